@@ -1,0 +1,45 @@
+"""Errors that a user can mend: one clear sentence each, printed by the command line without a traceback."""
+
+from __future__ import annotations
+
+
+class ConcentError(ValueError):
+    """An input or a setting that cannot be worked with.
+
+    The message is one sentence: where, what is wrong, what was expected and found, and what to do about it.
+    Subclasses name the kind of thing that is wrong, so that a library user can catch one kind.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: object = None,
+        expected: object = None,
+        found: object = None,
+        fix: str | None = None,
+    ) -> None:
+        sentence = what if where is None else f"{where}: {what}"
+        if expected is not None:
+            sentence += f"; expected {expected}"
+        if found is not None:
+            sentence += f", found {found}" if expected is not None else f"; found {found}"
+        if fix is not None:
+            sentence += f"; {fix}"
+        super().__init__(sentence if sentence.endswith(".") else sentence + ".")
+
+
+class RecordingError(ConcentError):
+    """A recording file or folder that breaks the format or contradicts itself."""
+
+
+class SceneError(ConcentError):
+    """An MJCF, mesh or point cloud that cannot serve as a scene or an object."""
+
+
+class ModelError(ConcentError):
+    """A model file, contact geometry or parameter that cannot be used."""
+
+
+class EngineError(ConcentError):
+    """A simulation that an engine cannot run, or that did not stay finite or within its buffers."""

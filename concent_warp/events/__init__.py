@@ -1,0 +1,1 @@
+"""Contact events, their staging and the schedule plot."""

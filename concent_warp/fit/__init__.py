@@ -1,0 +1,1 @@
+"""Fitting contact geometry to recordings."""

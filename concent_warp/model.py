@@ -1,0 +1,146 @@
+"""A model: scene and contact geometry, all that a simulation needs. On disk one ``model.toml`` with files beside it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import ModelError
+from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.scene import Scene
+
+FORMAT = "concent-model"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class ContactParameters:
+    """MuJoCo's contact parameters of the spheres."""
+
+    solref: tuple[float, float] = (0.005, 1.0)
+    """Time constant [s] and damping ratio [-]."""
+    solimp: tuple[float, float, float] = (0.9, 0.95, 0.001)
+    """Impedance at zero depth, at full depth [-], and the depth between them [m]."""
+    condim: int = 4
+    """Contact dimensionality: 3 sliding friction, 4 torsional too, 6 rolling too."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Scene, contact geometry and contact parameters.
+
+    Time step, integrator and solver are those of the scene's MJCF.
+    """
+
+    scene: Scene
+    geometry: ContactGeometry | None = None
+    contact: ContactParameters = field(default_factory=ContactParameters)
+
+    def spec(self, collidable: np.ndarray | None = None) -> mujoco.MjSpec:
+        """Return a fresh spec with the spheres attached.
+
+        `collidable`, shape (S,) bool, leaves out the spheres that are False (paper, section 3.2.2).
+        """
+        spec = self.scene.spec()
+        if self.geometry is not None:
+            self.geometry.attach(spec, collidable=collidable, **asdict(self.contact))
+        return spec
+
+    def compile(self, collidable: np.ndarray | None = None) -> mujoco.MjModel:
+        """Return the compiled model, see `spec`."""
+        return self.spec(collidable).compile()
+
+    def with_geometry(self, geometry: ContactGeometry | None) -> Model:
+        """Return a copy with another contact geometry."""
+        return replace(self, geometry=geometry)
+
+    def save(self, path: Path) -> None:
+        """Write `path` (``.toml``), the scene as ``.xml`` and the geometry as ``.npz`` beside it.
+
+        Each file is written in one piece; the ``.toml`` last, so that it never names files that are not there.
+        """
+        import tomli_w
+
+        document: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+        document["scene"] = f"{path.stem}.scene.xml"
+        write_text(path.with_name(document["scene"]), self.scene.xml)
+        if self.geometry is not None:
+            document["geometry"] = f"{path.stem}.geometry.npz"
+            self.geometry.save(path.with_name(document["geometry"]))
+        document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self.contact).items()}
+        write_text(path, tomli_w.dumps(document))
+
+    @staticmethod
+    def load(path: Path) -> Model:
+        """Read a ``model.toml``, or a plain MJCF (``.xml``) as a model without contact geometry.
+
+        Raises `ModelError` or `SceneError` with one sentence that says what is wrong.
+        """
+        if path.suffix == ".xml":
+            return Model(Scene.from_mjcf(path))
+        if not path.is_file():
+            raise ModelError("no such model", where=path, expected="a model.toml or an MJCF .xml")
+        try:
+            document = tomllib.loads(path.read_text())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ModelError("not a TOML file", where=path, found=error) from None
+        if document.get("format") != FORMAT:
+            raise ModelError(
+                "not a concent model", where=path, expected=f'format = "{FORMAT}"', found=document.get("format")
+            )
+        if document.get("version") != VERSION:
+            raise ModelError(
+                "unknown version of the model file", where=path, expected=VERSION, found=document.get("version")
+            )
+        known = {"format", "version", "scene", "geometry", "contact"}
+        if unknown := sorted(set(document) - known):
+            raise ModelError(
+                "unknown entries in the model file", where=path, expected=f"only {sorted(known)}", found=unknown
+            )
+        if not isinstance(document.get("scene"), str):
+            raise ModelError(
+                "the model file names no scene", where=path, expected='scene = "file.xml"', found=document.get("scene")
+            )
+        scene = Scene.from_mjcf(path.parent / document["scene"])
+        geometry = ContactGeometry.load(path.parent / document["geometry"]) if "geometry" in document else None
+        model = Model(scene, geometry, contact_parameters(document.get("contact", {}), path))
+        if geometry is not None:
+            missing = [b for b in geometry.bodies if mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, b) < 0]
+            if missing:
+                raise ModelError("the contact geometry names bodies that the scene lacks", where=path, found=missing)
+        return model
+
+
+def contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameters:
+    """Read the ``[contact]`` table of a model file, strictly."""
+    known = {f.name: f for f in fields(ContactParameters)}
+    if unknown := sorted(set(table) - set(known)):
+        raise ModelError("unknown entries in [contact]", where=path, expected=f"only {sorted(known)}", found=unknown)
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        default = getattr(ContactParameters(), name)
+        if isinstance(default, tuple):
+            numbers = isinstance(value, list) and all(isinstance(v, int | float) for v in value)
+            if not numbers or len(value) != len(default):
+                raise ModelError(
+                    f"[contact] {name} is not right", where=path, expected=f"{len(default)} numbers", found=value
+                )
+            values[name] = tuple(float(v) for v in value)
+        elif value not in (3, 4, 6):
+            raise ModelError(f"[contact] {name} is not right", where=path, expected="3, 4 or 6", found=value)
+        else:
+            values[name] = value
+    return ContactParameters(**values)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one piece or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text)
+    partial.replace(path)

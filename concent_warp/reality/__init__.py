@@ -1,0 +1,1 @@
+"""A simulated stand-in for the real world, built on other assumptions than the models that are fitted to it."""

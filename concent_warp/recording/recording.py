@@ -1,0 +1,101 @@
+"""What was commanded and what was measured, with time stamps: the in-memory form of the recording file.
+
+Everything is SI (m, s, rad, kg, N), quaternions are wxyz, the angular velocity of a free body is in the body frame.
+Each channel has clock readings of its own; a value may be NaN (missing), a time may not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One commanded or measured signal."""
+
+    time: np.ndarray
+    """Clock readings [s], shape (T,), strictly increasing."""
+    value: np.ndarray
+    """Values in SI units, shape (T,) for an action, (T, dim) for a measurement; NaN where missing."""
+    noise_std: float | None = None
+    """Standard deviation of the measurement noise in the channel's unit, where known."""
+    frame: str | None = None
+    """Name of the frame the values are expressed in, where it is not the world."""
+
+
+@dataclass(frozen=True)
+class PointTrack:
+    """Tracked surface points of one body, in the world frame."""
+
+    time: np.ndarray
+    """Clock readings [s], shape (T,)."""
+    value: np.ndarray
+    """Point positions [m], world frame, shape (T, M, 3); point m is the same material point in every frame."""
+    visible: np.ndarray
+    """Whether a point was seen in a frame, shape (T, M), bool."""
+
+
+@dataclass(frozen=True)
+class ImageStream:
+    """RGB-D frames of one fixed camera."""
+
+    time: np.ndarray
+    """Clock readings [s], shape (T,)."""
+    rgb: np.ndarray
+    """Colour, shape (T, H, W, 3), uint8."""
+    depth: np.ndarray
+    """Planar depth [m], shape (T, H, W), float32; 0 where there is none."""
+    intrinsics: np.ndarray
+    """Pinhole matrix [px], shape (3, 3)."""
+    pose: np.ndarray
+    """Camera-to-world transform, shape (4, 4); camera axes x right, y down, z forward."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One execution of a task, or one toss, swing or push: everything recorded between start and stop."""
+
+    name: str
+    task: str = ""
+    success: bool | None = None
+    qpos: np.ndarray | None = None
+    """Generalised position at time 0, shape (nq,), where known."""
+    qvel: np.ndarray | None = None
+    """Generalised velocity at time 0, shape (nv,), where known."""
+    action: Mapping[str, Channel] = field(default_factory=dict)
+    """What was commanded, by actuator name; each value is held until the next sample."""
+    measured: Mapping[str, Channel] = field(default_factory=dict)
+    """What was measured, by the name of the MJCF sensor that predicts it."""
+    points: Mapping[str, PointTrack] = field(default_factory=dict)
+    """Tracked points, by body name."""
+    image: Mapping[str, ImageStream] = field(default_factory=dict)
+    """RGB-D streams, by camera name."""
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample of any channel [s]."""
+        streams = [*self.action.values(), *self.measured.values(), *self.points.values(), *self.image.values()]
+        return max((float(s.time[-1]) for s in streams if len(s.time)), default=0.0)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One or more demonstrations in the same scene."""
+
+    scene: str
+    """Self-contained MJCF text of the scene."""
+    demonstrations: tuple[Demonstration, ...]
+    source: str = "<memory>"
+    """File or folder that it came from, for messages."""
+
+    def __getitem__(self, name: str | int) -> Demonstration:
+        """Return a demonstration by name or by position."""
+        if isinstance(name, int):
+            return self.demonstrations[name]
+        for demonstration in self.demonstrations:
+            if demonstration.name == name:
+                return demonstration
+        raise KeyError(f"{self.source}: no demonstration {name!r}; it has {[d.name for d in self.demonstrations]}")

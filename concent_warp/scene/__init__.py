@@ -1,0 +1,1 @@
+"""Bodies, joints, actuators and sensors as MJCF, and the contact geometry of objects."""

@@ -1,0 +1,100 @@
+"""A scene: bodies, joints, actuators and sensors, held as self-contained MJCF and handed out as `mujoco.MjSpec`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+
+from concent_warp.errors import SceneError
+
+OBJECTS_TEXT = "concent_objects"
+"""Name of the MJCF <text> element that lists the bodies to be given contact geometry."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Self-contained MJCF text."""
+
+    xml: str
+    source: str = "<memory>"
+    """Where it came from, for messages."""
+
+    @staticmethod
+    def from_mjcf(path: Path) -> Scene:
+        """Read an MJCF file, with its includes and meshes drawn into the text.
+
+        Raises `SceneError` where the file is missing or MuJoCo cannot compile it.
+        """
+        if not path.is_file():
+            raise SceneError("no such MJCF file", where=path, fix="check the path given with --scene or --robot")
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            return Scene.from_spec(spec, source=str(path))
+        except (ValueError, mujoco.FatalError) as error:
+            raise SceneError("MuJoCo cannot read this MJCF", where=path, found=" ".join(str(error).split())) from None
+
+    @staticmethod
+    def from_spec(spec: mujoco.MjSpec, source: str = "<memory>") -> Scene:
+        """Hold a spec as text; meshes are written as inline vertices and faces."""
+        spec = spec.copy()
+        for mesh in spec.meshes:
+            inline_mesh(spec, mesh)
+        spec.compile()
+        return Scene(spec.to_xml(), source)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a fresh spec that the caller may edit."""
+        try:
+            return mujoco.MjSpec.from_string(self.xml)
+        except (ValueError, mujoco.FatalError) as error:
+            raise SceneError(
+                "MuJoCo cannot read this MJCF", where=self.source, found=" ".join(str(error).split())
+            ) from None
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The scene compiled as it stands, without contact geometry; not to be edited."""
+        try:
+            return self.spec().compile()
+        except (ValueError, mujoco.FatalError) as error:
+            raise SceneError(
+                "MuJoCo cannot compile this MJCF", where=self.source, found=" ".join(str(error).split())
+            ) from None
+
+    def objects(self) -> tuple[str, ...]:
+        """Return the names of the bodies that carry contact geometry.
+
+        They are those listed in the MJCF element ``<custom><text name="concent_objects" data="block box"/></custom>``;
+        without it, the bodies that have a free joint.
+        """
+        m = self.model
+        for i in range(m.ntext):
+            text = m.text(i)
+            if text.name == OBJECTS_TEXT:
+                names = bytes(text.data).split(b"\0")[0].decode().split()
+                missing = [n for n in names if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, n) < 0]
+                if missing:
+                    raise SceneError(
+                        f"<text name={OBJECTS_TEXT!r}> names bodies that do not exist", where=self.source, found=missing
+                    )
+                return tuple(names)
+        free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        return tuple(m.body(m.jnt_bodyid[j]).name for j in free)
+
+
+def inline_mesh(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> None:
+    """Replace a mesh file by its vertices and faces, so that the scene's text stands alone."""
+    if not mesh.file:
+        return
+    import trimesh
+
+    path = Path(spec.modelfiledir) / (spec.meshdir or "") / mesh.file
+    if not path.is_file():
+        raise SceneError("the scene's mesh file is missing", where=path)
+    loaded = trimesh.load(path, force="mesh")
+    mesh.uservert = loaded.vertices.astype(float).ravel()
+    mesh.userface = loaded.faces.astype(int).ravel()
+    mesh.file = ""

@@ -1,0 +1,1 @@
+"""Engines that simulate many variants of a model at once, and the replay of recordings."""

@@ -1,0 +1,1 @@
+"""Images of rollouts. Empty in this version."""

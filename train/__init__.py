@@ -1,0 +1,1 @@
+"""Reinforcement learning from contact events. Empty in this version."""
