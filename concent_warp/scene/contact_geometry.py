@@ -165,6 +165,6 @@ class ContactGeometry:
                 group=GROUP,
                 condim=condim,
                 solref=list(solref),
-                solimp=list(solimp),
+                solimp=[*solimp, 0.5, 2.0],
                 rgba=[0.2, 0.7, 0.9, 0.5],
             )
