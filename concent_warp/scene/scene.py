@@ -71,16 +71,16 @@ class Scene:
         without it, the bodies that have a free joint.
         """
         m = self.model
-        for i in range(m.ntext):
-            text = m.text(i)
-            if text.name == OBJECTS_TEXT:
-                names = bytes(text.data).split(b"\0")[0].decode().split()
-                missing = [n for n in names if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, n) < 0]
-                if missing:
-                    raise SceneError(
-                        f"<text name={OBJECTS_TEXT!r}> names bodies that do not exist", where=self.source, found=missing
-                    )
-                return tuple(names)
+        text = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, OBJECTS_TEXT)
+        if text >= 0:
+            start = m.text_adr[text]
+            names = bytes(m.text_data)[start : start + m.text_size[text]].rstrip(b"\0").decode().split()
+            missing = [name for name in names if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, name) < 0]
+            if missing:
+                raise SceneError(
+                    f"<text name={OBJECTS_TEXT!r}> names bodies that do not exist", where=self.source, found=missing
+                )
+            return tuple(names)
         free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         return tuple(m.body(m.jnt_bodyid[j]).name for j in free)
 
