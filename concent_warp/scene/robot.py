@@ -140,6 +140,7 @@ def panda() -> mujoco.MjSpec:
     """Return the embedded arm with its gripper, position-controlled, base at the origin."""
     spec = mujoco.MjSpec()
     spec.modelname = "arm"
+    spec.compiler.degree = False
     body = spec.worldbody.add_body(name="link0")
     base = body.add_geom(name="link0", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[-0.06, 0, 0.06, 0, 0, 0.06])
     base.size[0] = 0.06
@@ -178,7 +179,7 @@ def panda() -> mujoco.MjSpec:
         )
     add_hand(spec, body)
     for i in range(7):
-        for j in range(i + 1, 7):
+        for j in range(i, 7):
             spec.add_exclude(bodyname1=f"link{i}", bodyname2=f"link{j + 1}")
     return spec
 
