@@ -1,0 +1,382 @@
+"""Variants of a model in C MuJoCo, one after the other in each of a few threads."""
+
+from __future__ import annotations
+
+import copy
+import os
+import queue
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import EngineError
+from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
+from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+
+WARNING = mujoco.mjtWarning
+DIVERGED = [int(w) for w in (WARNING.mjWARN_BADQPOS, WARNING.mjWARN_BADQVEL, WARNING.mjWARN_BADQACC)]
+OVERFLOW = [int(w) for w in (WARNING.mjWARN_CONTACTFULL, WARNING.mjWARN_CNSTRFULL)]
+
+
+class MujocoEngine:
+    """Simulates in C MuJoCo, in double precision. See `concent_warp.simulate.engine.Engine`."""
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        collidable: np.ndarray | None = None,
+        threads: int | None = None,
+        memory: int | None = None,
+        max_memory: int = 2**30,
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            model: What to simulate.
+            collidable: Spheres that take part in the physics, shape (S,) bool; None for all.
+            threads: Variants simulated at a time; by default one for each CPU this process may use.
+            memory: Arena of one simulation [bytes], which holds contacts and constraints; by default what MuJoCo takes.
+                It grows when it overflows.
+            max_memory: How far the arena may grow [bytes].
+        """
+        self.model = model
+        self.threads = len(os.sched_getaffinity(0)) if threads is None else max(int(threads), 1)
+        self.max_memory = int(max_memory)
+        self._collidable = None if collidable is None else np.array(collidable)
+        self._memory = memory
+        self._compiled, self._sphere_geom = compile_model(model, self._collidable)
+        self._workshops: queue.SimpleQueue[Workshop] = queue.SimpleQueue()
+        if memory is not None:
+            self._resize(memory)
+        self.repeats = 0
+        """How often variants of the last run were repeated with a larger arena."""
+
+    @property
+    def timestep(self) -> float:
+        """The model's time step [s]."""
+        return float(self._compiled.opt.timestep)
+
+    @property
+    def compiled(self) -> mujoco.MjModel:
+        """The compiled model of the variant that changes nothing; geom ids refer to it. Not to be edited."""
+        return self._compiled
+
+    @property
+    def sphere_geom(self) -> np.ndarray:
+        """Geom id of each sphere of the model's geometry, shape (S,) int; -1 for those that are not collidable."""
+        return self._sphere_geom
+
+    @property
+    def memory(self) -> int:
+        """Arena of one simulation [bytes], as it has grown so far."""
+        return int(self._compiled.narena)
+
+    def run(
+        self,
+        variants: Variants,
+        ctrl: np.ndarray,
+        *,
+        record: Sequence[int] | np.ndarray | None = None,
+        bodies: Sequence[str] | None = None,
+        contacts: Contacts = "none",
+    ) -> Rollout:
+        """Simulate all variants, see `Engine.run`; arrays of the rollout are float64.
+
+        A variant that MuJoCo finds unstable is `diverged`, and its records are NaN from then on.
+        """
+        run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
+        run = Run(**{**vars(run), "variants": host_variants(variants)})
+        results: list[VariantResult | None] = [None] * variants.count
+        pending = list(range(variants.count))
+        self.repeats = 0
+        with quiet_warnings():
+            while pending:
+                with ThreadPoolExecutor(min(self.threads, len(pending))) as pool:
+                    for n, result in zip(pending, pool.map(lambda n: self._simulate(run, n), pending), strict=True):
+                        results[n] = result
+                if pending := [n for n in pending if results[n] is None]:
+                    self._grow(len(pending))
+        done = [result for result in results if result is not None]
+        return Rollout(
+            step=run.record,
+            time=run.record * self.timestep,
+            bodies=run.bodies,
+            qpos=np.stack([r.qpos for r in done]),
+            qvel=np.stack([r.qvel for r in done]),
+            sensordata=np.stack([r.sensordata for r in done]),
+            body_position=np.stack([r.body_position for r in done]),
+            body_quaternion=np.stack([r.body_quaternion for r in done]),
+            touched=np.stack([r.touched for r in done]) if contacts == "touched" else None,
+            contacts=collect([r.contacts for r in done]) if contacts == "all" else None,
+            diverged=np.array([r.diverged for r in done]),
+        )
+
+    def _simulate(self, run: Run, n: int) -> VariantResult | None:
+        """Simulate variant n; None if its contacts or constraints did not fit the arena."""
+        m = self._variant_model(run.variants, n)
+        d = mujoco.MjData(m)
+        if run.variants.qpos is not None:
+            d.qpos[:] = run.variants.qpos[n]
+        if run.variants.qvel is not None:
+            d.qvel[:] = run.variants.qvel[n]
+        result = VariantResult.empty(m, run)
+        try:
+            result.diverged = not simulate(m, d, run, run.ctrl if run.shared_ctrl else run.ctrl[n], result)
+        except mujoco.FatalError as error:
+            if "stack" in str(error) or "arena" in str(error):
+                return None
+            raise EngineError("MuJoCo stopped", where=f"variant {n}", found=error) from None
+        return None if d.warning.number[OVERFLOW].any() else result
+
+    def _variant_model(self, variants: Variants, n: int) -> mujoco.MjModel:
+        """Return the model of variant n, compiled anew where geometry varies: the mid-phase trees depend on it."""
+        if any(getattr(variants, name) is not None for name in SPHERE_FIELDS):
+            try:
+                workshop = self._workshops.get_nowait()
+            except queue.Empty:
+                workshop = Workshop(self.model, self._collidable, self._memory)
+            m = workshop.compile(variants, n)
+            self._workshops.put(workshop)
+        elif variants.fields:
+            m = copy.copy(self._compiled)
+        else:
+            return self._compiled
+        apply_fields(m, {name: value[n] for name, value in variants.fields.items()})
+        return m
+
+    def _grow(self, count: int) -> None:
+        """Double the arena."""
+        size = 2 * self.memory
+        if size > self.max_memory:
+            raise EngineError(
+                f"contacts and constraints of {count} variants overflow an arena of {self.memory} bytes",
+                expected=f"at most {self.max_memory} bytes",
+                fix=f"thin out the contact geometry, or allow at least max_memory={size}",
+            )
+        self.repeats += 1
+        self._resize(size)
+
+    def _resize(self, size: int) -> None:
+        """Compile anew with an arena of `size` bytes."""
+        self._memory = size
+        self._workshops = queue.SimpleQueue()
+        spec = self.model.spec(self._collidable)
+        spec.memory = size
+        self._compiled = spec.compile()
+
+
+class Workshop:
+    """A spec whose spheres are set and compiled for one variant after the other; for one thread at a time."""
+
+    def __init__(self, model: Model, collidable: np.ndarray | None, memory: int | None) -> None:
+        self._spec = model.spec(collidable)
+        if memory is not None:
+            self._spec.memory = memory
+        geoms = {geom.name: geom for geom in self._spec.geoms}
+        names = [] if model.geometry is None else model.geometry.names()
+        self._geoms = [(i, geoms[name]) for i, name in enumerate(names) if name in geoms]
+
+    def compile(self, variants: Variants, n: int) -> mujoco.MjModel:
+        """Return the compiled model of variant n, spheres only."""
+        for i, geom in self._geoms:
+            if variants.sphere_position is not None:
+                geom.pos = variants.sphere_position[n, i]
+            if variants.sphere_radius is not None:
+                geom.size[0] = variants.sphere_radius[n, i]
+            if variants.sphere_friction is not None:
+                geom.friction[0] = variants.sphere_friction[n, i]
+        return self._spec.compile()
+
+
+@dataclass
+class VariantResult:
+    """Records of one variant; NaN where it diverged."""
+
+    qpos: np.ndarray
+    """Shape (R, nq)."""
+    qvel: np.ndarray
+    """Shape (R, nv)."""
+    sensordata: np.ndarray
+    """Shape (R, nsensordata)."""
+    body_position: np.ndarray
+    """[m], shape (R, B, 3)."""
+    body_quaternion: np.ndarray
+    """wxyz, shape (R, B, 4)."""
+    touched: np.ndarray
+    """Shape (ngeom, nbody) bool."""
+    contacts: list[tuple[int, np.ndarray]]
+    """Step, and rows of geom ids (2), position (3), normal (3), distance and force (3), shape (C, 12)."""
+    diverged: bool = False
+
+    @staticmethod
+    def empty(m: mujoco.MjModel, run: Run) -> VariantResult:
+        """Return a result without records."""
+        r, b = len(run.record), len(run.body_ids)
+        return VariantResult(
+            qpos=np.full((r, m.nq), np.nan),
+            qvel=np.full((r, m.nv), np.nan),
+            sensordata=np.full((r, m.nsensordata), np.nan),
+            body_position=np.full((r, b, 3), np.nan),
+            body_quaternion=np.full((r, b, 4), np.nan),
+            touched=np.zeros((m.ngeom, m.nbody), dtype=bool),
+            contacts=[],
+        )
+
+    def put(self, row: int, d: mujoco.MjData, body_ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Record a state, and what `d` holds computed from it."""
+        self.qpos[row], self.qvel[row], self.sensordata[row] = qpos, qvel, d.sensordata
+        self.body_position[row], self.body_quaternion[row] = d.xpos[body_ids], d.xquat[body_ids]
+
+
+def simulate(m: mujoco.MjModel, d: mujoco.MjData, run: Run, ctrl: np.ndarray, result: VariantResult) -> bool:
+    """Step through the commands `ctrl`, shape (K, nu), filling `result`; returns whether the state stayed sane.
+
+    `mj_step` computes sensors, poses and contacts from the state before the step and leaves them in `d`, so they are
+    read after the step that they belong to. Only Runge-Kutta overwrites them, with those of its last stage.
+    """
+    row_of = {int(step): row for row, step in enumerate(run.record)}
+    watch = run.contacts != "none"
+    overwritten = m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    number = d.warning.number
+    k = 0
+    for stop in stops(ctrl, run):
+        if m.nu:
+            d.ctrl[:] = ctrl[k]
+        row = row_of.get(k)
+        if row is None and not watch:
+            mujoco.mj_step(m, d, nstep=stop - k)
+        else:
+            qpos, qvel = d.qpos.copy(), d.qvel.copy()
+            if overwritten:
+                mujoco.mj_forward(m, d)
+                read(m, d, k, row, run, result, qpos, qvel)
+            mujoco.mj_step(m, d)
+            if not overwritten and not number[DIVERGED].any():
+                read(m, d, k, row, run, result, qpos, qvel)
+        if number[OVERFLOW].any():
+            return True
+        if number[DIVERGED].any():
+            return False
+        k = stop
+    mujoco.mj_checkPos(m, d)
+    mujoco.mj_checkVel(m, d)
+    if run.steps in row_of and not number[DIVERGED].any():
+        mujoco.mj_forward(m, d)
+        result.put(row_of[run.steps], d, run.body_ids, d.qpos, d.qvel)
+    return not number[DIVERGED].any()
+
+
+def stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:
+    """Return the steps at which the simulation pauses, increasing, the last one K.
+
+    Every step when contacts are watched; else around each record and where the commands change.
+    """
+    if run.contacts != "none":
+        return iter(range(1, run.steps + 1))
+    changes = np.flatnonzero((ctrl[1:] != ctrl[:-1]).any(axis=1)) + 1
+    every = np.concatenate([changes, run.record, run.record + 1, [run.steps]])
+    return iter(np.unique(every[(every > 0) & (every <= run.steps)]).tolist())
+
+
+def read(
+    m: mujoco.MjModel,
+    d: mujoco.MjData,
+    step: int,
+    row: int | None,
+    run: Run,
+    result: VariantResult,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+) -> None:
+    """Record what `d` computed from the state of `step`."""
+    if row is not None:
+        result.put(row, d, run.body_ids, qpos, qvel)
+    if run.contacts == "none" or not d.ncon:
+        return
+    active = np.flatnonzero(d.contact.efc_address >= 0)
+    geom = d.contact.geom[active]
+    if run.contacts == "touched":
+        body = m.geom_bodyid[geom]
+        result.touched[geom[:, 0], body[:, 1]] = True
+        result.touched[geom[:, 1], body[:, 0]] = True
+    elif len(active):
+        result.contacts.append((step, contact_rows(m, d, active)))
+
+
+def contact_rows(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.ndarray:
+    """Return geom ids, position [m], normal, distance [m] and force [N] of the `active` contacts, shape (C, 12)."""
+    contact = d.contact
+    frame = contact.frame[active].reshape(-1, 3, 3)
+    wrench = np.zeros((len(active), 6))
+    for i, c in enumerate(active):
+        mujoco.mj_contactForce(m, d, int(c), wrench[i])
+    force = np.einsum("cij,ci->cj", frame, wrench[:, :3])
+    geom = contact.geom[active]
+    sign = np.where(geom[:, 0] > geom[:, 1], -1.0, 1.0)[:, None]
+    return np.concatenate(
+        [np.sort(geom, axis=1), contact.pos[active], sign * frame[:, 0], contact.dist[active, None], sign * force],
+        axis=1,
+    )
+
+
+def collect(logs: Sequence[Sequence[tuple[int, np.ndarray]]]) -> ContactLog:
+    """Join the contacts of all variants, ordered by variant, step, geom pair, distance and position."""
+    parts = [(n, step, rows) for n, log in enumerate(logs) for step, rows in log]
+    rows = np.concatenate([np.zeros((0, 12)), *(r for _, _, r in parts)])
+    sizes = [len(r) for _, _, r in parts]
+    variant = np.repeat(np.array([n for n, _, _ in parts], dtype=int), sizes)
+    step = np.repeat(np.array([s for _, s, _ in parts], dtype=int), sizes)
+    return sorted_log(variant, step, rows)
+
+
+def sorted_log(variant: np.ndarray, step: np.ndarray, rows: np.ndarray) -> ContactLog:
+    """Return the log of contact `rows`, shape (C, 12) as from `contact_rows`, in its one order."""
+    order = np.lexsort((rows[:, 4], rows[:, 3], rows[:, 2], rows[:, 8], rows[:, 1], rows[:, 0], step, variant))
+    rows = rows[order]
+    return ContactLog(
+        variant=variant[order],
+        step=step[order],
+        geom=rows[:, :2].astype(int),
+        position=rows[:, 2:5],
+        normal=rows[:, 5:8],
+        distance=rows[:, 8],
+        force=rows[:, 9:12],
+    )
+
+
+def apply_fields(m: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
+    """Set fields of a compiled model, and the constants that MuJoCo derives from them."""
+    if not fields:
+        return
+    for name, value in fields.items():
+        if name.startswith("opt."):
+            setattr(m.opt, name[4:], value)
+        else:
+            getattr(m, name)[:] = value
+    if "geom_margin" in fields:
+        m.body_margin[:] = 0
+        np.maximum.at(m.body_margin, m.geom_bodyid, m.geom_margin)
+    mujoco.mj_setConst(m, mujoco.MjData(m))
+    for name in ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0"):
+        if name in fields:
+            getattr(m, name)[:] = fields[name]
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing warnings and writing a log file: the engine reads the counters instead."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
