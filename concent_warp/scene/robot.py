@@ -7,7 +7,8 @@ Where the figures come from:
 - link masses, centres of mass and inertias: the `inertial` elements of `franka_description`, which follow Gaz et al.,
   "Dynamic identification of the Franka Emika Panda robot with retrieval of feasible parameters using penalty-based
   optimization", IEEE RA-L 4(4), 2019; hand: 0.73 kg, the Franka Hand's data sheet;
-- stiffness and damping of the position control: the gains of `joint_impedance_example_controller` of franka_ros;
+- stiffness of the position control: the gains of `joint_impedance_example_controller` of franka_ros, as is the damping
+  of the first four joints; the wrist's is lowered so that all joints lag their command by about 80 ms;
 - rotor inertias are not published; 0.1 kg m^2 a joint is an assumption shared with other MuJoCo models of this arm.
 
 The shapes are capsules and boxes drawn around the links: they look right and collide, and are nobody's measurement.
@@ -49,7 +50,7 @@ MAX_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 """Joint torque limits [N m]."""
 STIFFNESS = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)
 """Position control, proportional gain [N m/rad]."""
-DAMPING = (50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0)
+DAMPING = (50.0, 50.0, 50.0, 50.0, 18.0, 11.0, 4.0)
 """Position control, velocity gain [N m s/rad]."""
 ARMATURE = 0.1
 """Rotor inertia seen at the joint [kg m^2]."""

@@ -26,9 +26,9 @@ class ShapeSorterCfg:
     """Edge of the square hole [m]."""
     box_size: float = 0.07
     """Outer edge of the box [m]."""
-    box_height: float = 0.04
+    box_height: float = 0.025
     """Height of the box [m]."""
-    floor: float = 0.005
+    floor: float = 0.003
     """Thickness of the box's floor [m]."""
     friction: float = 0.3
     """Sliding friction of the objects' surfaces [-]."""

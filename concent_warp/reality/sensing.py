@@ -1,0 +1,84 @@
+"""What the stand-in's instruments see: encoders, a pose tracker, and surface points tracked by one camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from concent_warp.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class SensingCfg:
+    """Noise and rates of the instruments."""
+
+    encoder_std: float = 2e-4
+    """Joint encoder noise [rad], gripper [m]."""
+    encoder_rate: float = 100.0
+    """Rate of joint readings [Hz]."""
+    position_std: float = 3e-4
+    """Noise of tracked positions [m]."""
+    orientation_std: float = 3e-3
+    """Noise of tracked orientations [rad]."""
+    pose_rate: float = 60.0
+    """Rate of tracked poses [Hz]."""
+    point_std: float = 1e-3
+    """Noise of each tracked surface point [m]."""
+    point_rate: float = 30.0
+    """Rate of the point tracks, that is of the camera [Hz]."""
+    point_count: int = 96
+    """Points tracked on each object."""
+    camera_position: tuple[float, float, float] = (1.05, -0.45, 0.65)
+    """Place of the camera [m]; it looks at the workspace."""
+    camera_target: tuple[float, float, float] = (0.48, -0.02, 0.02)
+    """Point that the camera looks at [m]."""
+    tracking_std: float = 1e-4
+    """Slow wander of the joints against their commands that no encoder tells [rad]."""
+    tracking_time: float = 0.3
+    """Correlation time of the wander [s]."""
+
+
+def noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
+    """Rotate quaternions (T, 4) by random rotation vectors of `std` [rad] per axis."""
+    noise = rng.normal(0, std, (len(quaternion), 3))
+    result = np.empty_like(quaternion)
+    for i, (q, vector) in enumerate(zip(quaternion, noise, strict=True)):
+        result[i] = q
+        mujoco.mju_quatIntegrate(result[i], vector, 1.0)
+    return result
+
+
+def surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return points on the boxes and meshes of a body, body frame [m], shape (count, 3), by area."""
+    import trimesh
+
+    model = scene.model
+    parts = []
+    for g in np.flatnonzero(model.geom_bodyid == model.body(body).id):
+        if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_BOX:
+            raise ValueError(f"surface points of geom {model.geom(g).name!r}: only boxes are supported here")
+        box = trimesh.creation.box(extents=2 * model.geom_size[g])
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
+        transform = np.eye(4)
+        transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), model.geom_pos[g]
+        parts.append(box.apply_transform(transform))
+    mesh = trimesh.util.concatenate(parts)
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
+    return np.asarray(points)
+
+
+def seen(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: np.ndarray, points: np.ndarray, slack: float
+) -> np.ndarray:
+    """Return which world points (M, 3) [m] a camera at (3,) sees: no geom is more than `slack` [m] before them."""
+    ray = points - camera
+    distance = np.linalg.norm(ray, axis=1)
+    geom, hit = np.zeros(len(points), dtype=np.int32), np.zeros(len(points))
+    group = np.ones(6, dtype=np.uint8)
+    mujoco.mj_multiRay(
+        model, data, camera, (ray / distance[:, None]).ravel(), group, 1, -1, geom, hit, None, len(points), 10.0
+    )
+    return (geom < 0) | (hit > distance - slack)

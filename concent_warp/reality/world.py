@@ -1,0 +1,85 @@
+"""The stand-in's physics: exact convex shapes, elliptic cones, a finer step, and any hidden effect.
+
+It starts from the same drawing of the workshop (places and sizes) that the user's scene has, and shares none of the
+contact assumptions of the models fitted to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from concent_warp.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """A change of the world that the recording does not mention; each hook is optional."""
+
+    name: str
+    edit: Callable[[mujoco.MjSpec], None] | None = None
+    """Changes the world before it is compiled."""
+    force: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
+    """Called before every step; may add to `qfrc_applied` and `xfrc_applied`, which are cleared before it."""
+    command: Callable[[float, np.ndarray], np.ndarray] | None = None
+    """Maps time [s] and the commanded control (nu,) to the control that acts."""
+    measure: Callable[[str, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    """Maps channel name, times (T,) and values (T, dim) to what is written."""
+
+
+@dataclass(frozen=True)
+class WorldCfg:
+    """Physics of the stand-in."""
+
+    timestep: float = 0.001
+    """Step [s]."""
+    chamfer: float = 0.0015
+    """Chamfer of the edges of free box-shaped objects [m]."""
+    solref: tuple[float, float] = (0.003, 1.0)
+    """Contact time constant [s] and damping ratio [-]."""
+
+    def build(self, scene: Scene, effects: tuple[HiddenEffect, ...] = ()) -> mujoco.MjModel:
+        """Return the compiled world made from a scene's drawing."""
+        spec = scene.spec()
+        spec.option.timestep = self.timestep
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10.0
+        spec.option.iterations = 100
+        spec.option.ls_iterations = 50
+        for name in scene.objects():
+            for geom in spec.body(name).geoms:
+                geom.solref = list(self.solref)
+                if geom.type == mujoco.mjtGeom.mjGEOM_BOX and spec.body(name).joints:
+                    self.chamfer_box(spec, geom)
+        for effect in effects:
+            if effect.edit is not None:
+                effect.edit(spec)
+        return spec.compile()
+
+    def chamfer_box(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
+        """Turn a box into the convex mesh of a box with chamfered edges; mass and inertia of the box are kept."""
+        name = f"{geom.name}_chamfered"
+        body = geom.parent
+        compiled = spec.copy().compile()
+        base = compiled.body(body.name).id
+        body.explicitinertial = True
+        body.mass, body.inertia = compiled.body_mass[base], compiled.body_inertia[base]
+        body.ipos, body.iquat = compiled.body_ipos[base], compiled.body_iquat[base]
+        mesh = spec.add_mesh(name=name)
+        mesh.uservert = chamfered_box(np.array(geom.size), self.chamfer).ravel()
+        geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
+
+
+def chamfered_box(half: np.ndarray, chamfer: float) -> np.ndarray:
+    """Return the 24 corners [m] of a box of half sizes (3,) whose edges are cut at 45 degrees, shape (24, 3)."""
+    corners = []
+    for signs in np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T:
+        for axis in range(3):
+            inner = half - chamfer
+            inner[axis] = half[axis]
+            corners.append(signs * inner)
+    return np.array(corners)
