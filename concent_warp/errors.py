@@ -43,3 +43,7 @@ class ModelError(ConcentError):
 
 class EngineError(ConcentError):
     """A simulation that an engine cannot run, or that did not stay finite or within its buffers."""
+
+
+class EventsError(ConcentError):
+    """A contact event sequence that cannot be extracted, read or compared."""
