@@ -8,6 +8,7 @@ arm alone. Forces are exerted through the stiffness of the position control: the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
         (0.5, seat + cfg.clearance * 1.5 * up, free, place, open_width),
     ]
     time, position, force, turn, opening = [0.0], [start], [free], [0.0], [open_width]
-    for previous, (duration, goal, wrench, yaw_goal, width) in zip(waypoints, waypoints[1:], strict=False):
+    for previous, (duration, goal, wrench, yaw_goal, width) in pairwise(waypoints):
         steps = max(1, round(duration / cfg.speed * cfg.rate))
         for k in range(1, steps + 1):
             share = minimum_jerk(k / steps)

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from concent_warp.reality.expert import ExpertCfg, Path, plan
+from concent_warp.reality.expert import ExpertCfg, plan
 from concent_warp.reality.inverse_kinematics import solve_path
-from concent_warp.reality.sensing import SensingCfg, noisy_quaternion, seen, surface_points
+from concent_warp.reality.run import Log, settle, simulate
+from concent_warp.reality.sensing import SensingCfg, measure
+from concent_warp.reality.steering import aligned, arm_joints, deflection, finger_joints
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene
@@ -46,19 +48,6 @@ class Truth:
     """Force of the box on the block [N], shape (T, 3)."""
     success: bool
     """Whether the block came to rest in the hole."""
-
-
-@dataclass
-class Log:
-    """Raw readings, one list entry per step or per frame."""
-
-    time: list[float] = field(default_factory=list)
-    qpos: list[np.ndarray] = field(default_factory=list)
-    sensordata: list[np.ndarray] = field(default_factory=list)
-    pairs: list[dict[tuple[str, str], np.ndarray]] = field(default_factory=list)
-    frames: list[float] = field(default_factory=list)
-    points: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    visible: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
 
 def record(
@@ -108,7 +97,7 @@ def perform(
     block_joint = model.joint("block_joint").qposadr[0]
     data.qpos[block_joint : block_joint + 2] = block
     data.qpos[block_joint + 3 : block_joint + 7] = [np.cos(task.block_yaw / 2), 0, 0, np.sin(task.block_yaw / 2)]
-    for joint in finger_joints(model, task):
+    for joint in finger_joints(model):
         data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint, 1]
     gripper = [model.actuator(a).id for a in task.robot.gripper_actuators]
     open_width = float(model.actuator_ctrlrange[gripper[0], 1])
@@ -129,11 +118,11 @@ def perform(
             action[:, column] = angles[:, arm.index(int(model.actuator_trnid[column, 0]))]
     settle(model, data, action[0])
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
-    log = simulate(cfg, scene, model, data, path.time, action, effects, rng, progress)
+    log = simulate(cfg.sensing, scene, model, data, path.time, action, effects, rng, progress)
 
     truth = judge(model, log, task)
     actions = {model.actuator(i).name: Channel(path.time, action[:, i]) for i in range(model.nu)}
-    measured = measure(cfg.sensing, model, log, rng)
+    measured = measure(cfg.sensing, model, np.array(log.time), np.array(log.sensordata), rng)
     points = {
         body: PointTrack(np.array(log.frames), np.array(log.points[body]), np.array(log.visible[body]))
         for body in log.points
@@ -147,170 +136,6 @@ def perform(
         name, "put the block into the hole of the box", truth.success, qpos, qvel, actions, measured, points
     )
     return demonstration, truth
-
-
-def finger_joints(model: mujoco.MjModel, task: ShapeSorterCfg) -> list[int]:
-    """Return the slide joints of the gripper: those no arm actuator drives directly."""
-    return [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE and model.jnt_limited[j]]
-
-
-def arm_joints(model: mujoco.MjModel, gripper: list[int]) -> list[int]:
-    """Return the hinge joints that the other actuators drive, in the order of the actuators."""
-    return [int(model.actuator_trnid[a, 0]) for a in range(model.nu) if a not in gripper]
-
-
-def deflection(
-    model: mujoco.MjModel, site: str, joints: list[int], qpos: np.ndarray, angles: np.ndarray, force: np.ndarray
-) -> np.ndarray:
-    """Return by how much the commands lie beyond `angles` (T, J) [rad] to exert `force` (T, 3) [N], shape (T, J).
-
-    A position-controlled joint yields by torque over proportional gain: dq = K^-1 J^T f.
-    """
-    gain = np.array(
-        [
-            model.actuator_gainprm[a, 0]
-            for j in joints
-            for a in range(model.nu)
-            if model.actuator_trnid[a, 0] == j and model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-        ]
-    )
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    jacobian = np.zeros((3, model.nv))
-    result = np.zeros_like(angles)
-    for t in range(len(angles)):
-        data.qpos[model.jnt_qposadr[joints]] = angles[t]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_jacSite(model, data, jacobian, None, model.site(site).id)
-        result[t] = jacobian[:, model.jnt_dofadr[joints]].T @ force[t] / gain
-    return result
-
-
-def aligned(path: Path, start_rotation: np.ndarray) -> Path:
-    """Turn the planned orientations by quarter turns so that they begin nearest to where the tool is."""
-    best, turn = -np.inf, np.eye(3)
-    for k in range(4):
-        a = k * np.pi / 2
-        candidate = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        match = float(np.trace(start_rotation.T @ candidate @ path.rotation[0]))
-        if match > best + 1e-9:
-            best, turn = match, candidate
-    return replace(path, rotation=turn @ path.rotation)
-
-
-def settle(model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray) -> None:
-    """Let the objects come to rest before the recording starts."""
-    data.ctrl[:] = ctrl
-    for _ in range(round(0.3 / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-    data.time = 0.0
-
-
-def simulate(
-    cfg: RealityCfg,
-    scene: Scene,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    time: np.ndarray,
-    action: np.ndarray,
-    effects: tuple[HiddenEffect, ...],
-    rng: np.random.Generator,
-    progress: Callable[[float], None] | None,
-) -> Log:
-    """Step the world along the commands and log every step and every camera frame."""
-    sensing, log = cfg.sensing, Log()
-    camera = np.array(sensing.camera_position)
-    track = {body: visible_points(scene, model, data, body, camera, sensing, rng) for body in scene.objects()}
-    log.points, log.visible = {body: [] for body in track}, {body: [] for body in track}
-    steps = round(time[-1] / model.opt.timestep)
-    wander = np.zeros(model.nu)
-    keep = np.exp(-model.opt.timestep / sensing.tracking_time)
-    kick = sensing.tracking_std * np.sqrt(1 - keep**2)
-    next_frame = 0.0
-    for k in range(steps + 1):
-        now = k * model.opt.timestep
-        ctrl = action[np.searchsorted(time, now + 1e-9, side="right") - 1]
-        for effect in effects:
-            if effect.command is not None:
-                ctrl = effect.command(now, ctrl)
-        wander = keep * wander + kick * rng.normal(size=model.nu)
-        data.ctrl[:] = ctrl + wander
-        data.qfrc_applied[:] = 0
-        data.xfrc_applied[:] = 0
-        for effect in effects:
-            if effect.force is not None:
-                effect.force(model, data)
-        qpos = data.qpos.copy()
-        mujoco.mj_step(model, data)  # sensors, poses and contacts are those of the state before the step
-        log.time.append(now)
-        log.qpos.append(qpos)
-        log.sensordata.append(data.sensordata.copy())
-        log.pairs.append(touching(model, data))
-        if now >= next_frame - 1e-9:
-            next_frame += 1 / sensing.point_rate
-            log.frames.append(now)
-            for body, local in track.items():
-                place = data.body(body)
-                points = place.xpos + local @ place.xmat.reshape(3, 3).T
-                log.visible[body].append(seen(model, data, camera, points, 2e-3))
-                noisy = points + rng.normal(0, sensing.point_std, points.shape)
-                log.points[body].append(np.where(log.visible[body][-1][:, None], noisy, np.nan))
-        if progress is not None and k % 200 == 0:
-            progress(k / steps)
-    return log
-
-
-def visible_points(
-    scene: Scene,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    body: str,
-    camera: np.ndarray,
-    sensing: SensingCfg,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Return surface points of a body that the camera sees at time 0, body frame [m], shape (point_count, 3)."""
-    local = surface_points(scene, body, 40 * sensing.point_count, rng)
-    place = data.body(body)
-    points = place.xpos + local @ place.xmat.reshape(3, 3).T
-    local = local[seen(model, data, camera, points, 2e-3)]
-    return local[rng.choice(len(local), sensing.point_count, replace=False)]
-
-
-def touching(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, str], np.ndarray]:
-    """Return the body pairs in contact, in alphabetical order, with the force on the second [N], world frame."""
-    pairs: dict[tuple[str, str], np.ndarray] = {}
-    force = np.zeros(6)
-    for i, contact in enumerate(data.contact):
-        if contact.efc_address < 0:
-            continue
-        first, second = (model.body(model.geom_bodyid[g]).name for g in contact.geom)
-        mujoco.mj_contactForce(model, data, i, force)
-        vector = contact.frame.reshape(3, 3).T @ force[:3]
-        pair, vector = ((first, second), vector) if first <= second else ((second, first), -vector)
-        pairs[pair] = pairs.get(pair, np.zeros(3)) + vector
-    return pairs
-
-
-def measure(sensing: SensingCfg, model: mujoco.MjModel, log: Log, rng: np.random.Generator) -> dict[str, Channel]:
-    """Return every sensor's readings with the noise and the rate of its instrument."""
-    time, readings = np.array(log.time), np.array(log.sensordata)
-    channels = {}
-    for i in range(model.nsensor):
-        name, address, dim = model.sensor(i).name, model.sensor_adr[i], model.sensor_dim[i]
-        joint = int(model.sensor_type[i]) in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_TENDONPOS)
-        rate = sensing.encoder_rate if joint else sensing.pose_rate
-        rows = np.unique(np.round(np.arange(0, time[-1], 1 / rate) / model.opt.timestep).astype(int))
-        value = readings[rows, address : address + dim]
-        if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
-            std = sensing.orientation_std
-            value = noisy_quaternion(value, std, rng)
-        else:
-            std = sensing.encoder_std if joint else sensing.position_std
-            value = value + rng.normal(0, std, value.shape)
-        channels[name] = Channel(time[rows], value, noise_std=std)
-    return channels
 
 
 def judge(model: mujoco.MjModel, log: Log, task: ShapeSorterCfg) -> Truth:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 
 
@@ -82,3 +83,49 @@ def seen(
         model, data, camera, (ray / distance[:, None]).ravel(), group, 1, -1, geom, hit, None, len(points), 10.0
     )
     return (geom < 0) | (hit > distance - slack)
+
+
+def visible_points(
+    scene: Scene,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    body: str,
+    camera: np.ndarray,
+    sensing: SensingCfg,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Return surface points of a body that the camera sees at time 0, body frame [m], shape (point_count, 3)."""
+    local = surface_points(scene, body, 40 * sensing.point_count, rng)
+    place = data.body(body)
+    points = place.xpos + local @ place.xmat.reshape(3, 3).T
+    local = local[seen(model, data, camera, points, 2e-3)]
+    return local[rng.choice(len(local), sensing.point_count, replace=False)]
+
+
+def measure(
+    sensing: SensingCfg, model: mujoco.MjModel, time: np.ndarray, readings: np.ndarray, rng: np.random.Generator
+) -> dict[str, Channel]:
+    """Return every sensor's readings with the noise and the rate of its instrument.
+
+    Args:
+        sensing: The instruments.
+        model: The world.
+        time: Times of the steps [s], shape (T,).
+        readings: What perfect sensors read at each step, shape (T, nsensordata).
+        rng: Source of the noise.
+    """
+    channels = {}
+    for i in range(model.nsensor):
+        name, address, dim = model.sensor(i).name, model.sensor_adr[i], model.sensor_dim[i]
+        joint = int(model.sensor_type[i]) in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_TENDONPOS)
+        rate = sensing.encoder_rate if joint else sensing.pose_rate
+        rows = np.unique(np.round(np.arange(0, time[-1], 1 / rate) / model.opt.timestep).astype(int))
+        value = readings[rows, address : address + dim]
+        if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
+            std = sensing.orientation_std
+            value = noisy_quaternion(value, std, rng)
+        else:
+            std = sensing.encoder_std if joint else sensing.position_std
+            value = value + rng.normal(0, std, value.shape)
+        channels[name] = Channel(time[rows], value, noise_std=std)
+    return channels

@@ -1,0 +1,103 @@
+"""Step the stand-in world along the commands and log what happens, untouched by any instrument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from concent_warp.reality.sensing import SensingCfg, seen, visible_points
+from concent_warp.reality.world import HiddenEffect
+from concent_warp.scene.scene import Scene
+
+
+@dataclass
+class Log:
+    """Raw readings, one list entry per step or per frame."""
+
+    time: list[float] = field(default_factory=list)
+    qpos: list[np.ndarray] = field(default_factory=list)
+    sensordata: list[np.ndarray] = field(default_factory=list)
+    pairs: list[dict[tuple[str, str], np.ndarray]] = field(default_factory=list)
+    frames: list[float] = field(default_factory=list)
+    points: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    visible: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+
+def settle(model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray) -> None:
+    """Let the objects come to rest before the recording starts."""
+    data.ctrl[:] = ctrl
+    for _ in range(round(0.3 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    data.time = 0.0
+
+
+def simulate(
+    sensing: SensingCfg,
+    scene: Scene,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    time: np.ndarray,
+    action: np.ndarray,
+    effects: tuple[HiddenEffect, ...],
+    rng: np.random.Generator,
+    progress: Callable[[float], None] | None,
+) -> Log:
+    """Step the world along the commands and log every step and every camera frame."""
+    log = Log()
+    camera = np.array(sensing.camera_position)
+    track = {body: visible_points(scene, model, data, body, camera, sensing, rng) for body in scene.objects()}
+    log.points, log.visible = {body: [] for body in track}, {body: [] for body in track}
+    steps = round(time[-1] / model.opt.timestep)
+    wander = np.zeros(model.nu)
+    keep = np.exp(-model.opt.timestep / sensing.tracking_time)
+    kick = sensing.tracking_std * np.sqrt(1 - keep**2)
+    next_frame = 0.0
+    for k in range(steps + 1):
+        now = k * model.opt.timestep
+        ctrl = action[np.searchsorted(time, now + 1e-9, side="right") - 1]
+        for effect in effects:
+            if effect.command is not None:
+                ctrl = effect.command(now, ctrl)
+        wander = keep * wander + kick * rng.normal(size=model.nu)
+        data.ctrl[:] = ctrl + wander
+        data.qfrc_applied[:] = 0
+        data.xfrc_applied[:] = 0
+        for effect in effects:
+            if effect.force is not None:
+                effect.force(model, data)
+        qpos = data.qpos.copy()
+        mujoco.mj_step(model, data)  # sensors, poses and contacts are those of the state before the step
+        log.time.append(now)
+        log.qpos.append(qpos)
+        log.sensordata.append(data.sensordata.copy())
+        log.pairs.append(touching(model, data))
+        if now >= next_frame - 1e-9:
+            next_frame += 1 / sensing.point_rate
+            log.frames.append(now)
+            for body, local in track.items():
+                place = data.body(body)
+                points = place.xpos + local @ place.xmat.reshape(3, 3).T
+                log.visible[body].append(seen(model, data, camera, points, 2e-3))
+                noisy = points + rng.normal(0, sensing.point_std, points.shape)
+                log.points[body].append(np.where(log.visible[body][-1][:, None], noisy, np.nan))
+        if progress is not None and k % 200 == 0:
+            progress(k / steps)
+    return log
+
+
+def touching(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, str], np.ndarray]:
+    """Return the body pairs in contact, in alphabetical order, with the force on the second [N], world frame."""
+    pairs: dict[tuple[str, str], np.ndarray] = {}
+    force = np.zeros(6)
+    for i, contact in enumerate(data.contact):
+        if contact.efc_address < 0:
+            continue
+        first, second = (model.body(model.geom_bodyid[g]).name for g in contact.geom)
+        mujoco.mj_contactForce(model, data, i, force)
+        vector = contact.frame.reshape(3, 3).T @ force[:3]
+        pair, vector = ((first, second), vector) if first <= second else ((second, first), -vector)
+        pairs[pair] = pairs.get(pair, np.zeros(3)) + vector
+    return pairs
