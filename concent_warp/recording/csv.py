@@ -1,0 +1,180 @@
+"""Recordings as folders of CSV files.
+
+A folder holds ``scene.xml`` and, either in itself or in ``demo_*`` subfolders (one per demonstration):
+
+- ``measured_<sensor>.csv``: a header row, ``time`` and one name per number of the sensor; then one row per sample.
+- ``action_<actuator>.csv``: the same with one value column.
+- ``initial.csv``, optional: a row ``qpos,...`` and a row ``qvel,...`` with the state at time 0.
+
+Cells are SI numbers with a decimal point, separated by commas; an empty cell is a missing value. A ``/`` in a name is
+written as ``%2F`` in the file's name. Files of other kinds are left alone.
+"""
+
+from __future__ import annotations
+
+import csv
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from concent_warp.errors import RecordingError, SceneError
+from concent_warp.recording.bounds import MAX_BYTES, MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
+from concent_warp.recording.naming import PREFIX, by_number, name_of
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.recording.validate import validate
+from concent_warp.scene.scene import Scene
+
+SCENE = "scene.xml"
+INITIAL = "initial.csv"
+
+
+def read_csv(folder: Path) -> Recording:
+    """Read and validate a folder of CSV files.
+
+    Raises:
+        RecordingError: Something is missing, a cell is no number, or a rule of `validate` is broken.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise RecordingError("no such folder of CSV files", where=folder, fix="check the path")
+    if not (folder / SCENE).is_file():
+        raise RecordingError("the folder has no scene", where=folder, expected=SCENE, fix="put the MJCF into it")
+    nested = sorted((f for f in folder.glob(f"{PREFIX}*") if f.is_dir()), key=lambda f: by_number(f.name))
+    if nested and any(folder.glob("*.csv")):
+        raise RecordingError(
+            "the folder has CSV files of its own beside its demonstrations",
+            where=folder,
+            expected=f"CSV files in {PREFIX}* folders only",
+            fix="move them into the folder of their demonstration",
+        )
+    if len(nested) > MAX_DEMONSTRATIONS:
+        raise RecordingError("too many demonstrations", where=folder, expected=MAX_DEMONSTRATIONS, found=len(nested))
+    for demonstration in nested:
+        if (demonstration / SCENE).exists():
+            raise RecordingError("a demonstration has a scene of its own", where=demonstration, fix=f"remove {SCENE}")
+    try:
+        scene = Scene.from_mjcf(folder / SCENE).xml
+    except SceneError as error:
+        raise RecordingError("the scene of the recording cannot be read", found=str(error).rstrip(".")) from None
+    check_size(folder)
+    demonstrations = tuple(read_demonstration(f, f.name) for f in nested) or (read_demonstration(folder, f"{PREFIX}0"),)
+    recording = Recording(scene, demonstrations, str(folder))
+    validate(recording)
+    return recording
+
+
+def check_size(folder: Path) -> None:
+    """Refuse files that are too large, one by one and together, before any is read."""
+    total = 0
+    for path in folder.rglob("*.csv"):
+        size = path.stat().st_size
+        total += size
+        if size > MAX_FILE_BYTES or total > MAX_BYTES:
+            raise RecordingError("the CSV files are too large", where=path, expected=f"{MAX_FILE_BYTES} bytes a file")
+
+
+def read_demonstration(folder: Path, name: str) -> Demonstration:
+    """Read the CSV files of one demonstration."""
+    action: dict[str, Channel] = {}
+    measured: dict[str, Channel] = {}
+    state: dict[str, np.ndarray] = {}
+    paths = sorted(folder.glob("*.csv"))
+    if not paths:
+        raise RecordingError(
+            "the folder has no CSV files", where=folder, expected="measured_<sensor>.csv or action_<actuator>.csv"
+        )
+    if len(paths) > MAX_CHANNELS:
+        raise RecordingError("too many CSV files", where=folder, expected=f"at most {MAX_CHANNELS}", found=len(paths))
+    for path in paths:
+        kind, _, channel = path.stem.partition("_")
+        if path.name == INITIAL:
+            state = read_state(path)
+        elif kind == "measured" and channel:
+            table = read_table(path)
+            measured[name_of(channel)] = Channel(table[:, 0], table[:, 1:])
+        elif kind == "action" and channel:
+            table = read_table(path)
+            if table.shape[1] != 2:
+                raise RecordingError(
+                    "wrong number of columns", where=path, expected="time and one value", found=table.shape[1]
+                )
+            action[name_of(channel)] = Channel(table[:, 0], table[:, 1])
+        else:
+            raise RecordingError(
+                "a CSV file has a name that says nothing",
+                where=path,
+                expected=f"measured_<sensor>.csv, action_<actuator>.csv or {INITIAL}",
+                fix="rename it or take it out of the folder",
+            )
+    return Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
+
+
+def read_table(path: Path) -> np.ndarray:
+    """Return the numbers below the header of a channel's file, shape (T, columns); the first column is time [s]."""
+    rows = read_rows(path)
+    header = [cell.strip().lower() for cell in next(rows, (1, []))[1]]
+    if len(header) < 2 or header[0] != "time":
+        raise RecordingError(
+            "the header row is missing",
+            where=f"{path}, line 1",
+            expected="time,<name>,... separated by commas",
+            found=repr(",".join(header))[:80] if header else "an empty file",
+        )
+    table = array("d")
+    for line, cells in rows:
+        if len(cells) != len(header):
+            where = f"{path}, line {line}"
+            raise RecordingError(
+                "a row has the wrong number of cells", where=where, expected=len(header), found=len(cells)
+            )
+        table.extend(number(cell, path, line, column) for column, cell in zip(header, cells, strict=True))
+    if not table:
+        raise RecordingError("the file has no rows below its header", where=path, expected="one row per sample")
+    return np.array(table).reshape(-1, len(header))
+
+
+def read_state(path: Path) -> dict[str, np.ndarray]:
+    """Read the state at time 0: rows that begin with ``qpos`` and ``qvel``."""
+    state: dict[str, np.ndarray] = {}
+    for line, cells in read_rows(path):
+        key = cells[0].strip()
+        if key not in ("qpos", "qvel") or key in state:
+            raise RecordingError(
+                "unknown or repeated row", where=f"{path}, line {line}", expected="qpos and qvel, once", found=repr(key)
+            )
+        state[key] = np.array([number(cell, path, line, key) for cell in cells[1:]])
+    return state
+
+
+def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows that are not blank, each with its line number."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            for cells in reader:
+                if reader.line_num > MAX_SAMPLES:
+                    raise RecordingError("too many rows", where=path, expected=f"at most {MAX_SAMPLES}")
+                if cells:
+                    yield reader.line_num, cells
+    except (csv.Error, UnicodeDecodeError, OSError) as error:
+        raise RecordingError("not a CSV file", where=path, expected="UTF-8 text", found=error) from None
+
+
+def number(cell: str, path: Path, line: int, column: str) -> float:
+    """Return the number in a cell; NaN where it is empty."""
+    cell = cell.strip()
+    if not cell:
+        return float("nan")
+    try:
+        if "_" in cell:
+            raise ValueError
+        return float(cell)
+    except ValueError:
+        raise RecordingError(
+            f"a cell of column {column!r} is not a number",
+            where=f"{path}, line {line}",
+            expected="a number with a decimal point, or nothing where it is missing",
+            found=repr(cell[:40]),
+        ) from None

@@ -1,0 +1,243 @@
+"""The recording file: HDF5, one or more demonstrations, after robomimic's ``data/demo_i`` layout.
+
+Names of channels are filed as `naming` says. How entries are read without trusting the file is in `hdf5_access`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import h5py
+import numpy as np
+
+from concent_warp.errors import RecordingError, SceneError
+from concent_warp.recording.bounds import MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_SCENE_BYTES
+from concent_warp.recording.hdf5_access import SafeFile
+from concent_warp.recording.naming import by_number, entry_of, name_of
+from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
+from concent_warp.recording.validate import validate
+from concent_warp.scene.scene import Scene
+
+FORMAT = "concent-recording"
+VERSION = 1
+Stream = TypeVar("Stream")
+
+
+def read_hdf5(path: Path) -> Recording:
+    """Read and validate a recording file.
+
+    Raises:
+        RecordingError: The file is missing, damaged, no recording, too large, or breaks a rule of `validate`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RecordingError("no such recording file", where=path, expected="an HDF5 file", fix="check the path")
+    try:
+        if not h5py.is_hdf5(path):
+            raise RecordingError("not an HDF5 file", where=path, fix="check that the file was copied whole")
+        with h5py.File(path, "r") as file:
+            recording = Reader(path).recording(file)
+    except RecordingError:
+        raise
+    except MemoryError:
+        raise RecordingError("the recording does not fit into memory", where=path, fix="split it") from None
+    except Exception as error:  # h5py reports damage as OSError, KeyError, RuntimeError, ValueError, TypeError and more
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(
+            "the HDF5 file is damaged", where=path, found=reason, fix="copy or record it again"
+        ) from error
+    validate(recording)
+    return recording
+
+
+def write_hdf5(recording: Recording, path: Path) -> None:
+    """Validate a recording and write it, in one piece or not at all.
+
+    The file appears under its name only when it is whole; a killed process leaves at most a hidden ``.partial`` file,
+    which the next call replaces. Its metadata and its data carry checksums.
+
+    Raises:
+        RecordingError: The recording breaks a rule of `validate`, or the file cannot be written.
+    """
+    path = Path(path)
+    validate(recording)
+    if not path.parent.is_dir():
+        raise RecordingError("the folder to write to does not exist", where=path.parent, fix="create it")
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+            write_file(file, recording)
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:
+        raise RecordingError(
+            "the recording cannot be written", where=path, found=" ".join(str(error).split())
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_file(file: h5py.File, recording: Recording) -> None:
+    """Fill an open file."""
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    scene = recording.scene.encode()
+    file.create_dataset("scene", data=np.array(scene, dtype=h5py.string_dtype("utf-8", len(scene))))
+    data = file.create_group("data")
+    for demonstration in recording.demonstrations:
+        group = data.create_group(demonstration.name)
+        group.attrs["task"] = demonstration.task
+        if demonstration.success is not None:
+            group.attrs["success"] = bool(demonstration.success)
+        for name, value in (("qpos", demonstration.qpos), ("qvel", demonstration.qvel)):
+            if value is not None and len(value):
+                group.require_group("initial").create_dataset(name, data=np.asarray(value, dtype=float))
+        for kind in ("action", "measured", "points", "image"):
+            for name, stream in getattr(demonstration, kind).items():
+                write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
+
+
+def write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) -> None:
+    """Fill the group of one channel, point track or camera."""
+    store(group, "time", np.asarray(stream.time, dtype=float))
+    if isinstance(stream, ImageStream):
+        store(group, "rgb", stream.rgb)
+        store(group, "depth", stream.depth)
+        group.attrs["intrinsics"] = np.asarray(stream.intrinsics, dtype=float)
+        group.attrs["pose"] = np.asarray(stream.pose, dtype=float)
+        return
+    store(group, "value", np.asarray(stream.value, dtype=float))
+    if isinstance(stream, PointTrack):
+        store(group, "visible", stream.visible)
+    else:
+        if stream.noise_std is not None:
+            group.attrs["noise_std"] = float(stream.noise_std)
+        if stream.frame is not None:
+            group.attrs["frame"] = stream.frame
+
+
+def store(group: h5py.Group, name: str, value: np.ndarray) -> None:
+    """Write one array, compressed and with checksums; images frame by frame."""
+    chunks = (1, *value.shape[1:]) if name in ("rgb", "depth") else True
+    group.create_dataset(
+        name, data=value, chunks=chunks, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+    )
+
+
+class Reader(SafeFile):
+    """Reads a recording from an open file, without validating it."""
+
+    def recording(self, file: h5py.File) -> Recording:
+        """Read the whole file."""
+        found = self.text_attribute(file, "format")
+        if found != FORMAT:
+            raise self.error("not a recording", "attribute format", expected=repr(FORMAT), found=repr(found))
+        version = self.attribute(file, "version")
+        if version is None or np.shape(version) != () or version != VERSION:
+            raise self.error("unknown version of the format", "attribute version", expected=VERSION, found=version)
+        self.refuse_unknown(file, {"scene", "data"})
+        scene = self.scene(file)
+        data = self.group(file, "data")
+        if len(data) > MAX_DEMONSTRATIONS:
+            raise self.error(
+                "too many demonstrations", "data", expected=f"at most {MAX_DEMONSTRATIONS}", found=len(data)
+            )
+        names = sorted(data.keys(), key=by_number)
+        return Recording(scene, tuple(self.demonstration(self.group(data, n), n) for n in names), str(self.path))
+
+    def scene(self, file: h5py.File) -> str:
+        """Read the MJCF, from the file or from one beside it."""
+        beside = self.text_attribute(file, "path")
+        if beside is not None:
+            if Path(beside).name != beside:
+                raise self.error(
+                    "the scene must lie beside the recording", "attribute path", expected="a file name", found=beside
+                )
+            try:
+                return Scene.from_mjcf(self.path.parent / beside).xml
+            except SceneError as error:
+                raise self.error("its scene cannot be read", "attribute path", found=str(error).rstrip(".")) from None
+        if "scene" not in file:
+            raise self.error("the recording has no scene", "scene", expected="MJCF text, or an attribute 'path'")
+        dataset = self.dataset(file, "scene")
+        kind = h5py.check_string_dtype(dataset.dtype)
+        if kind is None or dataset.shape != ():
+            raise self.error(
+                "the scene is not text", "scene", expected="one string", found=f"{dataset.shape} {dataset.dtype}"
+            )
+        if (kind.length or 0) > MAX_SCENE_BYTES:
+            raise self.error("the scene is too long", "scene", expected=f"{MAX_SCENE_BYTES} bytes", found=kind.length)
+        return self.decode(dataset[()], "scene")
+
+    def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
+        """Read one demonstration."""
+        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image"})
+        success = self.attribute(group, "success")
+        if success is not None and (np.shape(success) != () or success not in (0, 1)):
+            raise self.error("success is not a truth value", group.name, expected="true or false", found=success)
+        state: dict[str, np.ndarray | None] = {"qpos": None, "qvel": None}
+        if "initial" in group:
+            initial = self.group(group, "initial")
+            self.refuse_unknown(initial, set(state))
+            state |= {key: self.array(initial, key) for key in state if key in initial}
+        return Demonstration(
+            name=name,
+            task=self.text_attribute(group, "task") or "",
+            success=None if success is None else bool(success),
+            action=self.streams(group, "action", self.channel),
+            measured=self.streams(group, "measured", self.channel),
+            points=self.streams(group, "points", self.points),
+            image=self.streams(group, "image", self.image),
+            **state,
+        )
+
+    def streams(self, group: h5py.Group, kind: str, read: Callable[[h5py.Group], Stream]) -> dict[str, Stream]:
+        """Read all channels of one kind."""
+        if kind not in group:
+            return {}
+        parent = self.group(group, kind)
+        if len(parent) > MAX_CHANNELS:
+            raise self.error("too many channels", parent.name, expected=f"at most {MAX_CHANNELS}", found=len(parent))
+        return {name_of(str(name)): read(self.group(parent, str(name))) for name in parent}
+
+    def channel(self, group: h5py.Group) -> Channel:
+        """Read a commanded or measured channel."""
+        self.refuse_unknown(group, {"time", "value"})
+        noise = self.attribute(group, "noise_std")
+        if noise is not None and (np.shape(noise) != () or np.asarray(noise).dtype.kind not in "fiu"):
+            raise self.error("noise_std is not a number", group.name, expected="one number", found=noise)
+        return Channel(
+            self.array(group, "time"),
+            self.array(group, "value"),
+            None if noise is None else float(noise),
+            self.text_attribute(group, "frame"),
+        )
+
+    def points(self, group: h5py.Group) -> PointTrack:
+        """Read the point track of one body."""
+        self.refuse_unknown(group, {"time", "value", "visible"})
+        return PointTrack(self.array(group, "time"), self.array(group, "value"), self.array(group, "visible", bool))
+
+    def image(self, group: h5py.Group) -> ImageStream:
+        """Read the frames of one camera."""
+        self.refuse_unknown(group, {"time", "rgb", "depth"})
+        matrices = {name: self.attribute(group, name) for name in ("intrinsics", "pose")}
+        for name, shape in (("intrinsics", (3, 3)), ("pose", (4, 4))):
+            if np.shape(matrices[name]) != shape:
+                found = np.shape(matrices[name]) if name in group.attrs else "no such attribute"
+                raise self.error(f"{name} is not a matrix", group.name, expected=shape, found=found)
+        return ImageStream(
+            self.array(group, "time"),
+            self.array(group, "rgb", np.uint8),
+            self.array(group, "depth", np.float32),
+            np.asarray(matrices["intrinsics"]),
+            np.asarray(matrices["pose"]),
+        )
+
+
+def reason(error: Exception) -> str:
+    """Return what an exception says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,127 @@
+"""Entries of an HDF5 file that nobody vouches for.
+
+A file is data: nothing in it is executed, nothing outside it is opened (soft, external and virtual links are refused,
+external storage too), and the size of an array is checked before the array is read.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+from h5py import h5l, h5z
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.bounds import MAX_BYTES, MAX_CHANNELS, MAX_INFLATION, MAX_SAMPLES, MAX_TEXT_BYTES
+
+KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
+"""Compression and checksums that come with h5py."""
+KINDS = {float: "fiu", np.float32: "f", np.uint8: "u", bool: "b"}
+"""Kinds of stored numbers that are read as a type."""
+
+Entry = TypeVar("Entry", h5py.Group, h5py.Dataset)
+
+
+class SafeFile:
+    """Reads entries of one open file and keeps count of what it has promised to load."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.left = MAX_BYTES
+
+    def error(self, what: str, entry: str | None, **details: Any) -> RecordingError:
+        """Return the error about an entry of the file."""
+        return RecordingError(what, where=f"{self.path}, {entry}", **details)
+
+    def array(self, group: h5py.Group, name: str, dtype: type = float) -> np.ndarray:
+        """Read an array of numbers as `dtype`, after checking what it declares."""
+        dataset = self.dataset(group, name)
+        entry = f"{group.name}/{name}"
+        if dataset.dtype.kind not in KINDS[dtype] or (dtype is np.uint8 and dataset.dtype != np.uint8):
+            raise self.error("wrong kind of data", entry, expected=np.dtype(dtype), found=dataset.dtype)
+        if dataset.shape is None or len(dataset.shape) not in range(1, 5) or dataset.shape[0] > MAX_SAMPLES:
+            raise self.error(
+                "wrong shape", entry, expected=f"1 to 4 axes, at most {MAX_SAMPLES} samples", found=dataset.shape
+            )
+        declared = math.prod(dataset.shape) * max(np.dtype(dtype).itemsize, dataset.dtype.itemsize)
+        if declared > self.left:
+            raise self.error(
+                "the recording is too large", entry, expected=f"at most {MAX_BYTES} bytes in all", found=dataset.shape
+            )
+        self.left -= declared
+        stored = dataset.id.get_storage_size()
+        if declared and declared > MAX_INFLATION * stored:
+            raise self.error(
+                "its data were never written, or only in part",
+                entry,
+                expected=f"data for {dataset.shape}",
+                found=f"{stored} bytes",
+            )
+        return dataset[()].astype(dtype, copy=False)
+
+    def dataset(self, group: h5py.Group, name: str) -> h5py.Dataset:
+        """Return a dataset whose data lie in this file."""
+        dataset = self.entry(group, name, h5py.Dataset)
+        entry = f"{group.name}/{name}"
+        if dataset.external or dataset.is_virtual:
+            raise self.error("its data lie in another file", entry, fix="write them into the recording")
+        chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+        if chunk > MAX_BYTES:
+            raise self.error("its chunks are too large", entry, expected=f"at most {MAX_BYTES} bytes", found=chunk)
+        filters = dataset.id.get_create_plist()
+        codes = [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
+        if set(codes) - KNOWN_FILTERS:
+            raise self.error("unknown compression", entry, expected="gzip, lzf or none", found=f"filters {codes}")
+        return dataset
+
+    def group(self, group: h5py.Group, name: str) -> h5py.Group:
+        """Return a group inside a group."""
+        return self.entry(group, name, h5py.Group)
+
+    def entry(self, group: h5py.Group, name: str, kind: type[Entry]) -> Entry:
+        """Return an entry of a group, without following a link."""
+        where = f"{str(group.name).rstrip('/')}/{name}"
+        if name not in group.keys():  # noqa: SIM118  `name in group` would follow a link
+            raise self.error("an entry is missing", where, expected=f"a {kind.__name__.lower()}")
+        if group.id.links.get_info(name.encode()).type != h5l.TYPE_HARD:
+            raise self.error("it is a link, and links are not followed", where, fix="copy the data to this place")
+        item = group[name]
+        if not isinstance(item, kind):
+            raise self.error(
+                "wrong kind of entry", where, expected=f"a {kind.__name__.lower()}", found=type(item).__name__.lower()
+            )
+        return item
+
+    def refuse_unknown(self, group: h5py.Group, known: set[str]) -> None:
+        """Refuse a group with entries that would be passed over in silence."""
+        unknown = [name for name, _ in zip(group, range(MAX_CHANNELS), strict=False) if name not in known][:5]
+        if unknown:
+            raise self.error("unknown entries", group.name, expected=f"only {sorted(known)}", found=unknown)
+
+    def attribute(self, item: h5py.Group, name: str) -> Any:
+        """Return a small attribute, or None."""
+        if name not in item.attrs:
+            return None
+        identifier = item.attrs.get_id(name)
+        if identifier.get_storage_size() > MAX_TEXT_BYTES:
+            raise self.error("an attribute is too large", f"{item.name}, attribute {name}")
+        return item.attrs[name]
+
+    def text_attribute(self, item: h5py.Group, name: str) -> str | None:
+        """Return a text attribute, or None."""
+        value = self.attribute(item, name)
+        return None if value is None else self.decode(value, f"{item.name}, attribute {name}")
+
+    def decode(self, value: Any, entry: str) -> str:
+        """Return text from what h5py gives for a string."""
+        if isinstance(value, str):
+            value = value.encode("utf-8", "surrogateescape")
+        if not isinstance(value, bytes):
+            raise self.error("not text", entry, expected="a string", found=type(value).__name__)
+        try:
+            return value.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise self.error("not UTF-8 text", entry, found=error) from None

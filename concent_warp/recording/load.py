@@ -1,0 +1,39 @@
+"""One door to all readers: the kind of a recording is told from its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.contactnets import read_contactnets
+from concent_warp.recording.csv import read_csv
+from concent_warp.recording.hdf5 import read_hdf5
+from concent_warp.recording.naming import PREFIX
+from concent_warp.recording.recording import Recording
+
+KINDS = "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses"
+
+
+def load_recording(path: Path | str) -> Recording:
+    """Read a recording of any kind.
+
+    An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``; a folder by what is in it: ``.pt``
+    files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders.
+
+    Raises:
+        RecordingError: The path is missing, of no known kind, or what is there cannot be used.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if any(path.glob("*.pt")):
+            return read_contactnets(path)
+        if (path / "scene.xml").exists() or any(path.glob("*.csv")) or any(path.glob(f"{PREFIX}*")):
+            return read_csv(path)
+        raise RecordingError("the folder holds no recording", where=path, expected=KINDS)
+    if not path.exists():
+        raise RecordingError("no such recording", where=path, expected=KINDS, fix="check the path")
+    if path.suffix in (".h5", ".hdf5"):
+        return read_hdf5(path)
+    if path.suffix == ".pt":
+        return read_contactnets(path)
+    raise RecordingError("unknown kind of recording", where=path, expected=KINDS, found=path.suffix or "no suffix")

@@ -1,0 +1,121 @@
+"""Magnitudes that only a wrong unit explains: millimetres for metres, degrees for radians.
+
+The bounds are far outside what a sound recording holds, and they grow with the scene:
+
+- positions: the lower quartile of the distances from the origin is above both 20 m and 50 times the extent of the
+  scene. What starts near the scene and flies or falls far away stays below it.
+- joint angles and commanded angles: more than a full turn outside a limited range. Encoders that wrap stay below it;
+  angles of joints without limits cannot be judged and are not.
+- joint slides and commanded slides: more than 1 m, and more than 5 ranges, outside a limited range.
+- speeds: above 340 m/s.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from concent_warp.recording.place import Place
+
+FAR = 20.0
+"""Distance [m] that is never refused."""
+FAR_EXTENTS = 50.0
+"""Distance in extents of the scene that is never refused."""
+TURN = 2 * np.pi
+"""How far outside its range a joint angle may read [rad]."""
+SLIDE = 1.0
+"""How far outside its range a joint slide may always read [m]."""
+SLIDE_RANGES = 5.0
+"""How far outside its range a joint slide may read, in ranges."""
+FAST = 340.0
+"""Speed above which a measurement is refused [m/s]."""
+
+POSITION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_SUBTREECOM)
+DISTANCE_SENSORS = (mujoco.mjtSensor.mjSENS_RANGEFINDER, mujoco.mjtSensor.mjSENS_GEOMDIST)
+SPEED_SENSORS = (
+    mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+    mujoco.mjtSensor.mjSENS_VELOCIMETER,
+    mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
+)
+
+
+def far(model: mujoco.MjModel) -> float:
+    """Return the distance [m] above which positions in this scene cannot be metres."""
+    return max(FAR, FAR_EXTENTS * float(model.stat.extent))
+
+
+def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+    """Check distances from the origin, or between things, [m], shape (n,), NaN where missing."""
+    length = length[np.isfinite(length)]
+    if len(length) and (quartile := float(np.quantile(length, 0.25))) > far(model):
+        raise place.error(
+            "its positions look like millimetres",
+            expected=f"metres, three quarters of them not beyond {far(model):.3g} m",
+            found=f"{quartile:.4g} m",
+            fix="write metres",
+        )
+
+
+def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+    """Check the units of an initial state [m, rad], shape (nq,)."""
+    for joint in range(model.njnt):
+        start = model.jnt_qposadr[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            check_lengths(np.linalg.norm(qpos[None, start : start + 3], axis=1), model, place)
+        else:
+            check_joint(qpos[start : start + 1], model, joint, None, place)
+
+
+def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, place: Place) -> None:
+    """Check the unit of a measured channel, shape (T, dim)."""
+    kind = model.sensor_type[sensor]
+    if kind in POSITION_SENSORS:
+        check_lengths(np.linalg.norm(value, axis=1), model, place)
+    elif kind in DISTANCE_SENSORS:
+        check_lengths(np.abs(value[:, 0]), model, place)
+    elif kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
+        check_joint(value[:, 0], model, int(model.sensor_objid[sensor]), None, place)
+    elif kind in SPEED_SENSORS:
+        speed = np.linalg.norm(np.nan_to_num(value), axis=1)
+        row = int(speed.argmax())
+        if speed[row] > FAST:
+            raise place.error(
+                "its speeds look like millimetres per second",
+                row=row,
+                expected=f"metres per second, at most {FAST:g} m/s",
+                found=f"{speed[row]:.4g} m/s",
+                fix="write m/s",
+            )
+
+
+def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place: Place) -> None:
+    """Check the unit of the commands of a position servo, shape (T,); other actuators are not judged."""
+    gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
+    servo = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain == -bias != 0
+    on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    if servo and on_joint and model.actuator_gear[actuator, 0] == 1:
+        limits = model.actuator_ctrlrange[actuator] if model.actuator_ctrllimited[actuator] else None
+        check_joint(value, model, int(model.actuator_trnid[actuator, 0]), limits, place)
+
+
+def check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, limits: np.ndarray | None, place: Place) -> None:
+    """Check positions of a hinge [rad] or slide [m], shape (T,), against `limits`, or else the range of the joint."""
+    if limits is None and not model.jnt_limited[joint]:
+        return
+    low, high = (float(bound) for bound in (model.jnt_range[joint] if limits is None else limits))
+    outside = np.nan_to_num(np.maximum(low - value, value - high))
+    row = int(outside.argmax())
+    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        allowed, guess, unit, fix = TURN, "degrees", "rad", "write radians"
+    elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+        allowed, guess, unit, fix = max(SLIDE, SLIDE_RANGES * (high - low)), "millimetres", "m", "write metres"
+    else:
+        return
+    if outside[row] > allowed:
+        raise place.error(
+            f"its values look like {guess}",
+            row=row,
+            expected=f"near the range {low:.4g} to {high:.4g} {unit} of joint {model.joint(joint).name!r}",
+            found=f"{value[row]:.4g}",
+            fix=fix,
+        )

@@ -1,0 +1,66 @@
+"""Whether a recording's MJCF may be given to MuJoCo: it must stand alone and be of a sane size."""
+
+from __future__ import annotations
+
+import math
+from xml.etree import ElementTree
+
+from concent_warp.recording.bounds import MAX_SCENE_BYTES, MAX_SCENE_COPIES
+from concent_warp.recording.place import Place
+
+FREE_TEXT = ("name", "class", "data")
+"""Attributes that hold words, so that ``nan`` is not a number in them."""
+
+
+def check_scene_text(text: str, place: Place) -> None:
+    """Refuse an MJCF text that is no XML, reads other files, asks for endless copies or holds numbers that are none.
+
+    Raises:
+        RecordingError: With the element that is at fault.
+    """
+    if len(text) > MAX_SCENE_BYTES:
+        raise place.error("the scene's MJCF is too long", expected=f"at most {MAX_SCENE_BYTES} bytes", found=len(text))
+    if not text.strip():
+        raise place.error("the scene is empty", expected="MJCF text", fix="write the MJCF into the recording")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise place.error("the scene declares XML entities, which MJCF does not need", fix="remove the DOCTYPE")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise place.error("the scene is not XML", expected="MJCF text", found=error) from None
+    stack = [(root, 1)]
+    while stack:
+        element, copies = stack.pop()
+        copies = check_element(element, copies, place)
+        stack.extend((child, copies) for child in element)
+
+
+def check_element(element: ElementTree.Element, copies: int, place: Place) -> int:
+    """Check one element; `copies` counts how often those around it repeat it, the result how often it does in turn."""
+    if element.tag == "include" or "file" in element.attrib:
+        raise place.error(
+            f"the scene is not self-contained: its <{element.tag}> reads a file",
+            found=element.get("file"),
+            fix="write meshes as inline vertices and drop textures, or name the MJCF in the attribute 'path'",
+        )
+    if element.tag in ("replicate", "composite", "flexcomp"):
+        try:
+            copies *= math.prod(max(int(n), 1) for n in element.get("count", "1").split())
+        except ValueError:
+            raise place.error(f"<{element.tag}> has no whole count", found=element.get("count")) from None
+        if copies > MAX_SCENE_COPIES:
+            raise place.error(
+                f"<{element.tag}> asks for too many copies", expected=f"at most {MAX_SCENE_COPIES}", found=copies
+            )
+    for key, value in element.attrib.items():
+        if key not in FREE_TEXT and not_finite(value):
+            raise place.error(f"<{element.tag} {key}> is not finite", expected="finite numbers", found=value)
+    return copies
+
+
+def not_finite(text: str) -> bool:
+    """Return whether a text is a list of numbers one of which is not finite."""
+    try:
+        return not all(math.isfinite(float(part)) for part in text.split())
+    except ValueError:
+        return False

@@ -1,0 +1,242 @@
+"""What makes a recording valid: every reader and the writer ask this module, so no other code has to.
+
+A recording is checked against its own scene: names and sizes against the compiled MJCF here, clocks in `clocks`,
+magnitudes that betray wrong units in `magnitudes`, cameras in `images`.
+
+Rules on missing values: a measurement may be NaN where it is missing, but not all of a channel; infinities are refused
+everywhere. A command may not be NaN at all: a command is held until the next sample, so a sample that is left out
+already says "as before", and a NaN would say that nobody knows what the actuator was told.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import SceneError
+from concent_warp.recording.bounds import MAX_SAMPLES
+from concent_warp.recording.clocks import check_clocks
+from concent_warp.recording.images import check_image
+from concent_warp.recording.magnitudes import check_command, check_lengths, check_measurement, check_positions
+from concent_warp.recording.naming import PREFIX
+from concent_warp.recording.place import Place
+from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+from concent_warp.recording.scene_text import check_scene_text
+from concent_warp.scene.scene import Scene
+
+QUATERNION_TOLERANCE = 0.05
+"""How far from 1 the norm of a measured or initial quaternion may be: rounding and additive noise stay below it, Euler
+angles, zeros and degrees do not."""
+QUATERNION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.mjSENS_BALLQUAT)
+
+
+def validate(recording: Recording) -> None:
+    """Check a recording against its scene and against itself.
+
+    Raises:
+        RecordingError: The first thing that is wrong, with file, demonstration, channel and row (counted from 0).
+    """
+    place = Place(recording.source)
+    model = compile_scene(recording)
+    if not recording.demonstrations:
+        raise place.error("the recording holds no demonstration", expected="at least one")
+    seen: set[str] = set()
+    for demonstration in recording.demonstrations:
+        name = demonstration.name
+        if not name.startswith(PREFIX) or "/" in name:
+            raise place.error(
+                "a demonstration has an unusable name", expected=f"{PREFIX}0, {PREFIX}1, ...", found=repr(name)
+            )
+        if name in seen:
+            raise place.error("two demonstrations have the same name", found=repr(name))
+        seen.add(name)
+        check_demonstration(demonstration, model, Place(recording.source, name))
+
+
+def compile_scene(recording: Recording) -> mujoco.MjModel:
+    """Return the compiled scene of a recording, or raise `RecordingError`."""
+    place = Place(recording.source, channel="scene")
+    check_scene_text(recording.scene, place)
+    try:
+        return Scene(recording.scene, recording.source).model
+    except SceneError as error:
+        reason = str(error).removeprefix(f"{recording.source}: ").rstrip(".")
+        raise place.error(reason, fix="mend the MJCF in the recording") from None
+
+
+def check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+    """Check one demonstration against the compiled scene."""
+    if demonstration.success is not None and not isinstance(demonstration.success, bool | np.bool_):
+        raise place.error("success is not a truth value", expected="True or False", found=demonstration.success)
+    check_initial(demonstration, model, place)
+    for name, channel in demonstration.action.items():
+        check_action(channel, model, name, place.at(f"action/{name}"))
+    for name, channel in demonstration.measured.items():
+        check_measured(channel, model, name, place.at(f"measured/{name}"))
+    for name, track in demonstration.points.items():
+        check_points(track, model, name, place.at(f"points/{name}"))
+    for name, stream in demonstration.image.items():
+        check_time(stream.time, place.at(f"image/{name}"))
+        check_image(stream, model, place.at(f"image/{name}"))
+    check_clocks(demonstration, place)
+
+
+def check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+    """Check the state at time 0: sizes, finite values, unit quaternions, units."""
+    for name, value, size in (("qpos", demonstration.qpos, model.nq), ("qvel", demonstration.qvel, model.nv)):
+        if value is None:
+            continue
+        check_shape(value, (size,), place.at(f"initial/{name}"), fix=f"write one number per {name} of the scene")
+        check_finite(value, place.at(f"initial/{name}"), missing_allowed=False)
+    if demonstration.qpos is None:
+        return
+    qpos = np.asarray(demonstration.qpos, dtype=float)
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            continue
+        start = model.jnt_qposadr[joint] + (3 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else 0)
+        norm = float(np.linalg.norm(qpos[start : start + 4]))
+        if abs(norm - 1) > QUATERNION_TOLERANCE:
+            raise place.at("initial/qpos").error(
+                f"the quaternion of joint {model.joint(joint).name!r} is not of unit length",
+                row=int(start),
+                expected=f"norm 1 within {QUATERNION_TOLERANCE}",
+                found=f"{norm:.4g}",
+                fix="write w, x, y, z after the three positions of a free joint",
+            )
+    check_positions(qpos, model, place.at("initial/qpos"))
+
+
+def check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+    """Check one commanded channel."""
+    row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+    if row < 0:
+        known = [model.actuator(i).name for i in range(model.nu)]
+        raise place.error("the scene has no such actuator", expected=one_of(known), found=repr(name))
+    check_time(channel.time, place)
+    check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
+    check_finite(channel.value, place, missing_allowed=False)
+    check_command(np.asarray(channel.value), model, row, place)
+
+
+def check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+    """Check one measured channel."""
+    row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if row < 0:
+        known = [model.sensor(i).name for i in range(model.nsensor)]
+        raise place.error("the scene has no such sensor", expected=one_of(known), found=repr(name))
+    check_time(channel.time, place)
+    check_shape(
+        channel.value,
+        (len(channel.time), int(model.sensor_dim[row])),
+        place,
+        fix="write one row per time and one column per number of the sensor",
+    )
+    check_finite(channel.value, place, missing_allowed=True)
+    value = np.asarray(channel.value)
+    if channel.noise_std is not None and not (np.isfinite(channel.noise_std) and channel.noise_std >= 0):
+        raise place.error("noise_std is not a standard deviation", expected=">= 0", found=channel.noise_std)
+    if model.sensor_type[row] in QUATERNION_SENSORS:
+        check_quaternions(value, place)
+    check_measurement(value, model, row, place)
+
+
+def check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Place) -> None:
+    """Check the tracked points of one body."""
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
+        known = [model.body(i).name for i in range(1, model.nbody)]
+        raise place.error("the scene has no such body", expected=one_of(known), found=repr(name))
+    check_time(track.time, place)
+    shape = np.shape(track.value)
+    if len(shape) != 3 or shape[2] != 3 or shape[0] != len(track.time) or shape[1] == 0:
+        raise place.error("wrong shape of the points", expected=f"({len(track.time)}, M, 3)", found=shape)
+    if np.shape(track.visible) != shape[:2] or np.asarray(track.visible).dtype != bool:
+        found = f"{np.shape(track.visible)} {np.asarray(track.visible).dtype}"
+        raise place.error("visible does not fit the points", expected=f"{shape[:2]} bool", found=found)
+    check_finite(track.value, place, missing_allowed=True)
+    seen = np.asarray(track.visible)
+    if not seen.any():
+        raise place.error("no point is visible in any frame", fix="leave the channel out")
+    lost = seen & np.isnan(track.value).any(axis=2)
+    if lost.any():
+        row, point = np.argwhere(lost)[0]
+        raise place.error(f"point {point} is visible but has no position", row=int(row), found="NaN")
+    check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place)
+
+
+def check_time(time: np.ndarray, place: Place) -> None:
+    """Check clock readings [s], shape (T,): finite, not negative, strictly increasing."""
+    time = np.asarray(time)
+    if time.ndim != 1 or time.dtype.kind not in "fiu":
+        raise place.error("wrong shape of time", expected="(T,) numbers", found=f"{time.shape} {time.dtype}")
+    if not 0 < len(time) <= MAX_SAMPLES:
+        raise place.error("wrong number of samples", expected=f"1 to {MAX_SAMPLES}", found=len(time))
+    if (bad := first(~np.isfinite(time))) is not None:
+        raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
+    if time[0] < 0:
+        raise place.error("time is negative", row=0, expected=">= 0 s", found=f"{time[0]:g} s", fix="count from 0")
+    if (bad := first(time[1:] <= time[:-1])) is not None:
+        raise place.error(
+            "time does not increase",
+            row=bad + 1,
+            expected=f"more than {time[bad]:.9g} s",
+            found=f"{time[bad + 1]:.9g} s",
+            fix="sort the samples and drop repeated ones",
+        )
+
+
+def check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: str) -> None:
+    """Check that values are numbers of a given shape."""
+    found = np.asarray(value)
+    if found.shape != shape or found.dtype.kind not in "fiu":
+        kind = "" if found.dtype.kind in "fiu" else f" {found.dtype}"
+        raise place.error("wrong shape of the values", expected=shape, found=f"{found.shape}{kind}", fix=fix)
+
+
+def check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> None:
+    """Refuse infinities, a channel without any value and, unless `missing_allowed`, every NaN."""
+    value = np.asarray(value, dtype=float)
+    if (bad := first(np.isinf(value))) is not None:
+        raise place.error("a value is infinite", row=bad, expected="finite, or NaN where missing", found="inf")
+    missing = np.isnan(value)
+    if missing.all():
+        raise place.error("every value is missing", expected="numbers", found="only NaN", fix="leave the channel out")
+    if not missing_allowed and (bad := first(missing)) is not None:
+        run = int(missing.reshape(len(value), -1).any(axis=1).sum())
+        raise place.error(
+            f"{run} of {len(value)} values are missing",
+            row=bad,
+            expected="a number",
+            found="NaN",
+            fix="leave the samples out, so that the value before them is held",
+        )
+
+
+def check_quaternions(value: np.ndarray, place: Place) -> None:
+    """Check quaternions, shape (T, 4): whole or missing, and of unit length."""
+    missing = np.count_nonzero(np.isnan(value), axis=1)
+    if (bad := first((missing > 0) & (missing < 4))) is not None:
+        raise place.error("a quaternion is missing in part", row=bad, expected="four numbers or four NaN")
+    norm = np.sqrt((value**2).sum(axis=1))
+    if (bad := first(np.asarray(np.abs(norm - 1) > QUATERNION_TOLERANCE))) is not None:
+        raise place.error(
+            "a quaternion is not of unit length",
+            row=bad,
+            expected=f"norm 1 within {QUATERNION_TOLERANCE}",
+            found=f"{norm[bad]:.4g}",
+            fix="write w, x, y, z",
+        )
+
+
+def first(wrong: np.ndarray) -> int | None:
+    """Return the first row of an array of any shape that holds a True, or None."""
+    rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1)) if wrong.size else np.empty(0, int)
+    return int(rows[0]) if len(rows) else None
+
+
+def one_of(names: list[str], limit: int = 12) -> str:
+    """Return a list of known names for a message, cut at `limit`."""
+    named = [name for name in names if name]
+    if not named:
+        return "none, for the scene names none"
+    return f"one of {named[:limit]}" + (f" and {len(named) - limit} more" if len(named) > limit else "")
