@@ -1,7 +1,7 @@
 """Starting contact geometry: from the bodies of a scene to spheres, by farthest point sampling of surface points.
 
-Paper, section 3.1.1 and appendix E.1. The paper centres the spheres on the surface, which inflates an object by a radius
-and closes a tight hole; the default here keeps the spheres within the object.
+Paper, section 3.1.1 and appendix E.1. The paper centres the spheres on the surface, which inflates an object by a
+radius and closes a tight hole; the default here keeps the spheres within the object.
 """
 
 from __future__ import annotations

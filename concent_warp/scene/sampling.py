@@ -1,4 +1,4 @@
-"""Farthest point sampling, which spreads the spheres evenly over an object (paper, appendix on object modelling, E.1)."""
+"""Farthest point sampling, which spreads the spheres evenly over an object (paper, appendix E.1)."""
 
 from __future__ import annotations
 

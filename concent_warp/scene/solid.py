@@ -11,14 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 Distances = tuple[np.ndarray, np.ndarray]
-"""Signed distance [m], shape (n,), and its gradient (unit outward normal of the nearest surface point), shape (n, 3)."""
+"""Signed distance [m], shape (n,), and its gradient (outward normal of the nearest surface point), shape (n, 3)."""
 
 
 class Solid(ABC):
     """A closed body that can tell how deep a point lies in it."""
 
-    area: float
-    """Area of the surface [m^2]."""
+    @property
+    @abstractmethod
+    def area(self) -> float:
+        """Area of the surface [m^2]."""
 
     @abstractmethod
     def distance(self, points: np.ndarray) -> Distances:
@@ -199,8 +201,9 @@ class Ellipsoid(Solid):
     def distance(self, points: np.ndarray) -> Distances:
         """See `Solid.distance`.
 
-        The nearest point is x_i = a_i^2 y_i / (t + a_i^2), with t the root above -a_min^2 of sum((a y / (t + a^2))^2) = 1
-        (Eberly, "Distance from a point to an ellipse, an ellipsoid, or a hyperellipsoid", section 3), by bisection.
+        The nearest point is x_i = a_i^2 y_i / (t + a_i^2), with t the root above -a_min^2 of
+        sum((a_i y_i / (t + a_i^2))^2) = 1, by bisection (Eberly, "Distance from a point to an ellipse, an ellipsoid, or
+        a hyperellipsoid", section 3).
         """
         rows = np.arange(len(points))
         folded = np.abs(points)

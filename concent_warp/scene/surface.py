@@ -21,7 +21,7 @@ from concent_warp.scene.scene import Scene
 from concent_warp.scene.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, Placed, Solid
 
 PROBE = 1e-6
-"""How far outside a surface point is looked at to tell an outer face from an inner one, relative to the solid's size."""
+"""How far outside a surface point is looked at to tell an outer face from an inner one, relative to the size."""
 ROUNDS = 200
 """Draws after which a union without outer surface is given up."""
 
@@ -42,7 +42,7 @@ class Surface:
 
         It is made of the geoms that can collide; of all geoms of the body where none can.
 
-        Raises `SceneError` where the body is missing, has no geoms, or has one without a closed surface (plane, hfield).
+        Raises `SceneError` where the body is missing, has no geoms, or one without a closed surface (plane, hfield).
         """
         model = scene.model
         row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
@@ -149,6 +149,16 @@ def geom_solid(scene: Scene, geom: int) -> Solid:
         solid = Cylinder(float(size[0]), float(size[1]))
     elif kind == kinds.mjGEOM_ELLIPSOID:
         solid = Ellipsoid(size.copy())
+    elif kind == kinds.mjGEOM_MESH:
+        import trimesh
+
+        from concent_warp.scene.mesh import MeshSolid
+
+        mesh = model.mesh(model.geom_dataid[geom])
+        first, last = mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0]
+        start, stop = mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0]
+        shape = trimesh.Trimesh(model.mesh_vert[first:last], model.mesh_face[start:stop], process=False)
+        solid = MeshSolid.of(shape, f"mesh {mesh.name!r} in {scene.source}")
     else:
         body = model.body(model.geom_bodyid[geom]).name
         raise SceneError(

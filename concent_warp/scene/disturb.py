@@ -1,0 +1,113 @@
+"""Make a contact geometry wrong on purpose: noise on the centres, or faces moved. For benchmarks and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from concent_warp.errors import ModelError
+from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.surface import Surface
+
+SelectFaces = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From surface points [m] and outward normals, each (n, 3) in the body frame, to which of them are meant, (n,) bool."""
+PROBES = 40_000
+"""Surface points looked at to find the face that a sphere belongs to."""
+
+
+def disturb(
+    geometry: ContactGeometry,
+    *,
+    position_std: float,
+    rng: np.random.Generator,
+    bodies: Sequence[str] | None = None,
+) -> ContactGeometry:
+    """Add independent Gaussian noise to the centres.
+
+    Args:
+        geometry: contact geometry.
+        position_std: standard deviation of each coordinate [m].
+        rng: source of the noise.
+        bodies: bodies whose spheres move; None for all. The noise of a sphere does not depend on this choice.
+    """
+    noise = position_std * rng.standard_normal(geometry.position.shape)
+    if bodies is not None:
+        noise[~np.isin(geometry.body, [body_index(geometry, name) for name in bodies])] = 0
+    return geometry.with_position(geometry.position + noise)
+
+
+def offset_normal(
+    geometry: ContactGeometry,
+    scene: Scene,
+    distance: float,
+    select: SelectFaces,
+    *,
+    body: str,
+    slack: float = 1e-3,
+    surface: Surface | None = None,
+) -> ContactGeometry:
+    """Move the spheres that make up some faces of a body along the outward normals there.
+
+    A sphere makes up a face if the face is no farther from its centre than radius plus `slack`; it moves along the
+    normal of the nearest point of the selected faces.
+
+    Args:
+        geometry: contact geometry.
+        scene: scene that holds the body.
+        distance: how far to move [m]; negative moves inward.
+        select: the faces, say ``toward_axis()`` for the walls of a hole.
+        body: name of the body.
+        slack: allowance [m] for spheres that do not quite reach the face.
+        surface: surface to use in place of the geoms of the scene.
+
+    Raises `ModelError` where no sphere is at the selected faces.
+    """
+    from scipy.spatial import cKDTree
+
+    surface = surface or Surface.of_body(scene, body)
+    mine = np.flatnonzero(geometry.body == body_index(geometry, body))
+    points, normals = surface.sample(PROBES, np.random.default_rng(0))
+    meant = select(points, normals)
+    points, normals = points[meant], normals[meant]
+    if not len(points):
+        raise ModelError(f"no faces of body {body!r} are selected", fix="check the selection")
+    away, nearest = cKDTree(points).query(geometry.position[mine])
+    moved = away <= geometry.radius[mine] + slack
+    if not moved.any():
+        raise ModelError(
+            f"no sphere of body {body!r} is at the selected faces",
+            expected=f"a gap of at most {slack:g} m",
+            found=f"{(away - geometry.radius[mine]).min():.3g} m",
+        )
+    position = geometry.position.copy()
+    position[mine[moved]] += distance * normals[nearest[moved]]
+    return geometry.with_position(position)
+
+
+def toward_axis(
+    point: Sequence[float] = (0.0, 0.0, 0.0), direction: Sequence[float] = (0.0, 0.0, 1.0), *, cosine: float = 0.5
+) -> SelectFaces:
+    """Select the faces that look at an axis, such as the walls of a hole.
+
+    Args:
+        point: a point of the axis, body frame [m], shape (3,).
+        direction: direction of the axis, shape (3,).
+        cosine: least cosine between the normal and the way to the axis.
+    """
+    axis = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+
+    def select(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        away = np.asarray(point, dtype=float) - points
+        away -= (away @ axis)[:, None] * axis
+        return np.einsum("nd,nd->n", away, normals) >= cosine * np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+
+    return select
+
+
+def body_index(geometry: ContactGeometry, name: str) -> int:
+    """Return the index of a body of the geometry."""
+    if name not in geometry.bodies:
+        raise ModelError(f"the contact geometry has no body {name!r}", expected=f"one of {list(geometry.bodies)}")
+    return geometry.bodies.index(name)
