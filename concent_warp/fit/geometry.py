@@ -1,0 +1,258 @@
+"""Fit contact geometry to recordings: the search of the paper's equation 1, with checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from concent_warp.errors import ModelError
+from concent_warp.fit.checkpoint import Checkpoint
+from concent_warp.fit.evolution import Evolution, EvolutionCfg
+from concent_warp.fit.mask import robot_bodies, spheres_in_reach, touched_spheres, with_neighbours
+from concent_warp.fit.objective import Objective
+from concent_warp.fit.target import Segment, observed_states, whole
+from concent_warp.model import Model
+from concent_warp.recording.recording import Recording
+from concent_warp.simulate.engine import Engine, Variants
+from concent_warp.simulate.select import make_engine
+
+
+@dataclass(frozen=True)
+class FitCfg:
+    """Settings of a fit."""
+
+    evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
+    generations: int = 40
+    """Generations at most."""
+    patience: int = 15
+    """Generations without a better estimate after which the fit ends."""
+    held_out: float = 0.2
+    """Share of the frames that choose the best estimate and do not move it."""
+    block: float = 0.2
+    """Length of the held-out blocks [s]."""
+    squared: bool = False
+    """Squared form of the Chamfer distance."""
+    reach: float = 0.006
+    """Spheres that stay farther than this from everything else [m] are left out of the collisions of the search."""
+    seed: int = 0
+    """Seed of all random draws."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands."""
+
+    generation: int
+    generations: int
+    loss: float
+    """Chamfer distance of the present estimate [m]."""
+    best: float
+    """Chamfer distance of the best estimate so far, over the held-out frames [m]."""
+    seconds_left: float
+    """Estimate of the time to the last generation [s]."""
+    simulations: int
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a fit found."""
+
+    model: Model
+    """The model with the fitted geometry."""
+    start: Model
+    """The model as it was."""
+    history: list[dict[str, Any]]
+    """One entry a generation: loss and held_out of the estimate [m], best, sigma [m], spheres, simulations, seconds."""
+    mask: np.ndarray
+    """Spheres that have moved, shape (S,) bool."""
+    stopped: str
+    """Why the fit ended."""
+
+
+def fit_geometry(
+    model: Model,
+    recording: Recording,
+    cfg: FitCfg,
+    *,
+    demonstrations: Sequence[str] | None = None,
+    segments: Sequence[Segment] | None = None,
+    engine: str = "auto",
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> FitResult:
+    """Move the spheres of a model so that replaying a recording reproduces the observed motion.
+
+    Args:
+        model: Model with a starting contact geometry.
+        recording: What was commanded and observed.
+        cfg: Settings.
+        demonstrations: Names of the demonstrations to fit; all by default.
+        segments: Stretches to simulate instead of whole demonstrations.
+        engine: "mujoco", "warp" or "auto".
+        checkpoint: File that holds the state of the fit after each generation.
+        resume: Go on from the checkpoint, to the same result as without the interruption.
+        progress: Called after each generation.
+
+    Raises:
+        ModelError: The model has no contact geometry, or the checkpoint belongs to another fit.
+        RecordingError: The recording does not observe any movable object.
+    """
+    if model.geometry is None:
+        raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
+    if segments is None:
+        names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
+        segments = [whole(model.scene, recording[name], model.geometry.bodies) for name in names]
+    search = Search(model, list(segments), cfg, engine)
+    if resume and checkpoint is not None and checkpoint.is_file():
+        search.restore(Checkpoint.load(checkpoint))
+    while search.stopped is None:
+        search.step()
+        if checkpoint is not None:
+            search.checkpoint().save(checkpoint)
+        if progress is not None:
+            progress(search.progress())
+    return search.result()
+
+
+class Search:
+    """The state of a fit between generations."""
+
+    def __init__(self, model: Model, segments: list[Segment], cfg: FitCfg, engine: str) -> None:
+        """Prepare the first generation."""
+        assert model.geometry is not None
+        self.model, self.segments, self.cfg, self.engine_name = model, segments, cfg, engine
+        self.evolution = Evolution(model.geometry, cfg.evolution)
+        self.rng = np.random.default_rng(cfg.seed)
+        self.robot = robot_bodies(model.scene.model)
+        self.collidable = np.zeros(len(model.geometry), dtype=bool)
+        self.frozen = np.zeros(len(model.geometry), dtype=bool)
+        self.objective: Objective | None = None
+        self.best, self.best_mean, self.best_generation = np.inf, self.evolution.mean.copy(), 0
+        self.history: list[dict[str, Any]] = []
+        self.simulations = 0
+        self.seconds = 0.0
+        self.stopped: str | None = None if cfg.generations > 0 else "no generations asked for"
+
+    def step(self) -> None:
+        """Run one generation."""
+        start = time.perf_counter()
+        cfg, evolution = self.cfg, self.evolution
+        mask, reachable = self.survey()
+        objective = self.prepared(reachable | mask)
+        values = evolution.ask(mask, self.rng)
+        losses = objective(evolution.candidates(np.concatenate([evolution.mean[None], values])))
+        loss, held_out = float(losses.fit[0]), float(losses.held_out[0])
+        self.simulations += (1 + len(losses.fit)) * len(self.segments)
+        if held_out < self.best:
+            self.best, self.best_mean, self.best_generation = held_out, evolution.mean.copy(), evolution.generation
+        sigma = cfg.evolution.sigma * evolution.shrink
+        evolution.tell(values, losses.fit[1:], mask)
+        self.seconds += time.perf_counter() - start
+        self.history.append(
+            {
+                "generation": evolution.generation,
+                "loss": loss,
+                "held_out": held_out,
+                "best": self.best,
+                "candidates": float(np.median(losses.fit[1:])),
+                "sigma": sigma,
+                "moving": int(mask.sum()),
+                "collidable": int(self.collidable.sum()),
+                "simulations": self.simulations,
+                "seconds": self.seconds,
+            }
+        )
+        if evolution.generation >= cfg.generations:
+            self.stopped = f"all {cfg.generations} generations done"
+        elif evolution.generation - self.best_generation > cfg.patience:
+            self.stopped = f"no better estimate for {cfg.patience} generations"
+
+    def survey(self) -> tuple[np.ndarray, np.ndarray]:
+        """Replay the estimate with all spheres; return those that may move and those that may come into contact."""
+        geometry = self.evolution.geometry(self.evolution.mean)
+        current = self.model.with_geometry(geometry)
+        engine = make_engine("mujoco", current)
+        n = len(self.segments)
+        steps = max(len(s.ctrl) for s in self.segments)
+        ctrl = np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in self.segments])
+        variants = Variants(
+            n, qpos=np.stack([s.qpos for s in self.segments]), qvel=np.stack([s.qvel for s in self.segments])
+        )
+        every = np.unique(np.linspace(0, steps, 1 + min(steps, round(steps * engine.timestep * 30))).astype(int))
+        rollout = engine.run(variants, ctrl, record=every, bodies=(), contacts="touched")
+        touched = np.asarray(rollout.touched).any(axis=0)
+        touched, gripped = touched_spheres(touched, engine.sphere_geom, self.robot)
+        if self.cfg.evolution.freeze_gripped:
+            self.frozen |= gripped
+        mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
+        states = [np.asarray(rollout.qpos[s]) for s in range(n)]
+        seen = [
+            observed_states(self.model.scene.model, segment, rollout.time, states[s])
+            for s, segment in enumerate(self.segments)
+        ]
+        reachable = spheres_in_reach(current, np.concatenate(states + seen), self.cfg.reach)
+        return mask, reachable | touched | gripped
+
+    def prepared(self, needed: np.ndarray) -> Objective:
+        """Return the objective with at least the needed spheres collidable."""
+        if self.objective is None or (needed & ~self.collidable).any():
+            self.collidable |= needed
+            engine: Engine = make_engine(self.engine_name, self.model, collidable=self.collidable)
+            self.objective = Objective(
+                engine,
+                self.segments,
+                held_out=self.cfg.held_out,
+                block=self.cfg.block,
+                squared=self.cfg.squared,
+            )
+        return self.objective
+
+    def progress(self) -> Progress:
+        """Return where the fit stands."""
+        done = self.evolution.generation
+        left = self.seconds / max(done, 1) * (self.cfg.generations - done)
+        return Progress(done, self.cfg.generations, self.history[-1]["loss"], self.best, left, self.simulations)
+
+    def result(self) -> FitResult:
+        """Return the best estimate."""
+        moved = (self.best_mean != 0).any(axis=1)
+        fitted = self.model.with_geometry(self.evolution.geometry(self.best_mean))
+        return FitResult(fitted, self.model, self.history, moved, self.stopped or "interrupted")
+
+    def checkpoint(self) -> Checkpoint:
+        """Return all that is needed to go on."""
+        return Checkpoint(
+            cfg=asdict(self.cfg),
+            start=self.evolution.start.position,
+            mean=self.evolution.mean,
+            best_mean=self.best_mean,
+            collidable=self.collidable,
+            frozen=self.frozen,
+            random_state=self.rng.bit_generator.state,
+            numbers={
+                "generation": self.evolution.generation,
+                "best": self.best,
+                "best_generation": self.best_generation,
+                "simulations": self.simulations,
+                "seconds": self.seconds,
+            },
+            history=self.history,
+            stopped=self.stopped,
+        )
+
+    def restore(self, saved: Checkpoint) -> None:
+        """Go on from a checkpoint."""
+        saved.check(asdict(self.cfg), self.evolution.start.position)
+        self.evolution.mean, self.best_mean = saved.mean, saved.best_mean
+        self.collidable, self.frozen = saved.collidable, saved.frozen
+        self.rng.bit_generator.state = saved.random_state
+        self.evolution.generation = int(saved.numbers["generation"])
+        self.best, self.best_generation = saved.numbers["best"], int(saved.numbers["best_generation"])
+        self.simulations, self.seconds = int(saved.numbers["simulations"]), saved.numbers["seconds"]
+        self.history, self.stopped = saved.history, saved.stopped

@@ -1,0 +1,92 @@
+"""Which spheres a fit may move, and which must be collidable while it searches (paper, appendix A)."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.spatial import cKDTree
+
+from concent_warp.model import Model
+from concent_warp.scene.contact_geometry import ContactGeometry
+
+
+def robot_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Return which bodies an actuator moves, directly or by carrying them, shape (nbody,) bool.
+
+    Joints driven through a tendon or coupled by an equality to a driven joint count as driven.
+    """
+    driven: set[int] = set()
+    for a in range(model.nu):
+        target, kind = int(model.actuator_trnid[a, 0]), int(model.actuator_trntype[a])
+        if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+            driven.add(target)
+        elif kind == int(mujoco.mjtTrn.mjTRN_TENDON):
+            start, count = model.tendon_adr[target], model.tendon_num[target]
+            wraps = range(start, start + count)
+            driven |= {int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
+    for e in range(model.neq):
+        if int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_JOINT):
+            pair = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])} - {-1}
+            driven |= pair if pair & driven else set()
+    result = np.zeros(model.nbody, dtype=bool)
+    for body in range(1, model.nbody):
+        joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+        result[body] = result[model.body_parentid[body]] or any(j in driven for j in joints)
+    return result
+
+
+def touched_spheres(touched: np.ndarray, sphere_geom: np.ndarray, robot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split the spheres in contact by what they touched.
+
+    Args:
+        touched: Contacts of one variant by geom and other body, shape (ngeom, nbody) bool.
+        sphere_geom: Geom id of each sphere, -1 where it is not collidable, shape (S,).
+        robot: Which bodies belong to the robot, shape (nbody,) bool.
+
+    Returns:
+        Spheres that touched anything but the robot, and spheres that the robot touched, each (S,) bool.
+    """
+    by_sphere = np.where(sphere_geom[:, None] >= 0, touched[np.maximum(sphere_geom, 0)], False)
+    return by_sphere[:, ~robot].any(axis=1), by_sphere[:, robot].any(axis=1)
+
+
+def with_neighbours(geometry: ContactGeometry, spheres: np.ndarray, k: int) -> np.ndarray:
+    """Return the spheres (S,) bool together with the k nearest neighbours of each on the same body."""
+    result = spheres.copy()
+    for body in geometry.bodies:
+        rows = geometry.of(body)
+        chosen = rows[spheres[rows]]
+        if len(chosen) and k > 0:
+            _, near = cKDTree(geometry.position[rows]).query(geometry.position[chosen], min(k + 1, len(rows)))
+            result[rows[np.unique(near)]] = True
+    return result
+
+
+def spheres_in_reach(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
+    """Return the spheres that come within `reach` [m] of a geom of another body in any of the states, shape (S,) bool.
+
+    Args:
+        model: Model with contact geometry.
+        states: Generalised positions, shape (T, nq).
+        reach: Distance between surfaces [m].
+    """
+    assert model.geometry is not None
+    spec = model.spec()
+    names = model.geometry.names()
+    spheres = set(names)
+    for geom in spec.geoms:
+        if geom.name in spheres:
+            geom.margin = reach
+            geom.gap = reach
+    compiled = spec.compile()
+    row = {compiled.geom(name).id: i for i, name in enumerate(names)}
+    data = mujoco.MjData(compiled)
+    result = np.zeros(len(names), dtype=bool)
+    for qpos in states:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(compiled, data)
+        mujoco.mj_collision(compiled, data)
+        for geom in np.unique(data.contact.geom):
+            if int(geom) in row:
+                result[row[int(geom)]] = True
+    return result

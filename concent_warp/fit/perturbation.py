@@ -1,0 +1,71 @@
+"""Spatially coherent noise over sphere positions (paper, appendix A).
+
+The paper draws noise at the centroid of the deformable region and propagates it through an RBF kernel. Taken literally
+that is one translation of each object; what deforms surfaces smoothly is a sample of a Gaussian process whose
+covariance is the same RBF kernel. Both are here, and independent noise for comparison.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from concent_warp.scene.contact_geometry import ContactGeometry
+
+Noise = Literal["gaussian_process", "centroid", "independent"]
+JITTER = 1e-6
+
+
+class Perturbation:
+    """Draws noise of unit standard deviation over the spheres of a mask."""
+
+    def __init__(self, geometry: ContactGeometry, mask: np.ndarray, kind: Noise, length: float) -> None:
+        """Prepare the draws.
+
+        Args:
+            geometry: Where the spheres are.
+            mask: Spheres that may move, shape (S,) bool.
+            kind: Gaussian-process sample, the paper's literal reading, or independent noise.
+            length: Length scale of the RBF kernel [m].
+        """
+        self.shape = len(geometry)
+        self.blocks: list[tuple[np.ndarray, np.ndarray]] = []
+        for body in geometry.bodies:
+            rows = geometry.of(body)
+            rows = rows[mask[rows]]
+            if not len(rows):
+                continue
+            points = geometry.position[rows]
+            if kind == "gaussian_process":
+                factor = np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(rows)))
+            elif kind == "centroid":
+                factor = rbf(points, points.mean(axis=0, keepdims=True), length)
+            else:
+                factor = np.eye(len(rows))
+            self.blocks.append((rows, factor))
+
+    def draw(self, count: int, channels: int, rng: np.random.Generator) -> np.ndarray:
+        """Return `count` samples with independent channels, shape (count, S, channels); zero outside the mask."""
+        result = np.zeros((count, self.shape, channels))
+        for rows, factor in self.blocks:
+            result[:, rows] = np.einsum("rk,ckd->crd", factor, rng.normal(size=(count, factor.shape[1], channels)))
+        return result
+
+
+def rbf(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
+    """Return the kernel exp(-|a_i - b_j|^2 / (2 length^2)), shape (len(a), len(b)); positions and length in m."""
+    squared = ((a[:, None] - b[None]) ** 2).sum(axis=2)
+    return np.exp(-squared / (2 * length**2))
+
+
+def smoothed(geometry: ContactGeometry, mask: np.ndarray, values: np.ndarray, length: float) -> np.ndarray:
+    """Return `values` (S, channels) averaged over neighbours by the normalised kernel, inside the mask of each body."""
+    result = values.copy()
+    for body in geometry.bodies:
+        rows = geometry.of(body)
+        rows = rows[mask[rows]]
+        if len(rows):
+            weight = rbf(geometry.position[rows], geometry.position[rows], length)
+            result[rows] = weight @ values[rows] / weight.sum(axis=1, keepdims=True)
+    return result

@@ -1,0 +1,167 @@
+"""What a fit aims at: observed point clouds of each object, cut into segments that are simulated on their own.
+
+The observed clouds V_t (paper, section 3.1.1) are tracked material points. The simulator's prediction of the same
+points is V_0, carried in the frame of the body as the simulation moves it. A recording that holds poses instead of
+points serves as well: points on the body's surface are then carried by the measured pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.recording import Channel, Demonstration
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.replay import commands, initial_state, step_count
+
+REST = 5e-4
+"""While the mean of a body's points has moved less than this [m], they count as at rest."""
+CARRIED_POINTS = 64
+"""Surface points that stand for a body whose pose is measured."""
+
+
+@dataclass(frozen=True)
+class BodyTarget:
+    """Observed points of one body during one segment."""
+
+    body: str
+    anchor: np.ndarray
+    """The points in the body frame [m], shape (M, 3)."""
+    time: np.ndarray
+    """Times from the segment's start [s], shape (T,)."""
+    points: np.ndarray
+    """Observed positions [m], world frame, shape (T, M, 3); NaN where not seen."""
+
+    def held_out(self, share: float, block: float) -> np.ndarray:
+        """Return which frames are kept from the fit, shape (T,) bool: every 1/share-th block of `block` seconds."""
+        if share <= 0:
+            return np.zeros(len(self.time), dtype=bool)
+        number = np.floor(self.time / block).astype(int)
+        return number % max(round(1 / share), 2) == 1
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a demonstration that is simulated from a state of its own."""
+
+    name: str
+    qpos: np.ndarray
+    """State at the start, shape (nq,)."""
+    qvel: np.ndarray
+    """Velocity at the start, shape (nv,)."""
+    ctrl: np.ndarray
+    """Commands, shape (K, nu)."""
+    targets: tuple[BodyTarget, ...]
+
+
+def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
+    """Return a demonstration as one segment, with the bodies of `bodies` that move and were observed as targets."""
+    model = scene.model
+    steps = step_count(demonstration, model.opt.timestep)
+    qpos, qvel = initial_state(model, demonstration)
+    movable = [body for body in bodies if model.body(body).weldid[0] != 0]
+    targets = [t for body in movable if (t := body_target(scene, demonstration, body, qpos)) is not None]
+    if not targets:
+        raise RecordingError(
+            "nothing to fit to",
+            where=demonstration.name,
+            expected=f"points, or position and orientation sensors, of one of {movable}",
+            fix="record /points/<body> or the body's pose",
+        )
+    return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets))
+
+
+def body_target(scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray) -> BodyTarget | None:
+    """Return the observed points of a body: tracked ones, else its surface carried by its measured pose, else None."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(scene.model, data)
+    origin, rotation = data.body(body).xpos.copy(), data.body(body).xmat.reshape(3, 3).copy()
+    if body in demonstration.points:
+        track = demonstration.points[body]
+        points = np.where(track.visible[:, :, None], track.value, np.nan)
+        anchor = (resting_mean(points) - origin) @ rotation
+        known = np.isfinite(anchor).all(axis=1)
+        return BodyTarget(body, anchor[known], track.time, points[:, known])
+    pose = measured_pose(scene.model, demonstration, body)
+    if pose is None:
+        return None
+    time, position, turn = pose
+    anchor = carried_points(scene, body)
+    return BodyTarget(body, anchor, time, position[:, None] + np.einsum("tij,mj->tmi", turn.as_matrix(), anchor))
+
+
+def resting_mean(points: np.ndarray) -> np.ndarray:
+    """Return each point's mean over the frames before the body moves [m], shape (M, 3); NaN for points unseen then."""
+    centre = np.nanmean(points - points[:1], axis=1)
+    moved = np.flatnonzero(np.linalg.norm(centre, axis=1) > REST)
+    frames = max(int(moved[0]) if len(moved) else len(points), 1)
+    seen = np.isfinite(points[:frames]).all(axis=2)
+    total = np.where(seen[:, :, None], points[:frames], 0.0).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        return total / np.where(seen.any(axis=0), seen.sum(axis=0), np.nan)[:, None]
+
+
+def measured_pose(
+    model: mujoco.MjModel, demonstration: Demonstration, body: str
+) -> tuple[np.ndarray, np.ndarray, Rotation] | None:
+    """Return times [s], positions [m] (T, 3) and rotations of a body's frame, from its pose sensors; None without."""
+    position = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEPOS)
+    orientation = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
+    if position is None or orientation is None:
+        return None
+    valid = np.isfinite(orientation.value).all(axis=1)
+    turn = Rotation.from_quat(orientation.value[valid], scalar_first=True)
+    time, value = position.time, position.value
+    nearest = np.abs(time[:, None] - orientation.time[valid][None, :]).argmin(axis=1)
+    return time, value, turn[nearest]
+
+
+def frame_channel(model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor) -> Channel | None:
+    """Return the measured channel of a world-frame sensor of a kind on a body's frame, or None."""
+    row = model.body(body).id
+    for name, channel in demonstration.measured.items():
+        sensor = model.sensor(name)
+        on_body = int(model.sensor_objtype[sensor.id]) == int(mujoco.mjtObj.mjOBJ_XBODY)
+        if on_body and int(model.sensor_type[sensor.id]) == int(kind) and model.sensor_objid[sensor.id] == row:
+            return channel
+    return None
+
+
+def observed_states(model: mujoco.MjModel, segment: Segment, time: np.ndarray, qpos: np.ndarray) -> np.ndarray:
+    """Return simulated states with each free body where its points were observed, shape (T, nq).
+
+    Args:
+        model: Compiled scene.
+        segment: Holds the observed points.
+        time: Times of the states [s], shape (T,).
+        qpos: Simulated states, shape (T, nq).
+    """
+    result = qpos.copy()
+    for target in segment.targets:
+        joint = model.body(target.body).jntadr[0]
+        if joint < 0 or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
+            continue
+        address = model.jnt_qposadr[joint]
+        for row, now in enumerate(time):
+            frame = int(np.abs(target.time - now).argmin())
+            seen = np.isfinite(target.points[frame]).all(axis=1)
+            if seen.sum() >= 3:
+                observed, anchor = target.points[frame, seen], target.anchor[seen]
+                turn, _ = Rotation.align_vectors(observed - observed.mean(axis=0), anchor - anchor.mean(axis=0))
+                position = observed.mean(axis=0) - turn.apply(anchor.mean(axis=0))
+                result[row, address : address + 7] = [*position, *turn.as_quat(scalar_first=True)]
+    return result
+
+
+def carried_points(scene: Scene, body: str) -> np.ndarray:
+    """Return points spread over a body's surface, body frame [m], shape (CARRIED_POINTS, 3)."""
+    from concent_warp.scene.sampling import farthest_point_sampling
+    from concent_warp.scene.surface import Surface
+
+    points, _ = Surface.of_body(scene, body).sample(20 * CARRIED_POINTS, np.random.default_rng(0))
+    return points[farthest_point_sampling(points, CARRIED_POINTS)]
