@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 
 if TYPE_CHECKING:
+    import mujoco
+
     from concent_warp.model import Model
 
 Contacts = Literal["none", "touched", "all"]
@@ -111,6 +113,11 @@ class Engine(Protocol):
     @property
     def timestep(self) -> float:
         """The model's time step [s]."""
+        ...
+
+    @property
+    def compiled(self) -> mujoco.MjModel:
+        """The compiled model that geom ids refer to. Not to be edited."""
         ...
 
     def run(
