@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import EngineError
+from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
 from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants
 
@@ -139,7 +140,7 @@ class MujocoEngine:
 
     def _variant_model(self, variants: Variants, n: int) -> mujoco.MjModel:
         """Return the model of variant n, compiled anew where geometry varies: the mid-phase trees depend on it."""
-        if any(getattr(variants, name) is not None for name in SPHERE_FIELDS):
+        if len(self._sphere_geom) and any(getattr(variants, name) is not None for name in SPHERE_FIELDS):
             try:
                 workshop = self._workshops.get_nowait()
             except queue.Empty:
@@ -181,19 +182,26 @@ class Workshop:
         self._spec = model.spec(collidable)
         if memory is not None:
             self._spec.memory = memory
+        geometry = model.geometry
+        assert geometry is not None
+        self._nominal = {
+            "sphere_position": geometry.position,
+            "sphere_radius": geometry.radius,
+            "sphere_friction": geometry.friction,
+        }
         geoms = {geom.name: geom for geom in self._spec.geoms}
-        names = [] if model.geometry is None else model.geometry.names()
-        self._geoms = [(i, geoms[name]) for i, name in enumerate(names) if name in geoms]
+        self._geoms = [(i, geoms[name]) for i, name in enumerate(geometry.names()) if name in geoms]
 
     def compile(self, variants: Variants, n: int) -> mujoco.MjModel:
-        """Return the compiled model of variant n, spheres only."""
+        """Return the compiled model of variant n, spheres only; what does not vary goes back to the model's own."""
+        position, radius, friction = (
+            nominal if (value := getattr(variants, name)) is None else value[n]
+            for name, nominal in self._nominal.items()
+        )
         for i, geom in self._geoms:
-            if variants.sphere_position is not None:
-                geom.pos = variants.sphere_position[n, i]
-            if variants.sphere_radius is not None:
-                geom.size[0] = variants.sphere_radius[n, i]
-            if variants.sphere_friction is not None:
-                geom.friction[0] = variants.sphere_friction[n, i]
+            geom.pos = position[i]
+            geom.size[0] = radius[i]
+            geom.friction[0] = friction[i]
         return self._spec.compile()
 
 
@@ -336,21 +344,6 @@ def collect(logs: Sequence[Sequence[tuple[int, np.ndarray]]]) -> ContactLog:
     variant = np.repeat(np.array([n for n, _, _ in parts], dtype=int), sizes)
     step = np.repeat(np.array([s for _, s, _ in parts], dtype=int), sizes)
     return sorted_log(variant, step, rows)
-
-
-def sorted_log(variant: np.ndarray, step: np.ndarray, rows: np.ndarray) -> ContactLog:
-    """Return the log of contact `rows`, shape (C, 12) as from `contact_rows`, in its one order."""
-    order = np.lexsort((rows[:, 4], rows[:, 3], rows[:, 2], rows[:, 8], rows[:, 1], rows[:, 0], step, variant))
-    rows = rows[order]
-    return ContactLog(
-        variant=variant[order],
-        step=step[order],
-        geom=rows[:, :2].astype(int),
-        position=rows[:, 2:5],
-        normal=rows[:, 5:8],
-        distance=rows[:, 8],
-        force=rows[:, 9:12],
-    )
 
 
 def apply_fields(m: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
