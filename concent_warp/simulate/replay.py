@@ -86,7 +86,7 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
             qpos[model.jnt_qposadr[target]] = first[0, 0]
             continue
-        if model.sensor_objtype[sensor.id] not in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
+        if int(model.sensor_objtype[sensor.id]) not in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
             continue
         joint = model.body_jntadr[target]
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
@@ -139,7 +139,7 @@ def predict(model: mujoco.MjModel, rollout: Rollout, sensor: str, channel: Chann
     row = model.sensor(sensor).id
     address, dim = model.sensor_adr[row], model.sensor_dim[row]
     value = np.asarray(rollout.sensordata[variant][:, address : address + dim], dtype=float)
-    if model.sensor_type[row] in UNIT_QUATERNION_SENSORS:
+    if int(model.sensor_type[row]) in UNIT_QUATERNION_SENSORS:
         flips = np.where((value[1:] * value[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         value = value * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
         result = interpolate(rollout.time, value, channel.time)
