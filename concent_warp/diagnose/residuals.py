@@ -1,0 +1,260 @@
+"""Residuals: what was measured less what a model predicts, channel by channel, at the measurement's own times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import gamma
+from typing import TYPE_CHECKING, Literal
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.errors import RecordingError
+from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, interpolate, predict
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack
+    from concent_warp.simulate.engine import Rollout
+
+ANCHOR_FRAMES = 5
+"""Frames of a point track, from the first on, that tell where on the body a point sits."""
+
+SENSOR = mujoco.mjtSensor
+POSITIONS = (SENSOR.mjSENS_FRAMEPOS, SENSOR.mjSENS_SUBTREECOM)
+BODIES = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+UNITS = {
+    SENSOR.mjSENS_FRAMEPOS: "m",
+    SENSOR.mjSENS_SUBTREECOM: "m",
+    SENSOR.mjSENS_RANGEFINDER: "m",
+    SENSOR.mjSENS_FRAMEQUAT: "rad",
+    SENSOR.mjSENS_BALLQUAT: "rad",
+    SENSOR.mjSENS_FRAMELINVEL: "m/s",
+    SENSOR.mjSENS_VELOCIMETER: "m/s",
+    SENSOR.mjSENS_SUBTREELINVEL: "m/s",
+    SENSOR.mjSENS_FRAMEANGVEL: "rad/s",
+    SENSOR.mjSENS_GYRO: "rad/s",
+    SENSOR.mjSENS_BALLANGVEL: "rad/s",
+    SENSOR.mjSENS_ACCELEROMETER: "m/s²",
+    SENSOR.mjSENS_FRAMELINACC: "m/s²",
+    SENSOR.mjSENS_FRAMEANGACC: "rad/s²",
+    SENSOR.mjSENS_FORCE: "N",
+    SENSOR.mjSENS_TOUCH: "N",
+    SENSOR.mjSENS_TORQUE: "N m",
+}
+"""Units of sensors that do not depend on the joint that they sit on."""
+JOINT_UNITS = {
+    SENSOR.mjSENS_JOINTPOS: ("rad", "m"),
+    SENSOR.mjSENS_TENDONPOS: ("rad", "m"),
+    SENSOR.mjSENS_ACTUATORPOS: ("rad", "m"),
+    SENSOR.mjSENS_JOINTVEL: ("rad/s", "m/s"),
+    SENSOR.mjSENS_TENDONVEL: ("rad/s", "m/s"),
+    SENSOR.mjSENS_ACTUATORVEL: ("rad/s", "m/s"),
+    SENSOR.mjSENS_ACTUATORFRC: ("N m", "N"),
+    SENSOR.mjSENS_JOINTACTFRC: ("N m", "N"),
+    SENSOR.mjSENS_TENDONACTFRC: ("N m", "N"),
+}
+"""Units on a hinge and on a slide."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Measurement less model of one channel of one demonstration."""
+
+    channel: str
+    """Sensor name, or ``<body> points`` of a point track."""
+    kind: Literal["position", "orientation", "joint", "points", "other"]
+    unit: str
+    """Unit of `value`, `error` and `noise`."""
+    body: str | None
+    """Body that the channel is about, where it is about one."""
+    time: np.ndarray
+    """Times of the measurements [s], shape (T,)."""
+    value: np.ndarray
+    """Measured less predicted, shape (T, dim); of an orientation the rotation vector from predicted to measured, in
+    the predicted frame; of points the mean over the visible points; NaN where nothing was measured."""
+    error: np.ndarray
+    """How far off, shape (T,): Euclidean norm, rotation angle, mean distance of the visible points from where the model
+    has them; NaN where nothing was measured, infinite where the model has diverged."""
+    noise: float | None
+    """Mean error that the measurement noise alone would leave with a perfect model, where known."""
+
+
+def residuals(compiled: mujoco.MjModel, rollout: Rollout, demonstration: Demonstration) -> tuple[Residual, ...]:
+    """Return the residuals of every measured channel and every point track.
+
+    Args:
+        compiled: The model as the engine compiled it.
+        rollout: Replay of the demonstration, one variant, NumPy, all bodies recorded.
+        demonstration: What was measured.
+
+    Raises:
+        RecordingError: A channel names a sensor or a body that the model lacks, or has another dimension.
+    """
+    found = [
+        sensor_residual(compiled, rollout, name, channel, demonstration.name)
+        for name, channel in demonstration.measured.items()
+    ]
+    for body, track in demonstration.points.items():
+        if body not in rollout.bodies:
+            raise RecordingError(
+                f"points of a body {body!r} that the model lacks",
+                where=demonstration.name,
+                expected=f"one of {list(rollout.bodies)}",
+            )
+        found.append(point_residual(rollout, body, track))
+    return tuple(found)
+
+
+def sensor_residual(compiled: mujoco.MjModel, rollout: Rollout, name: str, channel: Channel, where: str) -> Residual:
+    """Return the residual of one sensor."""
+    row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if row < 0:
+        names = [compiled.sensor(i).name for i in range(compiled.nsensor)]
+        raise RecordingError(
+            f"a measurement of a sensor {name!r} that the model lacks", where=where, expected=f"one of {names}"
+        )
+    if channel.value.shape[1] != compiled.sensor_dim[row]:
+        raise RecordingError(
+            f"sensor {name!r} measures another number of values than the model's",
+            where=where,
+            expected=int(compiled.sensor_dim[row]),
+            found=channel.value.shape[1],
+        )
+    predicted = predict(compiled, rollout, name, channel)
+    kind, unit = kind_and_unit(compiled, row)
+    value = rotation_between(predicted, channel.value) if kind == "orientation" else channel.value - predicted
+    error = np.linalg.norm(value, axis=1)
+    noise = None if channel.noise_std is None else channel.noise_std * mean_norm(value.shape[1])
+    return Residual(
+        channel=name,
+        kind=kind,
+        unit=unit,
+        body=body_of(compiled, row),
+        time=channel.time,
+        value=value,
+        error=lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
+        noise=noise,
+    )
+
+
+def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
+    """Return the residual of a point track: each material point against where the model's body carries it.
+
+    Where a point sits on the body is the mean of its first `ANCHOR_FRAMES` observations, brought into the body frame by
+    the model's own pose at these times; points not seen then take no part. What these observations scatter tells the
+    noise.
+    """
+    row = rollout.bodies.index(body)
+    position = interpolate(rollout.time, rollout.body_position[0][:, row], track.time)
+    quaternion = interpolate(rollout.time, same_sign(rollout.body_quaternion[0][:, row]), track.time)
+    rotation = rotations(quaternion)
+    seen = np.where(track.visible[..., None], track.value, np.nan)
+    local = np.einsum("tji,tmj->tmi", rotation[:ANCHOR_FRAMES], seen[:ANCHOR_FRAMES] - position[:ANCHOR_FRAMES, None])
+    there = np.isfinite(local).all(axis=2)
+    sightings = there.sum(axis=0)
+    anchor = np.where(there[..., None], local, 0).sum(axis=0) / np.maximum(sightings, 1)[:, None]
+    anchor[sightings == 0] = np.nan
+    offset = seen - (position[:, None] + np.einsum("tij,mj->tmi", rotation, anchor))
+    measured = np.isfinite(seen).all(axis=2) & (sightings > 0)
+    share = measured / np.maximum(measured.sum(axis=1), 1)[:, None]
+    distance = np.where(measured, np.linalg.norm(offset, axis=2), 0)
+    value = (share[..., None] * np.where(measured[..., None], offset, 0)).sum(axis=1)
+    some = np.asarray(measured.any(axis=1))
+    value[~some] = np.nan
+    error = np.where(some, (share * distance).sum(axis=1), np.nan)
+    return Residual(
+        channel=f"{body} points",
+        kind="points",
+        unit="m",
+        body=body,
+        time=track.time,
+        value=value,
+        error=lost(error, position, some),
+        noise=point_noise(local, anchor, sightings),
+    )
+
+
+def point_noise(local: np.ndarray, anchor: np.ndarray, sightings: np.ndarray) -> float | None:
+    """Return the mean distance that the scatter of `local` (F, M, 3) about `anchor` (M, 3) [m] leaves, if it tells.
+
+    The anchors are means of `sightings` (M,) observations, so they err too.
+    """
+    several = sightings > 1
+    if not several.any():
+        return None
+    square = np.nansum((local[:, several] - anchor[several]) ** 2)
+    std = np.sqrt(square / (3 * (sightings[several] - 1).sum()))
+    return float(std * np.sqrt(1 + np.mean(1 / sightings[several])) * mean_norm(3))
+
+
+def lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return `error` (T,), infinite where something was `measured` (T,) and `predicted` (T, dim) is not finite."""
+    diverged = measured & ~np.isfinite(predicted).all(axis=1)
+    return np.where(diverged, np.inf, np.where(measured, error, np.nan))
+
+
+def kind_and_unit(
+    compiled: mujoco.MjModel, row: int
+) -> tuple[Literal["position", "orientation", "joint", "other"], str]:
+    """Return what a sensor measures and the unit of its residual."""
+    sensor = SENSOR(int(compiled.sensor_type[row]))
+    if sensor in UNIT_QUATERNION_SENSORS:
+        return "orientation", "rad"
+    if sensor in JOINT_UNITS:
+        unit = JOINT_UNITS[sensor][slides(compiled, sensor, int(compiled.sensor_objid[row]))]
+        return "joint" if unit in ("rad", "m") else "other", unit
+    return "position" if sensor in POSITIONS else "other", UNITS.get(sensor, "")
+
+
+def slides(compiled: mujoco.MjModel, sensor: mujoco.mjtSensor, target: int) -> bool:
+    """Return whether a joint, tendon or actuator sensor is about lengths rather than angles."""
+    if sensor in (SENSOR.mjSENS_ACTUATORPOS, SENSOR.mjSENS_ACTUATORVEL, SENSOR.mjSENS_ACTUATORFRC):
+        tendon = compiled.actuator_trntype[target] == mujoco.mjtTrn.mjTRN_TENDON
+        target = int(compiled.actuator_trnid[target, 0])
+    else:
+        tendon = sensor in (SENSOR.mjSENS_TENDONPOS, SENSOR.mjSENS_TENDONVEL, SENSOR.mjSENS_TENDONACTFRC)
+    if not tendon:
+        return compiled.jnt_type[target] == mujoco.mjtJoint.mjJNT_SLIDE
+    start = compiled.tendon_adr[target]
+    wraps = range(start, start + compiled.tendon_num[target])
+    joints = [compiled.wrap_objid[w] for w in wraps if compiled.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT]
+    return all(compiled.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE for j in joints)
+
+
+def body_of(compiled: mujoco.MjModel, row: int) -> str | None:
+    """Return the body that a frame sensor sits on."""
+    if int(compiled.sensor_objtype[row]) in BODIES:
+        return compiled.body(compiled.sensor_objid[row]).name
+    return None
+
+
+def mean_norm(dim: int) -> float:
+    """Return the mean length of a vector of `dim` independent standard normal numbers (chi distribution)."""
+    return float(np.sqrt(2) * gamma((dim + 1) / 2) / gamma(dim / 2))
+
+
+def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return rotation vectors [rad], shape (T, 3), that turn `start` into `end`, quaternions wxyz (T, 4).
+
+    In the frame of `start`; NaN where either is.
+    """
+    vector = np.full((len(start), 3), np.nan)
+    valid = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    turn = Rotation.from_quat(start[valid], scalar_first=True).inv() * Rotation.from_quat(end[valid], scalar_first=True)
+    vector[valid] = turn.as_rotvec()
+    return vector
+
+
+def same_sign(quaternion: np.ndarray) -> np.ndarray:
+    """Return quaternions (T, 4) with signs flipped so that each is on the side of the one before it."""
+    flips = np.where((quaternion[1:] * quaternion[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def rotations(quaternion: np.ndarray) -> np.ndarray:
+    """Return rotation matrices, shape (T, 3, 3), of quaternions wxyz (T, 4) of any length but zero; NaN for NaN."""
+    matrix = np.full((len(quaternion), 3, 3), np.nan)
+    valid = np.isfinite(quaternion).all(axis=1)
+    matrix[valid] = Rotation.from_quat(quaternion[valid], scalar_first=True).as_matrix()
+    return matrix
