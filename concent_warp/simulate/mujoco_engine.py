@@ -17,6 +17,7 @@ import numpy as np
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
+from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants
 
 if TYPE_CHECKING:
@@ -151,7 +152,8 @@ class MujocoEngine:
             m = copy.copy(self._compiled)
         else:
             return self._compiled
-        apply_fields(m, {name: value[n] for name, value in variants.fields.items()})
+        if variants.fields:
+            apply_fields(m, {name: value[n] for name, value in variants.fields.items()}, mujoco.MjData(m))
         return m
 
     def _grow(self, count: int) -> None:
@@ -344,24 +346,6 @@ def collect(logs: Sequence[Sequence[tuple[int, np.ndarray]]]) -> ContactLog:
     variant = np.repeat(np.array([n for n, _, _ in parts], dtype=int), sizes)
     step = np.repeat(np.array([s for _, s, _ in parts], dtype=int), sizes)
     return sorted_log(variant, step, rows)
-
-
-def apply_fields(m: mujoco.MjModel, fields: dict[str, np.ndarray]) -> None:
-    """Set fields of a compiled model, and the constants that MuJoCo derives from them."""
-    if not fields:
-        return
-    for name, value in fields.items():
-        if name.startswith("opt."):
-            setattr(m.opt, name[4:], value)
-        else:
-            getattr(m, name)[:] = value
-    if "geom_margin" in fields:
-        m.body_margin[:] = 0
-        np.maximum.at(m.body_margin, m.geom_bodyid, m.geom_margin)
-    mujoco.mj_setConst(m, mujoco.MjData(m))
-    for name in ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0"):
-        if name in fields:
-            getattr(m, name)[:] = fields[name]
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from concent_warp.errors import EngineError
@@ -40,7 +42,11 @@ def make_engine(name: EngineName, model: Model, *, collidable: np.ndarray | None
 
 
 def has_cuda() -> bool:
-    """Return whether Warp finds a CUDA device."""
+    """Return whether Warp finds a CUDA device; without a driver, Warp is not even asked, since it prints a warning."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        return False
     import warp
 
     return warp.is_cuda_available()

@@ -1,0 +1,332 @@
+"""Variants of a model as parallel worlds of MuJoCo-Warp."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+
+from concent_warp.errors import EngineError
+from concent_warp.simulate.contact_log import sorted_log
+from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
+from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model
+from concent_warp.simulate.mujoco_engine import quiet_warnings
+from concent_warp.simulate.warp_model import batchable, is_switch
+from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, world_bytes
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+
+BITS = mjw.OverflowType
+GROWING = BITS.NEFC | BITS.NJMAX_NNZ | BITS.BROADPHASE | BITS.NARROWPHASE | BITS.CCD | BITS.CONTACT_MATCH
+"""Overflows that larger buffers mend."""
+FATAL = BITS.HFIELD | BITS.NVMAX | BITS.EPA_HORIZON | BITS.TACTILE
+"""Overflows of buffers whose size cannot be set."""
+LIMITED = BITS.ITERATIONS | BITS.LS_ITERATIONS
+
+LOG_ROW_BYTES = 14 * 4
+PROGRAMS = 2
+"""Programs kept for the next run with the same shapes."""
+HEADROOM = 1.5
+"""Memory that MuJoCo-Warp takes in a step, relative to that of its data."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What came out of the worlds of one program run."""
+
+    records: list[torch.Tensor]
+    touched: torch.Tensor | None
+    log: tuple[np.ndarray, np.ndarray] | None
+    unstable_step: np.ndarray
+
+
+class WarpEngine:
+    """Simulates in MuJoCo-Warp, in single precision. See `concent_warp.simulate.engine.Engine`.
+
+    Graphs and buffers are kept between runs of the same shapes, so that a run with other values costs no set-up.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        collidable: np.ndarray | None = None,
+        device: str | None = None,
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        max_memory: int | None = None,
+        max_worlds: int | None = None,
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            model: What to simulate.
+            collidable: Spheres that take part in the physics, shape (S,) bool; None for all.
+            device: Warp's name of the device; ``cuda:0`` where there is one, else ``cpu``.
+            nconmax: Contacts and candidate pairs to make room for, a world, in a pool for all worlds. By default
+                measured: the first variant is simulated in C MuJoCo before the first run. It grows when it overflows.
+            njmax: Constraint rows to make room for in each world; the same holds.
+            max_memory: Memory that the data of all worlds may take [bytes]; by default 40 % of what is free on a GPU,
+                2 GiB on a CPU.
+            max_worlds: Worlds simulated at a time; by default what fits the memory.
+        """
+        self.model = model
+        self.device = str(wp.get_device(device if device is not None else preferred_device()))
+        self._compiled, self._sphere_geom = compile_model(model, collidable)
+        self._max_memory = free_memory(self.device) if max_memory is None else int(max_memory)
+        self._max_worlds = max_worlds
+        self._nconmax, self._njmax = nconmax, njmax
+        self._buffers: Buffers | None = None
+        self._world_bytes: dict[Buffers, int] = {}
+        self._programs: OrderedDict[Plan, Program] = OrderedDict()
+        self.repeats = 0
+        """How often the last run was repeated with larger buffers."""
+        self.limited = 0
+        """In how many variants of the last run the solver or its line search reached its iteration limit."""
+
+    @property
+    def timestep(self) -> float:
+        """The model's time step [s]."""
+        return float(self._compiled.opt.timestep)
+
+    @property
+    def compiled(self) -> mujoco.MjModel:
+        """The compiled model of the variant that changes nothing; geom ids refer to it. Not to be edited."""
+        return self._compiled
+
+    @property
+    def sphere_geom(self) -> np.ndarray:
+        """Geom id of each sphere of the model's geometry, shape (S,) int; -1 for those that are not collidable."""
+        return self._sphere_geom
+
+    @property
+    def buffers(self) -> Buffers | None:
+        """Sizes in use, as they have grown so far; None before the first run."""
+        return self._buffers
+
+    def run(
+        self,
+        variants: Variants,
+        ctrl: np.ndarray,
+        *,
+        record: Sequence[int] | np.ndarray | None = None,
+        bodies: Sequence[str] | None = None,
+        contacts: Contacts = "none",
+    ) -> Rollout:
+        """Simulate all variants, see `Engine.run`.
+
+        Arrays of the rollout are float32 tensors on the device, its contact log is NumPy. A variant whose position,
+        velocity or acceleration is not finite or beyond 1e10 is `diverged`, and its records are NaN from then on.
+        """
+        run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
+        for name in variants.fields:
+            if not batchable(name):
+                raise EngineError(f"{name} cannot vary between the worlds of MuJoCo-Warp", fix="use MujocoEngine")
+        if self._buffers is None:
+            self._buffers = self._first_buffers(run)
+        self.repeats = self.limited = 0
+        parts: list[Part] = []
+        start = 0
+        while start < variants.count:
+            size = self._chunk(self._buffers, variants.count)
+            part = self._run_part(run, np.arange(start, start + size))
+            if part is not None:
+                parts.append(part)
+                start += size
+        return self._join(run, parts)
+
+    def _run_part(self, run: Run, rows: np.ndarray) -> Part | None:
+        """Simulate the variants `rows`, the last one standing in for those beyond; None if buffers had to grow."""
+        assert self._buffers is not None
+        count = run.variants.count
+        kept = int((rows < count).sum())
+        rows = np.minimum(rows, count - 1)
+        program = self._program(run, len(rows))
+        spheres = {name: pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
+        fields = {name: pick(value, rows) for name, value in run.variants.fields.items()}
+        ctrl = run.ctrl if run.shared_ctrl else run.ctrl[rows]
+        qpos, qvel = pick(run.variants.qpos, rows), pick(run.variants.qvel, rows)
+        program.load(spheres, fields, qpos, qvel, ctrl, run.record)
+        demand = program.run()
+        if (grown := self._grown(self._buffers, demand, program)) is not None:
+            self._buffers = grown
+            self._programs.clear()
+            self.repeats += 1
+            return None
+        self.limited += int(((demand.overflow[:kept] & int(LIMITED)) != 0).sum())
+        log = None
+        if run.contacts == "all":
+            key, value = program.log(demand)
+            inside = key[:, 0] < kept
+            log = key[inside] + np.array([rows[0], 0, 0, 0]), value[inside]
+        return Part(
+            records=[values[:kept] for values in program.records()],
+            touched=program.touched()[:kept] if run.contacts == "touched" else None,
+            log=log,
+            unstable_step=demand.unstable_step[:kept],
+        )
+
+    def _program(self, run: Run, worlds: int) -> Program:
+        """Return a program for a run, a kept one if there is one."""
+        assert self._buffers is not None
+        fields = run.variants.fields
+        plan = Plan(
+            worlds=worlds,
+            steps=run.steps,
+            shared_ctrl=run.shared_ctrl,
+            records=len(run.record),
+            bodies=tuple(run.body_ids.tolist()),
+            contacts=run.contacts,
+            spheres=tuple(name for name in SPHERE_FIELDS if getattr(run.variants, name) is not None),
+            fields=tuple((name, is_switch(name) and bool((fields[name] != 0).any())) for name in sorted(fields)),
+        )
+        if plan in self._programs:
+            self._programs.move_to_end(plan)
+            return self._programs[plan]
+        while len(self._programs) >= PROGRAMS:
+            self._programs.popitem(last=False)
+        typical = {name: largest(value) for name, value in fields.items()}
+        program = Program(self._compiled, self._sphere_geom, plan, self._buffers, typical, self.device)
+        self._programs[plan] = program
+        return program
+
+    def _first_buffers(self, run: Run) -> Buffers:
+        """Return sizes for the first run: what was given, else twice what the first variant needs in C MuJoCo."""
+        contacts, constraints, total = probe(self._compiled, run)
+        return Buffers(
+            contacts=rung(2 * contacts + 8) if self._nconmax is None else self._nconmax,
+            constraints=rung(1.5 * constraints + 16) if self._njmax is None else self._njmax,
+            log_rows=int(min(2 * total * run.variants.count + 64, self._max_memory / 8 / LOG_ROW_BYTES)),
+        )
+
+    def _grown(self, buffers: Buffers, demand: Demand, program: Program) -> Buffers | None:
+        """Return the sizes that a run would have needed, or None if all went well."""
+        bits = BITS(int(np.bitwise_or.reduce(demand.overflow)))
+        sane = demand.unstable_step > program.plan.steps
+        if fatal := BITS(int(np.bitwise_or.reduce(demand.overflow, where=sane))) & FATAL:
+            raise EngineError(f"MuJoCo-Warp ran out of fixed buffers ({fatal.name})", fix="use MujocoEngine")
+        changes: dict[str, Any] = {}
+        capacity = buffers.contacts * program.plan.worlds
+        if demand.contacts > capacity or bits & (BITS.BROADPHASE | BITS.NARROWPHASE | BITS.CCD):
+            need = 1.25 * demand.contacts / program.plan.worlds
+            changes["contacts"] = rung(max(need, buffers.contacts + 1))
+        if demand.constraints > buffers.constraints or bits & BITS.NEFC:
+            changes["constraints"] = rung(max(1.25 * demand.constraints, buffers.constraints + 1))
+        if bits & BITS.NJMAX_NNZ:
+            changes["nonzeros"] = 2 * program.data.njmax_nnz
+        elif "constraints" in changes:
+            changes["nonzeros"] = None
+        if bits & BITS.CONTACT_MATCH:
+            changes["matches"] = 2 * int(program.model.opt.contact_sensor_maxmatch)
+        if program.plan.contacts == "all" and demand.logged > buffers.log_rows:
+            changes["log_rows"] = int(1.25 * demand.logged)
+        return replace(buffers, **changes) if changes else None
+
+    def _chunk(self, buffers: Buffers, count: int) -> int:
+        """Return how many of `count` variants to simulate at a time, in chunks of one size."""
+        if buffers not in self._world_bytes:
+            self._world_bytes[buffers] = world_bytes(self._compiled, buffers)
+        one = HEADROOM * self._world_bytes[buffers]
+        room = int((self._max_memory - buffers.log_rows * LOG_ROW_BYTES) // one)
+        if room < 1:
+            raise EngineError(
+                f"one variant needs {buffers.contacts} contacts and {buffers.constraints} constraint rows, and the "
+                f"log {buffers.log_rows} contacts: too much memory",
+                expected=f"at most {self._max_memory} bytes",
+                found=f"{int(one) + buffers.log_rows * LOG_ROW_BYTES}",
+                fix="thin out the contact geometry, simulate fewer variants or steps at a time, or raise max_memory",
+            )
+        largest_chunk = min(room, count, self._max_worlds or count)
+        return -(-count // -(-count // largest_chunk))
+
+    def _join(self, run: Run, parts: Sequence[Part]) -> Rollout:
+        """Put the parts together in the order of the variants."""
+        qpos, qvel, sensordata, position, quaternion = (
+            torch.cat(values) if len(values) > 1 else values[0]
+            for values in zip(*(part.records for part in parts), strict=True)
+        )
+        touched = [part.touched for part in parts if part.touched is not None]
+        unstable = np.concatenate([part.unstable_step for part in parts])
+        return Rollout(
+            step=run.record,
+            time=run.record * self.timestep,
+            bodies=run.bodies,
+            qpos=qpos,
+            qvel=qvel,
+            sensordata=sensordata,
+            body_position=position,
+            body_quaternion=quaternion,
+            touched=torch.cat(touched) if touched else None,
+            contacts=join_logs([part.log for part in parts if part.log is not None]) if run.contacts == "all" else None,
+            diverged=torch.as_tensor(unstable <= run.steps, device=qpos.device),
+        )
+
+
+def join_logs(logs: Sequence[tuple[np.ndarray, np.ndarray]]) -> ContactLog:
+    """Return the ordered log of keys (variant, step, geoms), shape (C, 4), and values, shape (C, 10)."""
+    key = np.concatenate([key for key, _ in logs])
+    value = np.concatenate([value for _, value in logs])
+    return sorted_log(key[:, 0].astype(int), key[:, 1].astype(int), np.concatenate([key[:, 2:], value], axis=1))
+
+
+def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
+    """Simulate the first variant's commands on the unchanged model in C MuJoCo.
+
+    Returns:
+        Most contacts and most constraint rows at a time, and the contacts of all steps together.
+    """
+    d = mujoco.MjData(compiled)
+    for name in ("qpos", "qvel"):
+        if (value := pick(getattr(run.variants, name), np.zeros(1, dtype=int))) is not None:
+            getattr(d, name)[:] = value[0].detach().cpu().numpy() if hasattr(value, "detach") else value[0]
+    ctrl = run.ctrl if run.shared_ctrl else run.ctrl[0]
+    contacts = constraints = total = 0
+    with quiet_warnings():
+        for k in range(max(run.steps, 1)):
+            if compiled.nu and run.steps:
+                d.ctrl[:] = ctrl[k]
+            mujoco.mj_step(compiled, d)
+            contacts, constraints = max(contacts, d.ncon), max(constraints, d.nefc)
+            total += d.ncon
+    return contacts, constraints, total
+
+
+def rung(size: float) -> int:
+    """Return the next of 16, 24, 32, 48, 64, 96, ...: few sizes, since each one is compiled for and cached."""
+    step = 16
+    while step < size:
+        if 3 * step // 2 >= size:
+            return 3 * step // 2
+        step *= 2
+    return step
+
+
+def largest(value: Any) -> np.ndarray:
+    """Return the entry largest in magnitude over the variants of a field (N, ...), shape (...)."""
+    array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value, dtype=float)
+    return np.take_along_axis(array, np.abs(array).argmax(axis=0)[None], axis=0)[0]
+
+
+def pick(value: Any, rows: np.ndarray) -> Any:
+    """Return the rows of an array or a tensor, or None of None."""
+    if value is None:
+        return None
+    return value[torch.as_tensor(rows, device=value.device)] if isinstance(value, torch.Tensor) else value[rows]
+
+
+def preferred_device() -> str:
+    """Return the first CUDA device, or the CPU."""
+    return "cuda:0" if wp.is_cuda_available() else "cpu"
+
+
+def free_memory(device: str) -> int:
+    """Return what the data of worlds may take by default [bytes]."""
+    return int(0.4 * wp.get_device(device).free_memory) if device.startswith("cuda") else 2 * 2**30
