@@ -1,0 +1,145 @@
+"""From a replayed demonstration to its contact event sequence (paper, section 3.1.2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from concent_warp.errors import EventsError
+from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.filter import close_gaps, runs, steps_of
+from concent_warp.events.roles import Roles
+from concent_warp.events.sequence import ContactEventSequence, ContactInterval
+from concent_warp.events.staging import find_stages
+from concent_warp.events.target import direction, number, vector
+from concent_warp.events.touches import Motion, Touches
+from concent_warp.simulate.replay import replay, step_count
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Demonstration
+    from concent_warp.scene.contact_geometry import ContactGeometry
+    from concent_warp.simulate.engine import ContactLog, Engine
+
+
+def extract(
+    model: Model, demonstration: Demonstration, engine: Engine, cfg: StagingCfg | None = None
+) -> ContactEventSequence:
+    """Replay a demonstration through a model and return who touched whom, the stages and their target events.
+
+    Args:
+        model: Scene and contact geometry.
+        demonstration: Commands and initial state.
+        engine: An engine for `model`.
+        cfg: Settings of the filter and of the staging.
+
+    Raises:
+        EventsError: The replay does not stay finite.
+    """
+    rollout = replay(model, demonstration, engine, contacts="all").numpy()
+    if rollout.diverged[0] or rollout.contacts is None:
+        raise EventsError(
+            "the replay does not stay finite, so that there are no contacts to read",
+            where=demonstration.name,
+            fix="shorten the time step, or look for spheres that start deep within one another",
+        )
+    roles = Roles.of(engine.compiled, model)
+    steps = step_count(demonstration, engine.timestep)
+    motion = Motion.of(rollout, roles.bodies, engine.timestep, steps)
+    return from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg)
+
+
+def from_log(
+    log: ContactLog,
+    roles: Roles,
+    motion: Motion,
+    geometry: ContactGeometry | None = None,
+    *,
+    name: str = "",
+    cfg: StagingCfg | None = None,
+    variant: int = 0,
+) -> ContactEventSequence:
+    """Return the contact event sequence of one variant of a rollout.
+
+    Args:
+        log: Every contact of every step.
+        roles: Names and roles of what the log's geom ids mean.
+        motion: Poses of all bodies at every step.
+        geometry: Spheres of the objects, where they have any.
+        name: Name of the demonstration.
+        cfg: Settings of the filter and of the staging.
+        variant: Which variant of the log.
+    """
+    cfg = cfg or StagingCfg()
+    everything = Touches.of(log, roles, variant)
+    settled = everything.settled_pairs(motion.steps, motion.timestep, cfg)
+    touches = everything.within(settled)
+    used = sorted({int(i) for i in touches.entity.ravel()}, key=lambda i: roles.entities[i].name)
+    return ContactEventSequence(
+        demonstration=name,
+        timestep=motion.timestep,
+        steps=motion.steps,
+        settings=cfg,
+        entities=tuple(roles.entities[i] for i in used),
+        body_contacts=body_intervals(touches, settled, motion, roles),
+        contacts=entity_intervals(touches, settled, motion, roles, steps_of(cfg.gap, motion.timestep)),
+        stages=find_stages(touches, settled, motion, roles, geometry, cfg),
+    )
+
+
+def body_intervals(
+    touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles
+) -> tuple[ContactInterval, ...]:
+    """Return the contacts of pairs of bodies."""
+    found = []
+    for (a, b), touching in settled.items():
+        names = roles.bodies[a], roles.bodies[b]
+        found += intervals(touches.between(a, b), touching, motion, names)
+    return in_order(found)
+
+
+def entity_intervals(
+    touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles, gap: int
+) -> tuple[ContactInterval, ...]:
+    """Return the contacts of pairs of entities: breaks closed, within the contacts of their bodies."""
+    found = []
+    order = np.lexsort((touches.step, touches.entity[:, 1], touches.entity[:, 0]))
+    ordered = touches[order]
+    edges = np.flatnonzero((np.diff(ordered.entity, axis=0) != 0).any(axis=1)) + 1
+    for rows in np.split(np.arange(len(order)), edges) if len(order) else []:
+        group = ordered[rows]
+        a, b = group.body[0].tolist()
+        touching = close_gaps(group.frames(motion.steps), gap) & settled[a, b]
+        first, second = (roles.entities[i].name for i in group.entity[0])
+        found += intervals(group, touching, motion, (first, second))
+    return in_order(found)
+
+
+def intervals(rows: Touches, touching: np.ndarray, motion: Motion, names: tuple[str, str]) -> list[ContactInterval]:
+    """Return an interval for each run of `touching` (K,) with the means of the contacts `rows` within it."""
+    found = []
+    for start, end in runs(touching):
+        part = rows[(rows.step >= start) & (rows.step < end)]
+        if not len(part.step):
+            continue
+        weight = part.force + 1e-9
+        weight = weight / weight.sum()
+        b = part.body[0, 1]
+        found.append(
+            ContactInterval(
+                a=names[0],
+                b=names[1],
+                start=number(start * motion.timestep),
+                end=number(end * motion.timestep),
+                force=number(np.bincount(part.step - start, part.force).max()),
+                point=vector(weight @ motion.into(b, part.step, part.point)),
+                normal=direction(weight @ motion.turn_into(b, part.step, part.normal)),
+            )
+        )
+    return found
+
+
+def in_order(found: list[ContactInterval]) -> tuple[ContactInterval, ...]:
+    """Return intervals in the order of their start, then of their names."""
+    return tuple(sorted(found, key=lambda item: (item.start, item.a, item.b)))

@@ -1,0 +1,55 @@
+"""Robot on object: when the robot begins to grasp or to push an object, and while it holds it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.filter import runs, settle, steps_of, windowed
+from concent_warp.events.onset import Onset
+from concent_warp.events.roles import Roles
+from concent_warp.events.touches import Motion, Touches
+
+
+def robot_onsets(
+    touches: Touches, motion: Motion, roles: Roles, cfg: StagingCfg
+) -> tuple[list[Onset], dict[int, np.ndarray]]:
+    """Return what the robot begins to do with objects, and when it holds each, shape (K,) bool by body id.
+
+    The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
+    to less than `squeeze` of the sum of their magnitudes, over windows, for `persist`: then they press from opposite
+    sides. It begins with the first touch of that contact. Any other contact counts if it moves the object by `moved`,
+    and as long as the robot has not grasped this object: brushing past it after letting go opens no stage.
+    """
+    gap, blip = steps_of(cfg.gap, motion.timestep), steps_of(cfg.blip, motion.timestep)
+    persist, width = steps_of(cfg.persist, motion.timestep), steps_of(cfg.window, motion.timestep)
+    initial = cfg.initial / motion.timestep
+    by_robot = touches[np.isin(touches.body[:, 0], roles.ids("robot"))]
+    onsets: list[Onset] = []
+    held: dict[int, np.ndarray] = {}
+    for body in roles.ids("object"):
+        rows = by_robot[by_robot.body[:, 1] == body]
+        touching = settle(rows.frames(motion.steps), gap, blip)
+        squeezing = settle(touching & opposed(rows, motion.steps, width, cfg.squeeze), gap, persist) & touching
+        held[body] = np.zeros(motion.steps, dtype=bool)
+        seen: set[str] = set()
+        for start, end in runs(touching):
+            if squeezing[start:end].any():
+                kind = "pick"
+                held[body][start:end] = True
+            elif np.linalg.norm(motion.position[end - 1, body] - motion.position[start, body]) > cfg.moved:
+                kind = "push"
+            else:
+                continue
+            if start > initial and not seen & {kind, "pick"}:
+                onsets.append(Onset(kind, int(start), (None, body), squeezing if kind == "pick" else touching))
+            seen.add(kind)
+    return onsets, held
+
+
+def opposed(rows: Touches, steps: int, width: int, share: float) -> np.ndarray:
+    """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,)."""
+    total = np.zeros((steps, 4))
+    np.add.at(total, rows.step, np.concatenate([rows.force[:, None] * rows.normal, rows.force[:, None]], axis=1))
+    total = windowed(total, width)
+    return np.linalg.norm(total[:, :3], axis=1) < share * total[:, 3]

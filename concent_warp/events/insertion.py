@@ -1,0 +1,243 @@
+"""Object on object: the first contact, and the move of this contact onto a new region, inside the other object.
+
+Spheres give bumpy surfaces and so bumpy normals: a single normal does not tell a rim from a wall. So the kinds of
+contact are told by place, and by forces summed over windows:
+
+- The *first contact* has a plane. Its normal is the reverse of the motion that the contact stopped (the approach, or
+  the way that the object goes on while in contact), turned into the layer of spheres that the contact is on: both are
+  far less bumpy than contact normals, which only tell whether the contact opposed the motion.
+- An object is *beyond* this plane once the foremost of its points that ever touch has passed it by `depth`. If it then
+  touches surfaces that stand across the plane, it has entered; if the other object is all around it there, that is
+  insertion, and the surfaces are inner walls.
+- A first contact whose normal lies across both the approach and the further way did not stop the object: there is no
+  such plane, and the object has gone straight in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.filter import runs, settle, steps_of, windowed
+from concent_warp.events.onset import Onset
+from concent_warp.events.touches import Motion, Touches
+
+ACROSS = float(np.cos(np.pi / 4))
+"""A normal is across an axis if it is more than 45 degrees from it."""
+OPPOSING = float(np.cos(np.pi / 3))
+"""A contact opposes a motion if its normal is within 60 degrees of the motion's reverse."""
+WALL_SHARE = 0.2
+"""Share of the normal force on surfaces across the plane from which these count as touched, beyond the plane [-]."""
+PLANE_REACH = 0.06
+"""Spheres within this distance of the first contact are fitted by its plane [m]."""
+PLANE_LEAST = 6
+"""Least number of spheres that a plane is fitted to."""
+PLANE_BAND = 0.0015
+"""Spheres that differ by less than this in height are level [m]."""
+PLANE_TILTS = np.radians(np.arange(2, 31, 2))
+"""Tilts against the reverse of the motion that are tried [rad]."""
+GRAIN = 0.001
+"""Material points that ever touch are thinned out to a grid of this size [m]."""
+
+
+@dataclass(frozen=True)
+class PairContact:
+    """The contacts of object `a` on object `b`, in the frame of b."""
+
+    step: np.ndarray
+    """Shape (C,)."""
+    normal: np.ndarray
+    """Unit normals from b to a, shape (C, 3)."""
+    force: np.ndarray
+    """Normal forces [N], shape (C,)."""
+    point: np.ndarray
+    """Contact points [m], shape (C, 3)."""
+    feelers: np.ndarray
+    """Points of a that ever touch b [m], frame of a, shape (M, 3)."""
+    origin: np.ndarray
+    """Origin of a at every step [m], shape (K, 3)."""
+    rotation: np.ndarray
+    """Rotation of a at every step, shape (K, 3, 3)."""
+    spheres: np.ndarray
+    """Sphere centres of b [m], shape (n, 3)."""
+
+    @staticmethod
+    def of(rows: Touches, motion: Motion, pair: tuple[int, int], spheres: np.ndarray) -> PairContact:
+        """Bring contacts of a pair of bodies into the frame of the second."""
+        a, b = pair
+        feelers = np.unique(np.round(motion.into(a, rows.step, rows.point) / GRAIN), axis=0) * GRAIN
+        origin, rotation = motion.relative(a, b)
+        return PairContact(
+            step=rows.step,
+            normal=motion.turn_into(b, rows.step, rows.normal),
+            force=rows.force,
+            point=motion.into(b, rows.step, rows.point),
+            feelers=feelers,
+            origin=origin,
+            rotation=rotation,
+            spheres=spheres,
+        )
+
+    def mean(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return point [m] and unit normal, shape (3,) each, of contacts `rows`, weighted by force."""
+        weight = self.force[rows] + 1e-9
+        normal = weight @ self.normal[rows]
+        return weight @ self.point[rows] / weight.sum(), normal / max(np.linalg.norm(normal), 1e-12)
+
+    def height(self, plane: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Return how far the foremost feeler is in front of a plane (point, normal) at each step [m], shape (K,)."""
+        point, normal = plane
+        reach = np.einsum("kij,i->kj", self.rotation, normal) @ self.feelers.T
+        return (self.origin - point) @ normal + reach.min(axis=1)
+
+
+def object_onsets(
+    touches: Touches,
+    settled: np.ndarray,
+    pair: tuple[int, int],
+    motion: Motion,
+    held: np.ndarray,
+    spheres: np.ndarray,
+    cfg: StagingCfg,
+) -> list[Onset]:
+    """Return what two objects begin to do with one another.
+
+    Args:
+        touches: Contacts of the two, a before b.
+        settled: When they are in contact, shape (K,) bool.
+        pair: Their body ids.
+        motion: Poses.
+        held: When the robot holds one of them, shape (K,) bool.
+        spheres: Sphere centres of b [m], frame of b, shape (n, 3).
+        cfg: Settings.
+    """
+    touching = settled.copy()
+    for start, end in runs(settled):
+        if start <= cfg.initial / motion.timestep:
+            touching[start:end] = False
+    rows = touches[touching[touches.step]]
+    if not len(rows.step):
+        return []
+    contact = PairContact.of(rows, motion, pair, spheres)
+    first = int(rows.step[0])
+    plane = first_plane(contact, touching, steps_of(cfg.window, motion.timestep), cfg)
+    beyond, inside = passage(contact, touching, plane, motion.timestep, cfg)
+    entered = int(np.flatnonzero(inside)[0]) if inside.any() else motion.steps
+    onsets = []
+    if entered - first >= steps_of(cfg.blip, motion.timestep):
+        onsets.append(Onset("align" if held[first] else "touch", first, pair, touching & ~beyond))
+    if inside.any():
+        within = surrounded(contact, plane, entered)
+        onsets.append(Onset("insert" if within else "enter", entered, pair, touching & beyond))
+    return onsets
+
+
+def first_plane(
+    contact: PairContact, touching: np.ndarray, width: int, cfg: StagingCfg
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return the plane of the first contact, and whether that contact stopped the object.
+
+    Returns:
+        point: A point of the plane [m], shape (3,).
+        normal: Its unit normal, against the approach, shape (3,).
+        stopped: Whether the contact opposed the motion; if not, the plane is across the approach at the first touch.
+    """
+    first, last = contact.step[0], np.flatnonzero(touching)[-1]
+    point, normal = contact.mean(contact.step < first + width)
+    approach = approach_direction(contact.origin, int(first), cfg.approach)
+    ways = [-approach, unit(contact.origin[first] - contact.origin[last], cfg.depth)]
+    opposed = [way for way in ways if way @ normal > OPPOSING]
+    if not opposed:
+        return point, (normal if not approach.any() else -approach), not approach.any()
+    point, normal = fit_plane(contact.spheres, point, opposed[0])
+    return point, normal, True
+
+
+def approach_direction(origin: np.ndarray, first: int, length: float) -> np.ndarray:
+    """Return the unit direction of the last `length` [m] of path before step `first`; zero if it has not moved."""
+    travelled = np.cumsum(np.linalg.norm(np.diff(origin[: first + 1], axis=0), axis=1)[::-1])
+    back = int(np.searchsorted(travelled, length)) + 1
+    return unit(origin[first] - origin[max(first - back, 0)], 0.1 * length)
+
+
+def unit(vector: np.ndarray, least: float) -> np.ndarray:
+    """Return a vector (3,) at length 1, or zero if it is not longer than `least`."""
+    length = np.linalg.norm(vector)
+    return vector / length if length > least else np.zeros(3)
+
+
+def fit_plane(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turn a plane through `point` (3,) so that it lies along the layer of spheres that the contact is on.
+
+    Of the directions around `normal`, the one is taken that has most spheres level with the touched one, the more of
+    them the farther it is from `normal`, and turned into the plane of least squares through these. Where they are too
+    few, or in a line, the plane stays as it is.
+    """
+    near = spheres[np.linalg.norm(spheres - point, axis=1) < PLANE_REACH]
+    if len(near) < PLANE_LEAST:
+        return point, normal
+    from_touched = near - near[np.argmin(np.linalg.norm(near - point, axis=1))]
+    candidates = cone(normal)
+    level = np.abs(from_touched @ candidates.T) < PLANE_BAND
+    nearness = 2 * (candidates @ normal) ** 2 - 1  # cosine of twice the tilt
+    layer = from_touched[level[:, np.argmax(level.sum(axis=0) * nearness)]]
+    spread, axes = np.linalg.svd(layer - layer.mean(axis=0), full_matrices=False)[1:]
+    turned = axes[2] * (1.0 if axes[2] @ normal > 0 else -1.0)
+    if len(layer) < PLANE_LEAST or spread[1] < 3 * spread[2] or turned @ normal < np.cos(PLANE_TILTS[-1]):
+        return point, normal
+    return point, turned
+
+
+def cone(axis: np.ndarray) -> np.ndarray:
+    """Return unit vectors around an axis (3,), the axis first, shape (n, 3)."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    tilt, turn = np.meshgrid(PLANE_TILTS, np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij")
+    sideways = np.cos(turn)[..., None] * across[0] + np.sin(turn)[..., None] * across[1]
+    vectors = np.cos(tilt)[..., None] * axis + np.sin(tilt)[..., None] * sideways
+    return np.concatenate([axis[None], vectors.reshape(-1, 3)])
+
+
+def passage(
+    contact: PairContact,
+    touching: np.ndarray,
+    plane: tuple[np.ndarray, np.ndarray, bool],
+    timestep: float,
+    cfg: StagingCfg,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return when a is in contact beyond the plane, and when it touches walls there for `persist`, shape (K,) bool."""
+    point, normal, stopped = plane
+    steps, width = len(touching), steps_of(cfg.window, timestep)
+    beyond = touching & (contact.height((point, normal)) < -cfg.depth) if stopped else touching.copy()
+    wall = np.abs(contact.normal @ normal) < ACROSS
+    on_walls = np.bincount(contact.step, contact.force * wall, minlength=steps)
+    total = np.bincount(contact.step, contact.force, minlength=steps)
+    pressed = windowed(on_walls, width) > WALL_SHARE * windowed(total, width)
+    now = np.bincount(contact.step, wall, minlength=steps) > 0
+    return beyond, settle(beyond & pressed & now, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
+
+
+def surrounded(contact: PairContact, plane: tuple[np.ndarray, np.ndarray, bool], entered: int) -> bool:
+    """Return whether b is all around the part of a that is beyond the plane, from step `entered` on.
+
+    Seen along the plane's normal from the middle of a's feelers, the spheres of b between the deepest feeler and the
+    plane leave no gap of half a turn. Without spheres, the contact normals must leave none.
+    """
+    point, normal, _ = plane
+    deepest = contact.step[contact.step >= entered][
+        np.argmin(contact.height((point, normal))[contact.step[contact.step >= entered]])
+    ]
+    middle = contact.origin[deepest] + contact.rotation[deepest] @ contact.feelers.mean(axis=0)
+    if len(contact.spheres):
+        height = (contact.spheres - point) @ normal
+        level = contact.height((point, normal))[deepest]
+        around = contact.spheres[(height < 0) & (height > level)] - middle
+    else:
+        around = -contact.normal[contact.step >= entered]
+    across = np.linalg.svd(normal[None])[2][1:]
+    flat = around @ across.T
+    angle = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
+    if len(angle) < 3:
+        return False
+    return bool(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max() < np.pi)
