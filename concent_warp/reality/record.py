@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
+from concent_warp.reality.camera import CAMERA, film
 from concent_warp.reality.expert import ExpertCfg, plan
 from concent_warp.reality.inverse_kinematics import solve_path
 from concent_warp.reality.run import Log, settle, simulate
-from concent_warp.reality.sensing import SensingCfg, measure
+from concent_warp.reality.sensing import SensingCfg, measure, sampled
 from concent_warp.reality.steering import aligned, arm_joints, deflection, finger_joints
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
@@ -40,6 +41,8 @@ class Truth:
 
     time: np.ndarray
     """Times [s], one each step, shape (T,)."""
+    qpos: np.ndarray
+    """States of the stand-in world, shape (T, nq); its joints are those of the scene."""
     block_position: np.ndarray
     """Block origin [m], world frame, shape (T, 3)."""
     contacts: dict[tuple[str, str], np.ndarray]
@@ -91,7 +94,8 @@ def perform(
     task = replace(
         cfg.task, block_position=tuple(block), block_yaw=cfg.task.block_yaw + rng.uniform(-1, 1) * cfg.yaw_spread
     )
-    model = cfg.world.build(scene, effects)
+    world = cfg.world.build(scene, effects)
+    model = world.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = home(model)
     block_joint = model.joint("block_joint").qposadr[0]
@@ -127,13 +131,18 @@ def perform(
         body: PointTrack(np.array(log.frames), np.array(log.points[body]), np.array(log.visible[body]))
         for body in log.points
     }
+    image = {}
+    if cfg.sensing.images:
+        rows = sampled(truth.time, cfg.sensing.image_rate)
+        # A source of its own, so that all else is the same with and without images.
+        image[CAMERA] = film(cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
     for effect in effects:
         if effect.measure is not None:
             for channel, stream in measured.items():
                 time, value = effect.measure(channel, stream.time, stream.value)
                 measured[channel] = replace(stream, time=time, value=value)
     demonstration = Demonstration(
-        name, "put the block into the hole of the box", truth.success, qpos, qvel, actions, measured, points
+        name, "put the block into the hole of the box", truth.success, qpos, qvel, actions, measured, points, image
     )
     return demonstration, truth
 
@@ -147,4 +156,4 @@ def judge(model: mujoco.MjModel, log: Log, task: ShapeSorterCfg) -> Truth:
     force = np.array([-pairs.get(("block", "box"), np.zeros(3)) for pairs in log.pairs])
     seat = np.array([*task.box_position, task.floor + task.block_size / 2])
     success = bool(np.abs(position[-1] - seat).max() < 0.003)
-    return Truth(np.array(log.time), position, contacts, force, success)
+    return Truth(np.array(log.time), np.array(log.qpos), position, contacts, force, success)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from concent_warp.reality.sensing import SensingCfg, seen, visible_points
+from concent_warp.reality.sensing import SLACK, SensingCfg, seen, visible_points
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.scene.scene import Scene
 
@@ -47,8 +47,7 @@ def simulate(
 ) -> Log:
     """Step the world along the commands and log every step and every camera frame."""
     log = Log()
-    camera = np.array(sensing.camera_position)
-    track = {body: visible_points(scene, model, data, body, camera, sensing, rng) for body in scene.objects()}
+    track = {body: visible_points(scene, model, data, body, sensing, rng) for body in scene.objects()}
     log.points, log.visible = {body: [] for body in track}, {body: [] for body in track}
     steps = round(time[-1] / model.opt.timestep)
     wander = np.zeros(model.nu)
@@ -80,7 +79,7 @@ def simulate(
             for body, local in track.items():
                 place = data.body(body)
                 points = place.xpos + local @ place.xmat.reshape(3, 3).T
-                log.visible[body].append(seen(model, data, camera, points, 2e-3))
+                log.visible[body].append(seen(sensing, model, data, points, SLACK))
                 noisy = points + rng.normal(0, sensing.point_std, points.shape)
                 log.points[body].append(np.where(log.visible[body][-1][:, None], noisy, np.nan))
         if progress is not None and k % 200 == 0:

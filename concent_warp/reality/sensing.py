@@ -7,8 +7,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.recording.pinhole import Pinhole
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
+
+SLACK = 2e-3
+"""How far before a point a surface may be and still count as the one the point is on [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +39,43 @@ class SensingCfg:
     """Place of the camera [m]; it looks at the workspace."""
     camera_target: tuple[float, float, float] = (0.48, -0.02, 0.02)
     """Point that the camera looks at [m]."""
+    camera_fovy: float = 20.0
+    """Vertical field of view of the camera [degrees]."""
+    images: bool = False
+    """Whether the camera's RGB-D frames are recorded, besides the points tracked in them."""
+    image_rate: float = 10.0
+    """Rate of the recorded frames [Hz]."""
+    image_size: tuple[int, int] = (96, 128)
+    """Height and width of the frames [px]."""
+    rgb_std: float = 2.0
+    """Noise of the colours, in steps of 1/255."""
+    depth_noise: float = 1.425e-3
+    """Depth noise per squared depth [1/m]: std = depth_noise * z^2, 1.3 mm at 0.95 m. The figure of a structured-light
+    camera: Khoshelham and Oude Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12(2), 2012."""
+    depth_step: float = 2.0**-12
+    """Step in which depth is reported [m], 0.24 mm."""
+    depth_jump: float = 0.01
+    """Difference of depth between neighbouring pixels from which on they lie on an edge [m]."""
+    depth_dropout: float = 0.5
+    """Share of the pixels on an edge that have no depth [-]: half of what they cover is hidden from the second eye."""
     tracking_std: float = 1e-4
     """Slow wander of the joints against their commands that no encoder tells [rad]."""
     tracking_time: float = 0.3
     """Correlation time of the wander [s]."""
+
+    def pinhole(self) -> Pinhole:
+        """Return the camera as calibrated: upright, its principal point in the middle of the image."""
+        height, width = self.image_size
+        focal = height / 2 / np.tan(np.radians(self.camera_fovy) / 2)
+        intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+        forward = np.array(self.camera_target) - self.camera_position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = self.camera_position
+        return Pinhole(intrinsics, pose)
 
 
 def noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
@@ -72,17 +109,34 @@ def surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator
 
 
 def seen(
-    model: mujoco.MjModel, data: mujoco.MjData, camera: np.ndarray, points: np.ndarray, slack: float
+    sensing: SensingCfg, model: mujoco.MjModel, data: mujoco.MjData, points: np.ndarray, slack: float
 ) -> np.ndarray:
-    """Return which world points (M, 3) [m] a camera at (3,) sees: no geom is more than `slack` [m] before them."""
-    ray = points - camera
+    """Return which world points (M, 3) [m] the camera sees.
+
+    They lie within the image, and no geom is more than `slack` [m] before them.
+    """
+    camera = sensing.pinhole()
+    pixel, depth = camera.project(points)
+    height, width = sensing.image_size
+    inside = (depth > 0) & (np.abs(pixel + 0.5 - np.array([width, height]) / 2) < np.array([width, height]) / 2).all(1)
+    ray = points - camera.position
     distance = np.linalg.norm(ray, axis=1)
     geom, hit = np.zeros(len(points), dtype=np.int32), np.zeros(len(points))
-    group = np.ones(6, dtype=np.uint8)
     mujoco.mj_multiRay(
-        model, data, camera, (ray / distance[:, None]).ravel(), group, 1, -1, geom, hit, None, len(points), 10.0
+        model,
+        data,
+        camera.position,
+        (ray / distance[:, None]).ravel(),
+        np.ones(6, dtype=np.uint8),
+        1,
+        -1,
+        geom,
+        hit,
+        None,
+        len(points),
+        10.0,
     )
-    return (geom < 0) | (hit > distance - slack)
+    return inside & ((geom < 0) | (hit > distance - slack))
 
 
 def visible_points(
@@ -90,7 +144,6 @@ def visible_points(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     body: str,
-    camera: np.ndarray,
     sensing: SensingCfg,
     rng: np.random.Generator,
 ) -> np.ndarray:
@@ -98,7 +151,7 @@ def visible_points(
     local = surface_points(scene, body, 40 * sensing.point_count, rng)
     place = data.body(body)
     points = place.xpos + local @ place.xmat.reshape(3, 3).T
-    local = local[seen(model, data, camera, points, 2e-3)]
+    local = local[seen(sensing, model, data, points, SLACK)]
     return local[rng.choice(len(local), sensing.point_count, replace=False)]
 
 
@@ -119,7 +172,7 @@ def measure(
         name, address, dim = model.sensor(i).name, model.sensor_adr[i], model.sensor_dim[i]
         joint = int(model.sensor_type[i]) in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_TENDONPOS)
         rate = sensing.encoder_rate if joint else sensing.pose_rate
-        rows = np.unique(np.round(np.arange(0, time[-1], 1 / rate) / model.opt.timestep).astype(int))
+        rows = sampled(time, rate)
         value = readings[rows, address : address + dim]
         if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
             std = sensing.orientation_std
@@ -129,3 +182,8 @@ def measure(
             value = value + rng.normal(0, std, value.shape)
         channels[name] = Channel(time[rows], value, noise_std=std)
     return channels
+
+
+def sampled(time: np.ndarray, rate: float) -> np.ndarray:
+    """Return the steps, at times (T,) [s] and evenly spaced, that an instrument with a rate [Hz] reads."""
+    return np.unique(np.round(np.arange(0, time[-1], 1 / rate) / (time[1] - time[0])).astype(int))

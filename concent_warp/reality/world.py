@@ -41,8 +41,8 @@ class WorldCfg:
     solref: tuple[float, float] = (0.003, 1.0)
     """Contact time constant [s] and damping ratio [-]."""
 
-    def build(self, scene: Scene, effects: tuple[HiddenEffect, ...] = ()) -> mujoco.MjModel:
-        """Return the compiled world made from a scene's drawing."""
+    def build(self, scene: Scene, effects: tuple[HiddenEffect, ...] = ()) -> mujoco.MjSpec:
+        """Return the world made from a scene's drawing, hidden effects included, ready to be compiled."""
         spec = scene.spec()
         spec.option.timestep = self.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -58,7 +58,7 @@ class WorldCfg:
         for effect in effects:
             if effect.edit is not None:
                 effect.edit(spec)
-        return spec.compile()
+        return spec
 
     def chamfer_box(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
         """Turn a box into the convex mesh of a box with chamfered edges; mass and inertia of the box are kept."""
