@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from concent_warp.errors import SceneError
 from concent_warp.scene.solid import Distances, Solid, unit
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
 NEIGHBOURS = 12
 """Points that a local plane is fitted to."""
@@ -72,16 +72,16 @@ class PointCloud(Solid):
         return PointCloud(points, unit(normals, np.linalg.norm(normals, axis=1)))
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> KDTree:
         """Search tree over the points."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        return cKDTree(self.points)
+        return KDTree(self.points)
 
     @cached_property
     def patch(self) -> np.ndarray:
         """Area that each point stands for [m^2], shape (n,): a share of the disc that reaches its eighth neighbour."""
-        return np.pi * self.tree.query(self.points, k=[9])[0][:, 0] ** 2 / 8.5
+        return np.pi * nearest_points(self.tree, self.points, 9)[0][:, -1] ** 2 / 8.5
 
     @property
     def area(self) -> float:
@@ -90,7 +90,7 @@ class PointCloud(Solid):
 
     def distance(self, points: np.ndarray) -> Distances:
         """See `Solid.distance`."""
-        reach, nearest = self.tree.query(points, k=[*range(1, BLEND + 1)])
+        reach, nearest = nearest_points(self.tree, points, BLEND)
         width = np.sqrt(self.patch[nearest[:, :1]])
         weight = np.exp((reach[:, :1] ** 2 - reach**2) / width**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -104,6 +104,11 @@ class PointCloud(Solid):
         return self.points[row].copy(), self.normals[row].copy()
 
 
+def nearest_points(tree: Any, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances [m] and indices of the nearest points in a SciPy tree, each (n, count), at points (n, 3)."""
+    return tree.query(points, k=[*range(1, count + 1)])
+
+
 def outward_normals(points: np.ndarray) -> np.ndarray:
     """Estimate outward normals of surface points, shape (n, 3).
 
@@ -112,9 +117,9 @@ def outward_normals(points: np.ndarray) -> np.ndarray:
     cloud turned inside out about the viewer (Katz, Tal and Basri, "Direct visibility of point sets", 2007). Neighbours
     share their votes.
     """
-    from scipy.spatial import ConvexHull, QhullError, cKDTree
+    from scipy.spatial import ConvexHull, KDTree, QhullError
 
-    near = cKDTree(points).query(points, k=[*range(1, NEIGHBOURS + 1)])[1]
+    near = nearest_points(KDTree(points), points, NEIGHBOURS)[1]
     spread = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -166,9 +171,9 @@ def without_outliers(points: np.ndarray, *, neighbours: int = 12, spread: float 
     A point is an outlier if the mean distance to its nearest neighbours exceeds the median over all points by more than
     `spread` times the median deviation from that median.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     count = min(neighbours + 1, len(points))
-    away = cKDTree(points).query(points, k=[*range(1, count + 1)])[0][:, 1:].mean(axis=1)
+    away = nearest_points(KDTree(points), points, count)[0][:, 1:].mean(axis=1)
     middle = np.median(away)
     return away <= middle + spread * np.median(np.abs(away - middle)) + 1e-12

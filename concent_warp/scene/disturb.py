@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from concent_warp.errors import ModelError
+from concent_warp.scene.cloud import nearest_points
 from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.surface import Surface
@@ -64,7 +65,7 @@ def offset_normal(
 
     Raises `ModelError` where no sphere is at the selected faces.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     surface = surface or Surface.of_body(scene, body)
     mine = np.flatnonzero(geometry.body == body_index(geometry, body))
@@ -73,7 +74,7 @@ def offset_normal(
     points, normals = points[meant], normals[meant]
     if not len(points):
         raise ModelError(f"no faces of body {body!r} are selected", fix="check the selection")
-    away, nearest = cKDTree(points).query(geometry.position[mine])
+    away, nearest = (column[:, 0] for column in nearest_points(KDTree(points), geometry.position[mine], 1))
     moved = away <= geometry.radius[mine] + slack
     if not moved.any():
         raise ModelError(

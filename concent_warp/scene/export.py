@@ -3,50 +3,66 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
 import mujoco
+import numpy as np
 
 from concent_warp.errors import ModelError
 from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.scene import Scene
+
+FIELDS = (
+    "pos", "friction", "condim", "contype", "conaffinity", "priority", "solmix", "solref", "solimp", "margin", "gap",
+    "group", "rgba",
+)  # fmt: skip
+"""Attributes of a sphere that are written out, so that no default class of the scene changes them."""
 
 
 class Exportable(Protocol):
     """What an export needs of a model."""
 
     @property
+    def scene(self) -> Scene:
+        """The scene."""
+
+    @property
     def geometry(self) -> ContactGeometry | None:
         """The contact geometry, if any."""
 
-    def spec(self) -> mujoco.MjSpec:
-        """Return a fresh spec with the spheres attached."""
+    def compile(self) -> mujoco.MjModel:
+        """Return the scene with the spheres, compiled."""
 
 
 def export_mjcf(model: Exportable) -> str:
-    """Return self-contained MJCF of a model: its scene and its spheres, by the names of `ContactGeometry.names`.
+    """Return self-contained MJCF of a model: the scene's text, with its spheres added.
 
-    It simulates as the model does. Each body with spheres keeps the inertia that the scene gives it, written as an
-    explicit ``<inertial>``; the spheres weigh nothing. The numbers of spheres and inertias are written in full; those
-    of the scene with six digits, as MuJoCo writes them and as `Scene.from_mjcf` keeps them.
+    It simulates as the model does. The spheres have the names of `ContactGeometry.names` and weigh nothing; each body
+    with spheres keeps the inertia that the scene gives it, written as an explicit ``<inertial>``, and its own geoms no
+    longer collide. Numbers are written in full.
     """
-    spec = model.spec()
-    spec.compile()
-    root = ET.fromstring(spec.to_xml())
     geometry = model.geometry
-    if geometry is not None:
-        bodies = {element.get("name"): element for element in root.iter("body")}
-        for name in geometry.bodies:
-            inertial = bodies[name].find("inertial")
-            if inertial is None:
-                raise ModelError(f"body {name!r} has spheres but no inertia to export")
-            write_inertial(inertial, spec.body(name))
-        geoms = {element.get("name"): element for element in root.iter("geom") if element.get("name")}
-        for i, name in enumerate(geometry.names()):
-            geoms[name].set("pos", numbers(geometry.position[i]))
-            geoms[name].set("size", numbers([geometry.radius[i]]))
-            geoms[name].set("friction", numbers(spec.geom(name).friction))
+    if geometry is None:
+        return model.scene.xml
+    root = ET.fromstring(model.scene.xml)
+    if not set(geometry.bodies) <= {element.get("name") for element in root.iter("body")}:
+        # Bodies made by <attach>, <include> or <replicate> are in the text only once MuJoCo has written it.
+        root = ET.fromstring(Scene.from_spec(model.scene.spec(), model.scene.source).xml)
+    elements = {element.get("name"): element for element in root.iter("body")}
+    compiled = model.compile()
+    names = geometry.names()
+    for body in geometry.bodies:
+        if body not in elements:
+            raise ModelError(f"body {body!r} is not in the scene's text", where=model.scene.source)
+        element = elements[body]
+        for geom in geoms_of(element):
+            geom.set("contype", "0")
+            geom.set("conaffinity", "0")
+        write_inertial(element, compiled, body)
+        for i in geometry.of(body):
+            element.append(sphere(compiled, names[i]))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -59,15 +75,34 @@ def save_mjcf(model: Exportable, path: Path) -> None:
     partial.replace(path)
 
 
-def write_inertial(element: ET.Element, body: mujoco.MjsBody) -> None:
-    """Write the inertia of a body in full."""
-    element.attrib.clear()
-    element.set("pos", numbers(body.ipos))
-    element.set("quat", numbers(body.iquat))
-    element.set("mass", numbers([body.mass]))
-    element.set("diaginertia", numbers(body.inertia))
+def geoms_of(body: ET.Element) -> Iterator[ET.Element]:
+    """Yield the geoms of a body and not those of its children."""
+    for child in body:
+        if child.tag == "geom":
+            yield child
+        elif child.tag in ("frame", "replicate"):
+            yield from geoms_of(child)
+
+
+def write_inertial(element: ET.Element, compiled: mujoco.MjModel, body: str) -> None:
+    """Replace the inertia of a body by the compiled one."""
+    for old in element.findall("inertial"):
+        element.remove(old)
+    row = compiled.body(body)
+    if row.mass[0] > 0:
+        values = {"pos": row.ipos, "quat": row.iquat, "mass": row.mass, "diaginertia": row.inertia}
+        element.insert(0, ET.Element("inertial", {name: numbers(value) for name, value in values.items()}))
+
+
+def sphere(compiled: mujoco.MjModel, name: str) -> ET.Element:
+    """Return the element of one sphere."""
+    geom = compiled.geom(name)
+    element = ET.Element("geom", {"name": name, "type": "sphere", "size": numbers(geom.size[:1]), "mass": "0"})
+    for field in FIELDS:
+        element.set(field, numbers(np.atleast_1d(getattr(geom, field))))
+    return element
 
 
 def numbers(values: Iterable[float]) -> str:
     """Return numbers as text that reads back to the same numbers."""
-    return " ".join(repr(float(value)) for value in values)
+    return " ".join(str(int(v)) if isinstance(v, np.integer) else repr(float(v)) for v in values)

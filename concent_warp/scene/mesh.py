@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 TOUCHING = 1e-6
 """Distance below which a point lies on the surface, relative to the mesh's extent: the normal is then the face's."""
+FLAT = 1e-9
+"""Thickness below which points are in one plane, relative to their spread."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +80,15 @@ class MeshSolid(Solid):
         from concent_warp.kernels.mesh_distance import nearest_face
 
         scaled = (np.asarray(points, dtype=float) - self.centre) / self.extent
-        face = wp.empty(len(scaled), dtype=wp.int32, device="cpu")
-        side = wp.empty(len(scaled), dtype=wp.float32, device="cpu")
+        face = np.empty(len(scaled), dtype=np.int32)
+        side = np.empty(len(scaled), dtype=np.float32)
         reach = float(np.linalg.norm(scaled, axis=1).max(initial=0)) + 2.0
-        inputs = [self.search.id, wp.array(scaled, dtype=wp.vec3, device="cpu"), reach, face, side]
+        # On the CPU a Warp array made with copy=False writes into the NumPy array.
+        written = [wp.array(values, copy=False, device="cpu") for values in (face, side)]
+        inputs = [self.search.id, wp.array(scaled, dtype=wp.vec3, device="cpu"), reach, *written]
         wp.launch(nearest_face, len(scaled), inputs=inputs, device="cpu")
-        corners = self.vertices[self.faces[face.numpy()]]
-        sign = side.numpy().astype(float)
+        corners = self.vertices[self.faces[face]]
+        sign = side.astype(float)
         away = points - nearest_on_triangles(points, corners)
         length = np.linalg.norm(away, axis=1)
         touching = length < TOUCHING * self.extent
@@ -116,12 +120,14 @@ def hull(points: np.ndarray, name: str) -> trimesh.Trimesh:
     import trimesh
     from scipy.spatial import QhullError
 
+    points = np.asarray(points, dtype=float)
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     try:
-        return trimesh.convex.convex_hull(np.asarray(points, dtype=float))
+        if len(spread) == 3 and spread[2] > FLAT * spread[0]:
+            return trimesh.convex.convex_hull(points)
     except (QhullError, ValueError):
-        raise SceneError(
-            "the points span no volume, so they have no convex hull", where=name, expected="4 points not in a plane"
-        ) from None
+        pass
+    raise SceneError("the points span no volume", where=name, expected="points that are not all in one plane")
 
 
 def areas(corners: np.ndarray) -> np.ndarray:
