@@ -27,13 +27,16 @@ class Exportable(Protocol):
     @property
     def scene(self) -> Scene:
         """The scene."""
+        ...
 
     @property
     def geometry(self) -> ContactGeometry | None:
         """The contact geometry, if any."""
+        ...
 
     def compile(self) -> mujoco.MjModel:
         """Return the scene with the spheres, compiled."""
+        ...
 
 
 def export_mjcf(model: Exportable) -> str:
