@@ -16,6 +16,7 @@ import numpy as np
 from concent_warp.errors import RecordingError, SceneError
 from concent_warp.recording.bounds import MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_SCENE_BYTES
 from concent_warp.recording.hdf5_access import SafeFile
+from concent_warp.recording.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
 from concent_warp.recording.validate import validate
@@ -36,8 +37,7 @@ def read_hdf5(path: Path) -> Recording:
     if not path.is_file():
         raise RecordingError("no such recording file", where=path, expected="an HDF5 file", fix="check the path")
     try:
-        if not h5py.is_hdf5(path):
-            raise RecordingError("not an HDF5 file", where=path, fix="check that the file was copied whole")
+        check_heaps(path)
         with h5py.File(path, "r") as file:
             recording = Reader(path).recording(file)
     except RecordingError:
@@ -83,13 +83,12 @@ def write_hdf5(recording: Recording, path: Path) -> None:
 
 def write_file(file: h5py.File, recording: Recording) -> None:
     """Fill an open file."""
-    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-    scene = recording.scene.encode()
-    file.create_dataset("scene", data=np.array(scene, dtype=h5py.string_dtype("utf-8", len(scene))))
+    file.attrs["format"], file.attrs["version"] = text(FORMAT), VERSION
+    file.create_dataset("scene", data=text(recording.scene))
     data = file.create_group("data")
     for demonstration in recording.demonstrations:
         group = data.create_group(demonstration.name)
-        group.attrs["task"] = demonstration.task
+        group.attrs["task"] = text(demonstration.task)
         if demonstration.success is not None:
             group.attrs["success"] = bool(demonstration.success)
         for name, value in (("qpos", demonstration.qpos), ("qvel", demonstration.qvel)):
@@ -116,7 +115,13 @@ def write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) 
         if stream.noise_std is not None:
             group.attrs["noise_std"] = float(stream.noise_std)
         if stream.frame is not None:
-            group.attrs["frame"] = stream.frame
+            group.attrs["frame"] = text(stream.frame)
+
+
+def text(value: str) -> np.ndarray:
+    """Return a string of fixed length: unlike one of variable length, it is covered by the file's checksums."""
+    encoded = value.encode()
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", max(1, len(encoded))))
 
 
 def store(group: h5py.Group, name: str, value: np.ndarray) -> None:

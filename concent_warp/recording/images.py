@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.magnitudes import check_lengths
 from concent_warp.recording.place import Place
 from concent_warp.recording.recording import ImageStream
@@ -50,7 +51,7 @@ def worst(frame: np.ndarray) -> float:
 def check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) -> None:
     """Check a pinhole matrix [px], shape (3, 3), for images of `width` x `height`."""
     matrix = np.asarray(matrix)
-    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
+    if matrix.shape != (3, 3) or not usable(matrix):
         raise place.error("intrinsics are not right", expected="(3, 3) finite numbers", found=f"{matrix.shape}")
     focal, centre = np.array([matrix[0, 0], matrix[1, 1]]), np.array([matrix[0, 2], matrix[1, 2]])
     size = np.array([width, height])
@@ -65,11 +66,15 @@ def check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) 
 def check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
     """Check a camera-to-world transform, shape (4, 4)."""
     pose = np.asarray(pose)
-    if pose.shape != (4, 4) or pose.dtype.kind not in "fiu" or not np.isfinite(pose).all():
+    if pose.shape != (4, 4) or not usable(pose):
         raise place.error("the camera pose is not right", expected="(4, 4) finite numbers", found=f"{pose.shape}")
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise place.error(
-            "the camera pose is not a transform", row=3, expected=[0, 0, 0, 1], found=pose[3], fix="is it transposed?"
+            "the camera pose is not a transform",
+            row=3,
+            expected=[0, 0, 0, 1],
+            found=pose[3],
+            fix="transpose it if need be",
         )
     rotation = pose[:3, :3].astype(float)
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -80,3 +85,8 @@ def check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
             found=f"deviation {error:.3g}, determinant {np.linalg.det(rotation):.3g}",
         )
     check_lengths(np.linalg.norm(pose[None, :3, 3], axis=1), model, place)
+
+
+def usable(matrix: np.ndarray) -> bool:
+    """Return whether a matrix holds finite numbers of a sane size."""
+    return matrix.dtype.kind in "fiu" and bool((np.abs(matrix) <= MAX_MAGNITUDE).all())

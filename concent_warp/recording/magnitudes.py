@@ -30,12 +30,13 @@ SLIDE_RANGES = 5.0
 FAST = 340.0
 """Speed above which a measurement is refused [m/s]."""
 
-POSITION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtSensor.mjSENS_SUBTREECOM)
-DISTANCE_SENSORS = (mujoco.mjtSensor.mjSENS_RANGEFINDER, mujoco.mjtSensor.mjSENS_GEOMDIST)
+# As numbers: an element of `sensor_type` equals a member of `mjtSensor`, but is not found in a tuple of them.
+POSITION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_SUBTREECOM))
+DISTANCE_SENSORS = (int(mujoco.mjtSensor.mjSENS_RANGEFINDER), int(mujoco.mjtSensor.mjSENS_GEOMDIST))
 SPEED_SENSORS = (
-    mujoco.mjtSensor.mjSENS_FRAMELINVEL,
-    mujoco.mjtSensor.mjSENS_VELOCIMETER,
-    mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
+    int(mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+    int(mujoco.mjtSensor.mjSENS_VELOCIMETER),
+    int(mujoco.mjtSensor.mjSENS_SUBTREELINVEL),
 )
 
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.recording.bounds import MAX_SAMPLES
+from concent_warp.recording.bounds import MAX_MAGNITUDE, MAX_SAMPLES
 from concent_warp.recording.clocks import check_clocks
 from concent_warp.recording.images import check_image
 from concent_warp.recording.magnitudes import check_command, check_lengths, check_measurement, check_positions
@@ -27,7 +27,7 @@ from concent_warp.scene.scene import Scene
 QUATERNION_TOLERANCE = 0.05
 """How far from 1 the norm of a measured or initial quaternion may be: rounding and additive noise stay below it, Euler
 angles, zeros and degrees do not."""
-QUATERNION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.mjSENS_BALLQUAT)
+QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
 
 def validate(recording: Recording) -> None:
@@ -92,9 +92,10 @@ def check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Pl
         return
     qpos = np.asarray(demonstration.qpos, dtype=float)
     for joint in range(model.njnt):
-        if model.jnt_type[joint] not in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+        free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        if not free and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_BALL:
             continue
-        start = model.jnt_qposadr[joint] + (3 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else 0)
+        start = model.jnt_qposadr[joint] + (3 if free else 0)
         norm = float(np.linalg.norm(qpos[start : start + 4]))
         if abs(norm - 1) > QUATERNION_TOLERANCE:
             raise place.at("initial/qpos").error(
@@ -134,7 +135,7 @@ def check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: Pl
     )
     check_finite(channel.value, place, missing_allowed=True)
     value = np.asarray(channel.value)
-    if channel.noise_std is not None and not (np.isfinite(channel.noise_std) and channel.noise_std >= 0):
+    if channel.noise_std is not None and not 0 <= channel.noise_std <= MAX_MAGNITUDE:
         raise place.error("noise_std is not a standard deviation", expected=">= 0", found=channel.noise_std)
     if model.sensor_type[row] in QUATERNION_SENSORS:
         check_quaternions(value, place)
@@ -171,7 +172,7 @@ def check_time(time: np.ndarray, place: Place) -> None:
         raise place.error("wrong shape of time", expected="(T,) numbers", found=f"{time.shape} {time.dtype}")
     if not 0 < len(time) <= MAX_SAMPLES:
         raise place.error("wrong number of samples", expected=f"1 to {MAX_SAMPLES}", found=len(time))
-    if (bad := first(~np.isfinite(time))) is not None:
+    if (bad := first(~(np.abs(time) <= MAX_MAGNITUDE))) is not None:
         raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
     if time[0] < 0:
         raise place.error("time is negative", row=0, expected=">= 0 s", found=f"{time[0]:g} s", fix="count from 0")
@@ -196,8 +197,14 @@ def check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: st
 def check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> None:
     """Refuse infinities, a channel without any value and, unless `missing_allowed`, every NaN."""
     value = np.asarray(value, dtype=float)
-    if (bad := first(np.isinf(value))) is not None:
-        raise place.error("a value is infinite", row=bad, expected="finite, or NaN where missing", found="inf")
+    if (bad := first(np.abs(value) > MAX_MAGNITUDE)) is not None:
+        found = value.reshape(len(value), -1)[bad]
+        raise place.error(
+            "a value is infinite" if np.isinf(found).any() else "a value is absurdly large",
+            row=bad,
+            expected="finite, or NaN where missing",
+            found=f"{found[np.nanargmax(np.abs(found))]:g}",
+        )
     missing = np.isnan(value)
     if missing.all():
         raise place.error("every value is missing", expected="numbers", found="only NaN", fix="leave the channel out")
