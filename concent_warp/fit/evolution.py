@@ -25,6 +25,10 @@ class EvolutionCfg:
     """Length scale of the RBF kernel [m]: how far a dent reaches."""
     noise: Noise = "gaussian_process"
     """Gaussian-process samples; "centroid" is the paper's wording taken literally; "independent" for comparison."""
+    swelling: float = 1.0
+    """Displacement along the outward normals, common to a region, relative to sigma; 0 for none."""
+    swelling_length: float = 0.05
+    """Length over which the swelling varies [m]."""
     antithetic: bool = True
     """Draw candidates in pairs of opposite displacement."""
     elite_share: float = 0.25
@@ -61,9 +65,9 @@ class Evolution:
     Channels are x, y, z [m], then the logarithms of radius and friction where these are fitted.
     """
 
-    def __init__(self, start: ContactGeometry, cfg: EvolutionCfg) -> None:
-        """Start at the given geometry."""
-        self.start, self.cfg = start, cfg
+    def __init__(self, start: ContactGeometry, normals: np.ndarray, cfg: EvolutionCfg) -> None:
+        """Start at the given geometry, whose spheres' outward unit vectors are `normals` (S, 3)."""
+        self.start, self.normals, self.cfg = start, normals, cfg
         self.mean = np.zeros((len(start), len(cfg.scales())))
         self.generation = 0
 
@@ -75,7 +79,15 @@ class Evolution:
     def ask(self, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return displacements of the candidates, shape (population, S, C); the estimate itself is not among them."""
         cfg = self.cfg
-        perturbation = Perturbation(self.geometry(self.mean), mask, cfg.noise, cfg.length)
+        perturbation = Perturbation(
+            self.geometry(self.mean),
+            mask,
+            cfg.noise,
+            cfg.length,
+            normals=self.normals,
+            swelling=cfg.swelling,
+            swelling_length=cfg.swelling_length,
+        )
         pairs = (cfg.population + 1) // 2 if cfg.antithetic else cfg.population
         noise = perturbation.draw(pairs, self.mean.shape[1], rng) * cfg.scales() * self.shrink
         if cfg.antithetic:

@@ -15,6 +15,7 @@ from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
 from concent_warp.fit.mask import robot_bodies, spheres_in_reach, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
+from concent_warp.fit.perturbation import outward
 from concent_warp.fit.target import Segment, observed_states, whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -127,7 +128,8 @@ class Search:
         """Prepare the first generation."""
         assert model.geometry is not None
         self.model, self.segments, self.cfg, self.engine_name = model, segments, cfg, engine
-        self.evolution = Evolution(model.geometry, cfg.evolution)
+        normals = outward(model.geometry, model.scene, cfg.evolution.length / 2)
+        self.evolution = Evolution(model.geometry, normals, cfg.evolution)
         self.rng = np.random.default_rng(cfg.seed)
         self.robot = robot_bodies(model.scene.model)
         self.collidable = np.zeros(len(model.geometry), dtype=bool)

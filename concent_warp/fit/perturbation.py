@@ -3,6 +3,10 @@
 The paper draws noise at the centroid of the deformable region and propagates it through an RBF kernel. Taken literally
 that is one translation of each object; what deforms surfaces smoothly is a sample of a Gaussian process whose
 covariance is the same RBF kernel. Both are here, and independent noise for comparison.
+
+A third of the matter is size: spheres centred on a surface inflate the object everywhere, and undoing this takes a
+motion of all spheres along their outward normals that random dents seldom add up to. So each sample may also hold a
+swelling: a displacement along the normals whose size varies over a longer distance.
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ from typing import Literal
 import numpy as np
 
 from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.surface import Surface
 
 Noise = Literal["gaussian_process", "centroid", "independent"]
 JITTER = 1e-6
@@ -20,7 +26,17 @@ JITTER = 1e-6
 class Perturbation:
     """Draws noise of unit standard deviation over the spheres of a mask."""
 
-    def __init__(self, geometry: ContactGeometry, mask: np.ndarray, kind: Noise, length: float) -> None:
+    def __init__(
+        self,
+        geometry: ContactGeometry,
+        mask: np.ndarray,
+        kind: Noise,
+        length: float,
+        *,
+        normals: np.ndarray | None = None,
+        swelling: float = 0.0,
+        swelling_length: float = 0.05,
+    ) -> None:
         """Prepare the draws.
 
         Args:
@@ -28,29 +44,58 @@ class Perturbation:
             mask: Spheres that may move, shape (S,) bool.
             kind: Gaussian-process sample, the paper's literal reading, or independent noise.
             length: Length scale of the RBF kernel [m].
+            normals: Outward unit vectors of the spheres, shape (S, 3); needed for swelling.
+            swelling: Standard deviation of the swelling, relative to that of the rest.
+            swelling_length: Length scale over which the swelling varies [m].
         """
         self.shape = len(geometry)
-        self.blocks: list[tuple[np.ndarray, np.ndarray]] = []
+        self.normals, self.swelling = normals, swelling
+        self.blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for body in geometry.bodies:
             rows = geometry.of(body)
             rows = rows[mask[rows]]
             if not len(rows):
                 continue
             points = geometry.position[rows]
+            slow = root(points, swelling_length)
             if kind == "gaussian_process":
-                factor = np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(rows)))
+                factor = root(points, length)
             elif kind == "centroid":
                 factor = rbf(points, points.mean(axis=0, keepdims=True), length)
             else:
                 factor = np.eye(len(rows))
-            self.blocks.append((rows, factor))
+            self.blocks.append((rows, factor, slow))
 
     def draw(self, count: int, channels: int, rng: np.random.Generator) -> np.ndarray:
         """Return `count` samples with independent channels, shape (count, S, channels); zero outside the mask."""
         result = np.zeros((count, self.shape, channels))
-        for rows, factor in self.blocks:
+        for rows, factor, slow in self.blocks:
             result[:, rows] = np.einsum("rk,ckd->crd", factor, rng.normal(size=(count, factor.shape[1], channels)))
+            if self.swelling > 0 and self.normals is not None:
+                size = self.swelling * rng.normal(size=(count, len(rows))) @ slow.T
+                result[:, rows, :3] += size[:, :, None] * self.normals[rows]
         return result
+
+
+def root(points: np.ndarray, length: float) -> np.ndarray:
+    """Return the Cholesky factor of the RBF kernel over points (n, 3), shape (n, n)."""
+    return np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(points)))
+
+
+def outward(geometry: ContactGeometry, scene: Scene, reach: float) -> np.ndarray:
+    """Return the outward unit vector of each sphere, shape (S, 3).
+
+    It is the gradient of the signed distance to the body's surface, averaged over neighbours within about `reach` [m],
+    so that it points diagonally at edges.
+    """
+    normals = np.zeros((len(geometry), 3))
+    for body in geometry.bodies:
+        rows = geometry.of(body)
+        _, gradient = Surface.of_body(scene, body).distance(geometry.position[rows])
+        mean = rbf(geometry.position[rows], geometry.position[rows], reach) @ gradient
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        normals[rows] = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), gradient)
+    return normals
 
 
 def rbf(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:

@@ -121,7 +121,9 @@ def measured_pose(
     return time, value, turn[nearest]
 
 
-def frame_channel(model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor) -> Channel | None:
+def frame_channel(
+    model: mujoco.MjModel, demonstration: Demonstration, body: str, kind: mujoco.mjtSensor
+) -> Channel | None:
     """Return the measured channel of a world-frame sensor of a kind on a body's frame, or None."""
     row = model.body(body).id
     for name, channel in demonstration.measured.items():
