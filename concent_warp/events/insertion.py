@@ -7,15 +7,15 @@ contact are told by place, and by forces summed over windows:
   the way that the object goes on while in contact), turned into the layer of spheres that the contact is on: both are
   far less bumpy than contact normals, which only tell whether the contact opposed the motion.
 - An object is *beyond* this plane once the foremost of its points that ever touch has passed it by `depth`. If it then
-  touches surfaces that stand across the plane, it has entered; if the other object is all around it there, that is
-  insertion, and the surfaces are inner walls.
-- A first contact whose normal lies across both the approach and the further way did not stop the object: there is no
-  such plane, and the object has gone straight in.
+  touches surfaces that stand across the plane, or any surface beyond it, it has entered; if the other object is all
+  around it there, that is insertion, and these surfaces are inner ones.
+- A first contact that did not oppose the motion, or that is deep within the other object, was not in the way: the
+  object has gone straight in.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,8 +28,8 @@ ACROSS = float(np.cos(np.pi / 4))
 """A normal is across an axis if it is more than 45 degrees from it."""
 OPPOSING = float(np.cos(np.pi / 3))
 """A contact opposes a motion if its normal is within 60 degrees of the motion's reverse."""
-WALL_SHARE = 0.2
-"""Share of the normal force on surfaces across the plane from which these count as touched, beyond the plane [-]."""
+INNER_SHARE = 0.2
+"""Share of the normal force from which the surfaces that it acts on count as touched [-]."""
 PLANE_REACH = 0.06
 """Spheres within this distance of the first contact are fitted by its plane [m]."""
 PLANE_LEAST = 6
@@ -40,6 +40,18 @@ PLANE_TILTS = np.radians(np.arange(2, 31, 2))
 """Tilts against the reverse of the motion that are tried [rad]."""
 GRAIN = 0.001
 """Material points that ever touch are thinned out to a grid of this size [m]."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane of the first contact, in the frame of the second object."""
+
+    point: np.ndarray
+    """A point of it [m], shape (3,)."""
+    normal: np.ndarray
+    """Its unit normal, against the approach, shape (3,)."""
+    barred: bool
+    """Whether the contact was in the way; if not, the plane lies across the approach, at the first touch."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +98,10 @@ class PairContact:
         normal = weight @ self.normal[rows]
         return weight @ self.point[rows] / weight.sum(), normal / max(np.linalg.norm(normal), 1e-12)
 
-    def height(self, plane: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Return how far the foremost feeler is in front of a plane (point, normal) at each step [m], shape (K,)."""
-        point, normal = plane
-        reach = np.einsum("kij,i->kj", self.rotation, normal) @ self.feelers.T
-        return (self.origin - point) @ normal + reach.min(axis=1)
+    def height(self, plane: Plane) -> np.ndarray:
+        """Return how far the foremost feeler is in front of a plane at each step [m], shape (K,)."""
+        reach = np.einsum("kij,i->kj", self.rotation, plane.normal) @ self.feelers.T
+        return (self.origin - plane.point) @ plane.normal + reach.min(axis=1)
 
 
 def object_onsets(
@@ -129,30 +140,23 @@ def object_onsets(
     if entered - first >= steps_of(cfg.blip, motion.timestep):
         onsets.append(Onset("align" if held[first] else "touch", first, pair, touching & ~beyond))
     if inside.any():
-        within = surrounded(contact, plane, entered)
-        onsets.append(Onset("insert" if within else "enter", entered, pair, touching & beyond))
+        deepest = entered + int(np.argmin(contact.height(plane)[entered : contact.step[-1] + 1]))
+        kind = "insert" if surrounded(contact, plane, deepest, cfg.depth) else "enter"
+        onsets.append(Onset(kind, entered, pair, touching & beyond))
     return onsets
 
 
-def first_plane(
-    contact: PairContact, touching: np.ndarray, width: int, cfg: StagingCfg
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the plane of the first contact, and whether that contact stopped the object.
-
-    Returns:
-        point: A point of the plane [m], shape (3,).
-        normal: Its unit normal, against the approach, shape (3,).
-        stopped: Whether the contact opposed the motion; if not, the plane is across the approach at the first touch.
-    """
-    first, last = contact.step[0], np.flatnonzero(touching)[-1]
+def first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: StagingCfg) -> Plane:
+    """Return the plane of the first contact, judged by the first `width` steps from it on."""
+    first, last = int(contact.step[0]), int(np.flatnonzero(touching)[-1])
     point, normal = contact.mean(contact.step < first + width)
-    approach = approach_direction(contact.origin, int(first), cfg.approach)
+    approach = approach_direction(contact.origin, first, cfg.approach)
     ways = [-approach, unit(contact.origin[first] - contact.origin[last], cfg.depth)]
     opposed = [way for way in ways if way @ normal > OPPOSING]
     if not opposed:
-        return point, (normal if not approach.any() else -approach), not approach.any()
-    point, normal = fit_plane(contact.spheres, point, opposed[0])
-    return point, normal, True
+        return Plane(point, -approach if approach.any() else normal, barred=not approach.any())
+    plane = Plane(point, fit_normal(contact.spheres, point, opposed[0]), barred=True)
+    return replace(plane, barred=not surrounded(contact, plane, first, cfg.depth))
 
 
 def approach_direction(origin: np.ndarray, first: int, length: float) -> np.ndarray:
@@ -168,26 +172,26 @@ def unit(vector: np.ndarray, least: float) -> np.ndarray:
     return vector / length if length > least else np.zeros(3)
 
 
-def fit_plane(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a plane through `point` (3,) so that it lies along the layer of spheres that the contact is on.
+def fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Turn a direction (3,) into the normal of the layer of spheres (n, 3) that a contact at `point` (3,) is on.
 
     Of the directions around `normal`, the one is taken that has most spheres level with the touched one, the more of
-    them the farther it is from `normal`, and turned into the plane of least squares through these. Where they are too
-    few, or in a line, the plane stays as it is.
+    them the farther it is from `normal`, and turned into the normal of their plane of least squares. Where they are too
+    few, or in a line, it stays as it is.
     """
     near = spheres[np.linalg.norm(spheres - point, axis=1) < PLANE_REACH]
     if len(near) < PLANE_LEAST:
-        return point, normal
+        return normal
     from_touched = near - near[np.argmin(np.linalg.norm(near - point, axis=1))]
     candidates = cone(normal)
     level = np.abs(from_touched @ candidates.T) < PLANE_BAND
     nearness = 2 * (candidates @ normal) ** 2 - 1  # cosine of twice the tilt
     layer = from_touched[level[:, np.argmax(level.sum(axis=0) * nearness)]]
+    if len(layer) < PLANE_LEAST:
+        return normal
     spread, axes = np.linalg.svd(layer - layer.mean(axis=0), full_matrices=False)[1:]
     turned = axes[2] * (1.0 if axes[2] @ normal > 0 else -1.0)
-    if len(layer) < PLANE_LEAST or spread[1] < 3 * spread[2] or turned @ normal < np.cos(PLANE_TILTS[-1]):
-        return point, normal
-    return point, turned
+    return turned if spread[1] > 3 * spread[2] and turned @ normal > np.cos(PLANE_TILTS[-1]) else normal
 
 
 def cone(axis: np.ndarray) -> np.ndarray:
@@ -200,44 +204,31 @@ def cone(axis: np.ndarray) -> np.ndarray:
 
 
 def passage(
-    contact: PairContact,
-    touching: np.ndarray,
-    plane: tuple[np.ndarray, np.ndarray, bool],
-    timestep: float,
-    cfg: StagingCfg,
+    contact: PairContact, touching: np.ndarray, plane: Plane, timestep: float, cfg: StagingCfg
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return when a is in contact beyond the plane, and when it touches walls there for `persist`, shape (K,) bool."""
-    point, normal, stopped = plane
+    """Return when a is in contact beyond the plane, and when on inner surfaces for `persist`, shape (K,) bool each."""
     steps, width = len(touching), steps_of(cfg.window, timestep)
-    beyond = touching & (contact.height((point, normal)) < -cfg.depth) if stopped else touching.copy()
-    wall = np.abs(contact.normal @ normal) < ACROSS
-    on_walls = np.bincount(contact.step, contact.force * wall, minlength=steps)
-    total = np.bincount(contact.step, contact.force, minlength=steps)
-    pressed = windowed(on_walls, width) > WALL_SHARE * windowed(total, width)
-    now = np.bincount(contact.step, wall, minlength=steps) > 0
-    return beyond, settle(beyond & pressed & now, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
+    across = np.abs(contact.normal @ plane.normal) < ACROSS
+    deep = (contact.point - plane.point) @ plane.normal < -cfg.depth
+    inner = across | deep if plane.barred else np.ones(len(contact.step), dtype=bool)
+    beyond = touching & (contact.height(plane) < -cfg.depth) if plane.barred else touching.copy()
+    on_inner = windowed(np.bincount(contact.step, contact.force * inner, minlength=steps), width)
+    total = windowed(np.bincount(contact.step, contact.force, minlength=steps), width)
+    now = np.bincount(contact.step, inner, minlength=steps) > 0
+    inside = beyond & now & (on_inner > INNER_SHARE * total)
+    return beyond, settle(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
 
 
-def surrounded(contact: PairContact, plane: tuple[np.ndarray, np.ndarray, bool], entered: int) -> bool:
-    """Return whether b is all around the part of a that is beyond the plane, from step `entered` on.
+def surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> bool:
+    """Return whether b is all around a at a step.
 
-    Seen along the plane's normal from the middle of a's feelers, the spheres of b between the deepest feeler and the
-    plane leave no gap of half a turn. Without spheres, the contact normals must leave none.
+    Seen along the plane's normal from the middle of a's feelers, what b has above the foremost feeler, by more than
+    `margin` [m], leaves no gap of half a turn. Without spheres, the places where b has been touched are taken for it.
     """
-    point, normal, _ = plane
-    deepest = contact.step[contact.step >= entered][
-        np.argmin(contact.height((point, normal))[contact.step[contact.step >= entered]])
-    ]
-    middle = contact.origin[deepest] + contact.rotation[deepest] @ contact.feelers.mean(axis=0)
-    if len(contact.spheres):
-        height = (contact.spheres - point) @ normal
-        level = contact.height((point, normal))[deepest]
-        around = contact.spheres[(height < 0) & (height > level)] - middle
-    else:
-        around = -contact.normal[contact.step >= entered]
-    across = np.linalg.svd(normal[None])[2][1:]
-    flat = around @ across.T
+    across = np.linalg.svd(plane.normal[None])[2][1:]
+    body = contact.spheres if len(contact.spheres) else contact.point
+    middle = contact.origin[step] + contact.rotation[step] @ contact.feelers.mean(axis=0)
+    above = (body - plane.point) @ plane.normal > contact.height(plane)[step] + margin
+    flat = (body[above] - middle) @ across.T
     angle = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
-    if len(angle) < 3:
-        return False
-    return bool(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max() < np.pi)
+    return len(angle) > 2 and bool(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max() < np.pi)

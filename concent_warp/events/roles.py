@@ -80,7 +80,7 @@ def driven_trees(m: mujoco.MjModel) -> set[int]:
     tendons: set[int] = set()
     trees: set[int] = set()
     for i in range(m.nu):
-        kind, target = m.actuator_trntype[i], int(m.actuator_trnid[i, 0])
+        kind, target = int(m.actuator_trntype[i]), int(m.actuator_trnid[i, 0])
         if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
             joints.add(target)
         elif kind == mujoco.mjtTrn.mjTRN_TENDON:

@@ -61,7 +61,7 @@ def find_stages(
                 spheres = geometry.position[geometry.of(roles.bodies[b])]
             onsets += object_onsets(touches.between(a, b), touching, (a, b), motion, carried, spheres, cfg)
     onsets.sort(key=lambda onset: (onset.step, KINDS.index(onset.kind), body_names(onset, roles)))
-    ends = [*(onset.step for onset in onsets[1:]), motion.steps]
+    ends = [onset.step for onset in onsets[1:]] + [motion.steps] * bool(onsets)
     names = stage_names(onsets, roles)
     return tuple(
         Stage(
