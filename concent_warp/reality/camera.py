@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -49,8 +51,8 @@ def film(
         colour = mjw.create_render_context(
             model, render_rgb=True, render_depth=False, samples_per_pixel=SAMPLES, **options
         )
-        range_ = mjw.create_render_context(model, render_rgb=False, render_depth=True, **options)
-        seen = wp.zeros((1, height, width), dtype=wp.vec3)
+        ranging = mjw.create_render_context(model, render_rgb=False, render_depth=True, **options)
+        seen: Any = wp.zeros((1, height, width), dtype=wp.vec3)
         for t, state in enumerate(qpos):
             data.qpos[:] = state
             mujoco.mj_kinematics(model, data)
@@ -58,18 +60,27 @@ def film(
             for name in ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir"):
                 target = getattr(warp_data, name)
                 wp.copy(target, wp.array(getattr(data, name)[None].reshape(target.numpy().shape), dtype=target.dtype))
-            for context in (colour, range_):
+            for context in (colour, ranging):
                 mjw.refit_bvh(warp_model, warp_data, context)
                 mjw.render(warp_model, warp_data, context)
             mjw.get_rgb(colour, 0, seen)
             rgb[t] = noisy_colour(seen.numpy()[0], sensing, rng)
-            depth[t] = noisy_depth(range_.depth_data.numpy()[0].reshape(height, width), sensing, rng)
+            depth[t] = noisy_depth(ranging.depth_data.numpy()[0].reshape(height, width), sensing, rng)
     return ImageStream(np.asarray(time, float), rgb, depth, camera.intrinsics, camera.pose)
 
 
 def staged(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: SensingCfg) -> mujoco.MjSpec:
-    """Return a copy of the world with the camera in it and the pattern on the bodies."""
+    """Return a copy of the world with the camera in it, the pattern on the bodies, and nothing that only moves it.
+
+    States come from the world itself, so what its motion takes is left out, whether the ray tracer's simulator knows it
+    or not.
+    """
     spec = dress(world, bodies)
+    for elements in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons):
+        for element in list(elements):
+            spec.delete(element)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.noslip_iterations = 0
     pose = sensing.pinhole().pose
     quaternion = np.zeros(4)
     # MuJoCo's cameras look along -z and have y up.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from scipy.optimize import least_squares
@@ -66,7 +68,8 @@ def solve_path(
             identity = pull * np.eye(len(q))
             return np.concatenate([move, turn, 0.3 * identity, 0.1 * identity])
 
-        angle = least_squares(residual, np.clip(angle, lower, upper), gradient, bounds=(lower, upper), xtol=1e-10).x
+        options: dict[str, Any] = {"jac": gradient, "bounds": (lower, upper), "xtol": 1e-10}
+        angle = least_squares(residual, np.clip(angle, lower, upper), **options).x
         error = residual(angle)
         if np.abs(error[:3]).max() > tolerance or np.abs(error[3:6]).max() > 2 * tolerance:
             raise SceneError(

@@ -104,8 +104,7 @@ def surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator
         transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), model.geom_pos[g]
         parts.append(box.apply_transform(transform))
     mesh = trimesh.util.concatenate(parts)
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
-    return np.asarray(points)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[0])
 
 
 def seen(

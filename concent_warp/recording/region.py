@@ -1,0 +1,79 @@
+"""Which pixels of a depth image show a body whose shape and pose are known."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+
+from concent_warp.recording.pinhole import Pinhole, pixel_grid
+from concent_warp.recording.rigid import inverse, moved
+
+OWN = 5
+"""Geom group that the body's geoms are put into, so that rays meet no others."""
+
+
+class BodyShape:
+    """The geoms of one body, for casting rays at it wherever it is."""
+
+    def __init__(self, model: mujoco.MjModel, qpos: np.ndarray, body: str) -> None:
+        """Take the geoms of `body` from a compiled scene; `qpos` (nq,) says where it is at the start."""
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[:] = qpos
+        mujoco.mj_forward(self.model, self.data)
+        row = self.model.body(body).id
+        own = self.model.geom_bodyid == row
+        self.model.geom_group[:] = np.where(own, OWN, 0)
+        self.start = np.eye(4)
+        """Pose of the body at the start, shape (4, 4)."""
+        self.start[:3, :3] = self.data.xmat[row].reshape(3, 3)
+        self.start[:3, 3] = self.data.xpos[row]
+        centre = self.data.geom_xpos[own] - self.data.xpos[row]
+        self.reach = float((np.linalg.norm(centre, axis=1) + self.model.geom_rbound[own]).max())
+        """Radius of a sphere around the body frame that holds all geoms [m]."""
+
+    def depth(self, camera: Pinhole, pose: np.ndarray, height: int, width: int) -> np.ndarray:
+        """Return the depth [m] of the body alone at `pose` (4, 4), shape (height, width); 0 where it is not."""
+        result = np.zeros((height, width))
+        centre, distance = camera.project(pose[:3, 3])
+        if distance <= self.reach:
+            return result
+        half = self.reach * camera.intrinsics[[0, 1], [0, 1]] / (distance - self.reach)
+        low = np.clip(np.floor(centre - half), 0, [width, height]).astype(int)
+        high = np.clip(np.ceil(centre + half) + 1, 0, [width, height]).astype(int)
+        window = np.s_[low[1] : high[1], low[0] : high[0]]
+        pixels = pixel_grid(height, width)[window].reshape(-1, 2)
+        if not len(pixels):
+            return result
+        # The rays are brought to where the body was at the start, so that the compiled scene can stay as it is.
+        back = self.start @ inverse(pose)
+        origin = moved(back, camera.position[None])[0]
+        ray = camera.rays(pixels) @ (back[:3, :3] @ camera.pose[:3, :3]).T
+        length = np.linalg.norm(ray, axis=1)
+        group = np.zeros(6, dtype=np.uint8)
+        group[OWN] = 1
+        geom, hit = np.zeros(len(ray), dtype=np.int32), np.zeros(len(ray))
+        mujoco.mj_multiRay(
+            self.model,
+            self.data,
+            origin,
+            (ray / length[:, None]).ravel(),
+            group,
+            1,
+            -1,
+            geom,
+            hit,
+            None,
+            len(ray),
+            mujoco.mjMAXVAL,
+        )
+        # Rays are scaled to a depth of 1, so depth is distance over length.
+        result[window] = np.where(geom >= 0, hit / length, 0.0).reshape(result[window].shape)
+        return result
+
+    def shown(self, camera: Pinhole, pose: np.ndarray, depth: np.ndarray, tolerance: float) -> np.ndarray:
+        """Return which pixels show the body, shape (H, W): `depth` there is within `tolerance` of its own, both [m]."""
+        expected = self.depth(camera, pose, *depth.shape)
+        return (expected > 0) & (depth > 0) & (np.abs(depth - expected) < tolerance)

@@ -1,0 +1,83 @@
+"""Rigid motion between two sets of points, some of which are wrong.
+
+Least squares by Kabsch ("A solution for the best rotation to relate two sets of vectors", Acta Crystallographica A32,
+1976), made robust by random sample consensus (Fischler and Bolles, "Random sample consensus", Communications of the
+ACM 24(6), 1981).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+REFITS = 3
+"""Rounds of refitting to the points that agree."""
+TYPICAL = 3.0
+"""How many times the median distance of the agreeing points one may be off and still agree; of distances with the same
+normal noise along all axes, all but one in ten thousand are nearer."""
+
+
+def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the rigid transforms that bring `source` nearest to `target`, shape (..., 4, 4).
+
+    Args:
+        source: Points [m], shape (..., n, 3), n >= 3.
+        target: The same points elsewhere [m], shape (..., n, 3).
+    """
+    source_mean, target_mean = source.mean(axis=-2), target.mean(axis=-2)
+    covariance = np.swapaxes(source - source_mean[..., None, :], -1, -2) @ (target - target_mean[..., None, :])
+    left, _, right = np.linalg.svd(covariance)
+    mirror = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    left[..., 2] *= mirror[..., None]
+    rotation = np.swapaxes(left @ right, -1, -2)
+    result = np.zeros((*rotation.shape[:-2], 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = target_mean - np.einsum("...ij,...j->...i", rotation, source_mean)
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def moved(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return points (..., n, 3) [m] after a rigid transform (..., 4, 4)."""
+    return points @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
+
+
+def inverse(transform: np.ndarray) -> np.ndarray:
+    """Return the inverse of a rigid transform, shape (4, 4)."""
+    result = np.eye(4)
+    result[:3, :3] = transform[:3, :3].T
+    result[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return result
+
+
+def consensus(
+    source: np.ndarray, target: np.ndarray, tolerance: float, rng: np.random.Generator, *, rounds: int = 200
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the rigid transform (4, 4) that most points agree with, and which do, shape (n,) bool.
+
+    Every round fits three points and counts those that come within `tolerance` [m]. The winner is refitted to those
+    that agree with it, and what agreement means is narrowed to `TYPICAL` of what is then found, so that a wide
+    tolerance costs no accuracy where the noise is small. None where there are fewer than three points, or none agree
+    beyond the three drawn.
+
+    Args:
+        source: Points [m], shape (n, 3).
+        target: The same points elsewhere [m], some of them wrong, shape (n, 3).
+        tolerance: Distance within which a point agrees [m].
+        rng: Source of the draws.
+        rounds: Triples tried.
+    """
+    count = len(source)
+    if count < 3:
+        return None
+    triples = np.argsort(rng.random((rounds, count)), axis=1)[:, :3]
+    candidates = kabsch(source[triples], target[triples])
+    agrees = np.linalg.norm(moved(candidates, source[None]) - target, axis=2) < tolerance
+    best = agrees[agrees.sum(axis=1).argmax()]
+    transform = candidates[agrees.sum(axis=1).argmax()]
+    for _ in range(REFITS):
+        if best.sum() < min(count, 4):
+            return None
+        transform = kabsch(source[best], target[best])
+        distance = np.linalg.norm(moved(transform, source) - target, axis=1)
+        best = distance < min(tolerance, TYPICAL * float(np.median(distance[best])) + 1e-12)
+    return transform, best

@@ -1,0 +1,214 @@
+"""RGB-D video to point tracks, without any trained network.
+
+For each body: corners are found where the depth image shows the body, followed by optical flow (`flow`), lifted to 3D
+by their depth, and held together by the rigid motion that most of them agree with (`rigid`); points that disagree are
+dropped, new ones are found where the body now is. The body's shape and its pose at the start are all that is known
+beforehand, and both come from the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.flow import corners, depth_at, follow, grey, shrunk
+from concent_warp.recording.pinhole import Pinhole
+from concent_warp.recording.recording import Demonstration, ImageStream, PointTrack, Recording
+from concent_warp.recording.region import BodyShape
+from concent_warp.recording.rigid import consensus, inverse, moved
+from concent_warp.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class TrackingCfg:
+    """How points are tracked."""
+
+    count: int = 60
+    """Points of a body followed at a time, where so many corners are found."""
+    refill: float = 0.7
+    """Share of `count` below which new points are looked for."""
+    spacing: float = 3.0
+    """Least distance between new points [px]."""
+    window: int = 7
+    """Edge of the square that optical flow compares [px]."""
+    return_tolerance: float = 0.5
+    """Largest forward-backward error [px]."""
+    agreement: float = 0.006
+    """Distance within which a point follows the rigid motion of its body [m]; a few times the depth noise."""
+    region_tolerance: float = 0.008
+    """Distance within which a measured depth belongs to a body [m]."""
+    margin: int = 2
+    """Distance that new points keep from the outline of what is visible [px]."""
+    least: int = 6
+    """Points that must agree, or the body counts as lost in this frame."""
+    seed: int = 0
+    """Seed of the random samples."""
+
+
+class BodyTracker:
+    """Follows one body from frame to frame."""
+
+    def __init__(self, shape: BodyShape, camera: Pinhole, cfg: TrackingCfg) -> None:
+        """Start where the body is at the start, with no points yet."""
+        self.shape, self.camera, self.cfg = shape, camera, cfg
+        self.rng = np.random.default_rng(cfg.seed)
+        self.pose, self.step = shape.start, np.eye(4)
+        self.local = np.zeros((0, 3))
+        """Points [m], body frame, shape (M, 3)."""
+        self.pixel = np.zeros((0, 2))
+        """Where the points were seen last [px], shape (M, 2)."""
+        self.alive = np.zeros(0, dtype=bool)
+        """Which points are being followed, shape (M,)."""
+        self.history: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        """Of each frame: the pose (4, 4), the points seen (m,) and where depth put them [m], world frame, (m, 3)."""
+
+    def advance(self, before: np.ndarray | None, image: np.ndarray, depth: np.ndarray) -> None:
+        """Take one frame: brightness before and now, uint8, and depth now [m], all (H, W)."""
+        if before is not None:
+            self.follow(before, image, depth)
+        if self.alive.sum() < self.cfg.refill * self.cfg.count:
+            self.refill(image, depth)
+        rows = np.flatnonzero(self.alive)
+        seen = self.camera.lift(self.pixel[rows], depth_at(depth, self.pixel[rows]))
+        self.history.append((self.pose, rows, seen))
+
+    def follow(self, before: np.ndarray, image: np.ndarray, depth: np.ndarray) -> None:
+        """Move the points that are followed, and the body with them."""
+        rows = np.flatnonzero(self.alive)
+        self.alive[:] = False
+        expected = self.step @ self.pose
+        guess = self.pixel[rows] + (
+            self.camera.project(moved(expected, self.local[rows]))[0]
+            - self.camera.project(moved(self.pose, self.local[rows]))[0]
+        )
+        pixel, sure = follow(
+            before,
+            image,
+            self.pixel[rows],
+            guess,
+            window=self.cfg.window,
+            tolerance=self.cfg.return_tolerance,
+        )
+        distance = depth_at(depth, pixel)
+        sure &= np.isfinite(distance)
+        rows, pixel, distance = rows[sure], pixel[sure], distance[sure]
+        result = consensus(self.local[rows], self.camera.lift(pixel, distance), self.cfg.agreement, self.rng)
+        if result is None or result[1].sum() < self.cfg.least:
+            self.step = np.eye(4)
+            return
+        pose, agrees = result
+        self.step, self.pose = pose @ inverse(self.pose), pose
+        self.alive[rows[agrees]] = True
+        self.pixel[rows[agrees]] = pixel[agrees]
+
+    def refill(self, image: np.ndarray, depth: np.ndarray) -> None:
+        """Find new points where the body shows."""
+        region = shrunk(self.shape.shown(self.camera, self.pose, depth, self.cfg.region_tolerance), self.cfg.margin)
+        taken = self.pixel[self.alive]
+        found = corners(image, region, taken, self.cfg.count - len(taken), self.cfg.spacing)
+        distance = depth_at(depth, found)
+        found, distance = found[np.isfinite(distance)], distance[np.isfinite(distance)]
+        local = moved(inverse(self.pose), self.camera.lift(found, distance))
+        self.local = np.concatenate([self.local, local])
+        self.pixel = np.concatenate([self.pixel, found])
+        self.alive = np.concatenate([self.alive, np.ones(len(found), dtype=bool)])
+
+    def track(self, time: np.ndarray) -> PointTrack:
+        """Return what was followed, at the times of the frames [s], shape (T,).
+
+        A point of the body is the mean of all its sightings, moved back into the body frame; where it was seen, it is
+        put where the body's motion takes it. So the noise of a single depth reading averages out.
+        """
+        total, count = np.zeros_like(self.local), np.zeros(len(self.local))
+        for pose, rows, seen in self.history:
+            total[rows] += moved(inverse(pose), seen)
+            count[rows] += 1
+        local = total / np.maximum(count, 1)[:, None]
+        value = np.full((len(time), len(local), 3), np.nan)
+        visible = np.zeros((len(time), len(local)), dtype=bool)
+        for t, (pose, rows, _) in enumerate(self.history):
+            value[t, rows] = moved(pose, local[rows])
+            visible[t, rows] = True
+        return PointTrack(np.asarray(time, float), value, visible)
+
+
+def track_points(
+    recording: Recording,
+    demonstration: Demonstration,
+    cfg: TrackingCfg | None = None,
+    *,
+    camera: str | None = None,
+    bodies: Sequence[str] | None = None,
+    qpos: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Demonstration:
+    """Return the demonstration with the points of its bodies tracked in its video.
+
+    Args:
+        recording: The recording that the demonstration is of; its scene gives the shapes of the bodies.
+        demonstration: The demonstration, with an RGB-D stream.
+        cfg: How points are tracked.
+        camera: Name of the stream; may be left out where there is one.
+        bodies: Bodies to track, each of one rigid piece; by default the objects of the scene.
+        qpos: State of the scene in the first frame, shape (nq,); by default the recorded initial state.
+        progress: Called with the share done, 0..1.
+
+    Raises:
+        RecordingError: There is no such stream, no initial state, or a body is not to be seen in the first frame.
+    """
+    cfg = cfg or TrackingCfg()
+    where = f"{recording.source}, {demonstration.name}"
+    stream = chosen_stream(demonstration, camera, where)
+    scene = Scene(recording.scene, recording.source)
+    state = demonstration.qpos if qpos is None else qpos
+    if state is None or len(state) != scene.model.nq:
+        raise RecordingError(
+            "tracking needs the state of the scene in the first frame",
+            where=where,
+            expected=f"qpos of {scene.model.nq} numbers",
+            found="none" if state is None else f"{len(state)} numbers",
+        )
+    pinhole = Pinhole.of(stream)
+    trackers = {}
+    for body in scene.objects() if bodies is None else bodies:
+        if mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, body) < 0:
+            raise RecordingError("the scene has no such body to track", where=where, found=repr(body))
+        trackers[body] = BodyTracker(BodyShape(scene.model, np.asarray(state, float), body), pinhole, cfg)
+    before = None
+    for t in range(len(stream.time)):
+        image = grey(stream.rgb[t])
+        for body, tracker in trackers.items():
+            tracker.advance(before, image, stream.depth[t])
+            if t == 0 and tracker.alive.sum() < cfg.least:
+                raise RecordingError(
+                    f"body {body!r} cannot be tracked",
+                    where=f"{where}, first frame",
+                    expected=f"at least {cfg.least} corners where the initial state has it",
+                    found=int(tracker.alive.sum()),
+                    fix="check the initial state, the camera's pose and the resolution",
+                )
+        before = image
+        if progress is not None:
+            progress((t + 1) / len(stream.time))
+    points = {body: tracker.track(stream.time) for body, tracker in trackers.items()}
+    return replace(demonstration, points={**demonstration.points, **points})
+
+
+def chosen_stream(demonstration: Demonstration, camera: str | None, where: str) -> ImageStream:
+    """Return the stream of a name, or the only one."""
+    names = list(demonstration.image)
+    if camera is None and len(names) != 1:
+        raise RecordingError(
+            "tracking needs one RGB-D stream",
+            where=where,
+            expected=f"the name of one of {names}" if names else "an image channel",
+            found=f"no name and {len(names)} streams",
+        )
+    name = names[0] if camera is None else camera
+    if name not in names:
+        raise RecordingError("no such RGB-D stream", where=where, expected=f"one of {names}", found=repr(name))
+    return demonstration.image[name]
