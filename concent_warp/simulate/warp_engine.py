@@ -136,7 +136,7 @@ class WarpEngine:
         parts: list[Part] = []
         start = 0
         while start < variants.count:
-            size = self._chunk(self._buffers, variants.count)
+            size = self._chunk(self._buffers, run)
             part = self._run_part(run, np.arange(start, start + size))
             if part is not None:
                 parts.append(part)
@@ -194,7 +194,14 @@ class WarpEngine:
         while len(self._programs) >= PROGRAMS:
             self._programs.popitem(last=False)
         typical = {name: largest(value) for name, value in fields.items()}
-        program = Program(self._compiled, self._sphere_geom, plan, self._buffers, typical, self.device)
+        try:
+            program = Program(self._compiled, self._sphere_geom, plan, self._buffers, typical, self.device)
+        except RuntimeError as error:
+            if "alloc" not in str(error).lower() and "memory" not in str(error).lower():
+                raise
+            raise EngineError(
+                f"{worlds} worlds do not fit the memory of {self.device}", fix=f"set max_worlds below {worlds}"
+            ) from error
         self._programs[plan] = program
         return program
 
@@ -230,22 +237,26 @@ class WarpEngine:
             changes["log_rows"] = int(1.25 * demand.logged)
         return replace(buffers, **changes) if changes else None
 
-    def _chunk(self, buffers: Buffers, count: int) -> int:
-        """Return how many of `count` variants to simulate at a time, in chunks of one size."""
+    def _chunk(self, buffers: Buffers, run: Run) -> int:
+        """Return how many variants to simulate at a time, in chunks of one size."""
+        m, count = self._compiled, run.variants.count
         if buffers not in self._world_bytes:
-            self._world_bytes[buffers] = world_bytes(self._compiled, buffers)
-        one = HEADROOM * self._world_bytes[buffers]
-        room = int((self._max_memory - buffers.log_rows * LOG_ROW_BYTES) // one)
+            self._world_bytes[buffers] = world_bytes(m, buffers)
+        recorded = 2 * 4 * len(run.record) * (m.nq + m.nv + m.nsensordata + 7 * len(run.bodies))
+        one = int(HEADROOM * self._world_bytes[buffers]) + recorded + m.ngeom * m.nbody + 4 * run.steps * m.nu
+        logged = buffers.log_rows * LOG_ROW_BYTES if run.contacts == "all" else 0
+        room = (self._max_memory - logged) // one
         if room < 1:
             raise EngineError(
                 f"one variant needs {buffers.contacts} contacts and {buffers.constraints} constraint rows, and the "
-                f"log {buffers.log_rows} contacts: too much memory",
+                f"contact log {logged // LOG_ROW_BYTES} rows: too much memory",
                 expected=f"at most {self._max_memory} bytes",
-                found=f"{int(one) + buffers.log_rows * LOG_ROW_BYTES}",
+                found=one + logged,
                 fix="thin out the contact geometry, simulate fewer variants or steps at a time, or raise max_memory",
             )
-        largest_chunk = min(room, count, self._max_worlds or count)
-        return -(-count // -(-count // largest_chunk))
+        most = min(room, count, self._max_worlds or count)
+        chunks = -(-count // most)
+        return -(-count // chunks)
 
     def _join(self, run: Run, parts: Sequence[Part]) -> Rollout:
         """Put the parts together in the order of the variants."""

@@ -6,8 +6,10 @@ import pytest
 from pushing import STEPS, make_model
 
 from concent_warp.errors import EngineError
+from concent_warp.simulate import warp_engine as warp_engine_module
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.warp_engine import WarpEngine, rung
+from concent_warp.simulate.warp_program import Buffers, world_bytes
 
 ROWS = np.arange(0, STEPS + 1, 10)
 
@@ -23,6 +25,15 @@ def assert_same(rollout, reference, atol=0.0):
 
 
 def test_engines_agree_where_everything_varies(engine, warp_engine, ctrl, variants):
+    assert_agreement(engine, warp_engine, ctrl, variants)
+
+
+@pytest.mark.gpu
+def test_engines_agree_on_a_gpu(model, engine, ctrl, variants):
+    assert_agreement(engine, WarpEngine(model, device="cuda:0"), ctrl, variants)
+
+
+def assert_agreement(engine, warp_engine, ctrl, variants):
     both = np.stack([ctrl, 0.9 * ctrl, 1.1 * ctrl])
     reference = engine.run(variants, both, contacts="all")
     rollout = warp_engine.run(variants, both, contacts="all").numpy()
@@ -138,16 +149,19 @@ def test_overflow_beyond_the_memory_is_an_error(model, ctrl):
 def test_growth_beyond_the_memory_says_what_was_needed(model, warp_engine, ctrl, variants):
     warp_engine.run(variants, ctrl, record=ROWS)
     njmax = warp_engine.buffers.constraints
-    small = WarpEngine(model, device="cpu", nconmax=1, njmax=njmax)
-    small._max_memory = int(1.5 * 1.01 * small_world_bytes(small, njmax))
-    with pytest.raises(EngineError, match=r"one variant needs \d+ contacts and \d+ constraint rows"):
+    one = world_bytes(warp_engine.compiled, Buffers(1, njmax))
+    small = WarpEngine(model, device="cpu", nconmax=1, njmax=njmax, max_memory=int(1.7 * one))
+    with pytest.raises(EngineError, match=r"one variant needs (?!1 )\d+ contacts and \d+ constraint rows"):
         small.run(replace(variants, fields={}), ctrl, record=ROWS)
 
 
-def small_world_bytes(engine, njmax):
-    from concent_warp.simulate.warp_program import Buffers, world_bytes
+def test_worlds_that_cannot_be_allocated_name_the_way_out(model, ctrl, monkeypatch):
+    def refuse(*_):
+        raise RuntimeError("Failed to allocate 1000000 bytes on device 'cuda:0'")
 
-    return world_bytes(engine.compiled, Buffers(1, njmax))
+    monkeypatch.setattr(warp_engine_module, "Program", refuse)
+    with pytest.raises(EngineError, match="set max_worlds below 3"):
+        WarpEngine(model, device="cpu").run(Variants(3), ctrl)
 
 
 def test_unstable_variant_is_flagged_and_harms_no_other(warp_engine, ctrl, variants):
