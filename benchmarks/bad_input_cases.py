@@ -109,14 +109,16 @@ def data_case(name: str, entry: str, change: Callable[[np.ndarray], object]) -> 
     """Return a case that replaces one dataset of the demonstration."""
 
     def edit(file: h5py.File) -> None:
-        value = change(file[f"data/demo_0/{entry}"][()])
+        dataset = file[f"data/demo_0/{entry}"]
+        assert isinstance(dataset, h5py.Dataset)
+        value = change(dataset[()])
         del file[f"data/demo_0/{entry}"]
         file[f"data/demo_0/{entry}"] = value
 
     return file_case(name, edit)
 
 
-def path_case(name: str, suffix: str, write: Callable[[Path], None]) -> Case:
+def path_case(name: str, suffix: str, write: Callable[[Path], object]) -> Case:
     """Return a case in which `write` makes the whole recording."""
 
     def build(folder: Path) -> tuple[Path, Path]:
@@ -151,7 +153,7 @@ def relink(link: h5py.SoftLink | h5py.ExternalLink) -> Callable[[h5py.File], Non
 
 def move(old: str, new: str) -> Callable[[h5py.File], None]:
     """Return an edit that renames an entry of the demonstration."""
-    return lambda file: file["data/demo_0"].move(old, new)
+    return lambda file: file.require_group("data/demo_0").move(old, new)
 
 
 def set_scene(text: str) -> Callable[[h5py.File], None]:
@@ -183,7 +185,7 @@ def hdf5_cases() -> Iterator[Case]:
     yield file_case("no scene", lambda f: f.__delitem__("scene"))
     yield file_case("MJCF that does not compile", set_scene(SCENE.replace('joint="elbow" kp', 'joint="knee" kp')))
     yield file_case("MJCF that includes a file", set_scene('<mujoco><include file="/etc/hostname"/></mujoco>'))
-    yield file_case("no demonstrations", lambda f: f["data"].__delitem__("demo_0"))
+    yield file_case("no demonstrations", lambda f: f.require_group("data").__delitem__("demo_0"))
     yield file_case("misspelt group", move("measured", "mesured"))
     yield file_case("unknown sensor", move(elbow, "measured/knee_angle"))
     yield file_case("unknown actuator", move("action/elbow", "action/knee"))
@@ -224,7 +226,7 @@ def path_cases() -> Iterator[Case]:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
     yield path_case("truncated HDF5", ".h5", truncated)
-    yield path_case("no HDF5 in it", ".h5", lambda p: p.write_text("time,value\n" * 100) and None)
+    yield path_case("no HDF5 in it", ".h5", lambda p: p.write_text("time,value\n" * 100))
     yield path_case("empty file", ".h5", Path.touch)
     yield path_case("missing file", ".h5", lambda _: None)
     yield path_case("unknown suffix", ".mat", Path.touch)
@@ -301,7 +303,7 @@ def toss_cases() -> Iterator[Case]:
     yield path_case("folder named .pt without tosses", ".pt", Path.mkdir)
 
 
-def model_case(kind: str, name: str, change: Callable[[Path], None]) -> Case:
+def model_case(kind: str, name: str, change: Callable[[Path], object]) -> Case:
     """Return a case that edits the files of a sound model."""
 
     def build(folder: Path) -> tuple[Path, Path]:
@@ -340,7 +342,7 @@ def model_cases() -> Iterator[Case]:
     toml, xml, npz = "model.toml", "model.scene.xml", "model.geometry.npz"
     mesh = '<asset><mesh name="m" file="gone.stl"/></asset><worldbody><geom type="mesh" mesh="m"/>'
     yield model_case("scene", "missing file", lambda f: (f / xml).unlink())
-    yield model_case("scene", "not XML", lambda f: (f / xml).write_text("a robot") and None)
+    yield model_case("scene", "not XML", lambda f: (f / xml).write_text("a robot"))
     yield model_case("scene", "missing mesh", replace_text(xml, "<worldbody>", mesh))
     yield model_case("scene", "unknown joint in an actuator", replace_text(xml, 'joint="elbow"', 'joint="knee"'))
     yield model_case("model", "missing file", lambda f: (f / toml).unlink())

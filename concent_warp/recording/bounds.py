@@ -20,5 +20,7 @@ MAX_INFLATION = 1100
 """Bytes in memory per byte in the file. Deflate reaches 1032 at most, so more means that data were never written."""
 MAX_SCENE_COPIES = 100_000
 """Bodies that the <replicate>, <composite> and <flexcomp> elements of a scene may ask for."""
+MAX_CHUNK_BYTES = 256 << 20
+"""One chunk of an HDF5 dataset, uncompressed: several frames of any camera [bytes]."""
 MAX_MAGNITUDE = 1e12
 """Largest number that a channel, clock or calibration may hold, in SI units."""

@@ -15,7 +15,14 @@ import numpy as np
 from h5py import h5l, h5z
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.bounds import MAX_BYTES, MAX_CHANNELS, MAX_INFLATION, MAX_SAMPLES, MAX_TEXT_BYTES
+from concent_warp.recording.bounds import (
+    MAX_BYTES,
+    MAX_CHANNELS,
+    MAX_CHUNK_BYTES,
+    MAX_INFLATION,
+    MAX_SAMPLES,
+    MAX_TEXT_BYTES,
+)
 
 KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 """Compression and checksums that come with h5py."""
@@ -46,19 +53,19 @@ class SafeFile:
             raise self.error(
                 "wrong shape", entry, expected=f"1 to 4 axes, at most {MAX_SAMPLES} samples", found=dataset.shape
             )
-        declared = math.prod(dataset.shape) * max(np.dtype(dtype).itemsize, dataset.dtype.itemsize)
-        if declared > self.left:
+        count = math.prod(dataset.shape)
+        self.left -= count * max(np.dtype(dtype).itemsize, dataset.dtype.itemsize)
+        if self.left < 0:
             raise self.error(
                 "the recording is too large", entry, expected=f"at most {MAX_BYTES} bytes in all", found=dataset.shape
             )
-        self.left -= declared
-        stored = dataset.id.get_storage_size()
-        if declared and declared > MAX_INFLATION * stored:
+        stored, size = dataset.id.get_storage_size(), self.path.stat().st_size
+        if stored > size or count * dataset.dtype.itemsize > MAX_INFLATION * stored:
             raise self.error(
-                "its data were never written, or only in part",
+                "its data are not in the file, or only in part",
                 entry,
                 expected=f"data for {dataset.shape}",
-                found=f"{stored} bytes",
+                found=f"{stored} bytes in a file of {size}",
             )
         return dataset[()].astype(dtype, copy=False)
 
@@ -69,8 +76,10 @@ class SafeFile:
         if dataset.external or dataset.is_virtual:
             raise self.error("its data lie in another file", entry, fix="write them into the recording")
         chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
-        if chunk > MAX_BYTES:
-            raise self.error("its chunks are too large", entry, expected=f"at most {MAX_BYTES} bytes", found=chunk)
+        if chunk > MAX_CHUNK_BYTES:
+            raise self.error(
+                "its chunks are too large", entry, expected=f"at most {MAX_CHUNK_BYTES} bytes", found=chunk
+            )
         filters = dataset.id.get_create_plist()
         codes = [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
         if set(codes) - KNOWN_FILTERS:
