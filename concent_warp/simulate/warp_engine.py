@@ -261,8 +261,7 @@ class WarpEngine:
     def _join(self, run: Run, parts: Sequence[Part]) -> Rollout:
         """Put the parts together in the order of the variants."""
         qpos, qvel, sensordata, position, quaternion = (
-            torch.cat(values) if len(values) > 1 else values[0]
-            for values in zip(*(part.records for part in parts), strict=True)
+            parts[0].records[i] if len(parts) == 1 else torch.cat([part.records[i] for part in parts]) for i in range(5)
         )
         touched = [part.touched for part in parts if part.touched is not None]
         unstable = np.concatenate([part.unstable_step for part in parts])

@@ -153,7 +153,7 @@ class Program:
             self._touched = wp.zeros((n, m.ngeom, m.nbody), dtype=wp.uint8)
         elif plan.contacts == "all":
             self._ids = wp.array(np.arange(d.naconmax, dtype=np.int32), dtype=int)
-            self._force = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
+            self._force: Any = wp.zeros(d.naconmax, dtype=wp.spatial_vector)
             self._key = wp.zeros((self.buffers.log_rows, 4), dtype=int)
             self._value = wp.zeros((self.buffers.log_rows, 10), dtype=float)
 

@@ -150,7 +150,7 @@ def test_growth_beyond_the_memory_says_what_was_needed(model, warp_engine, ctrl,
     warp_engine.run(variants, ctrl, record=ROWS)
     njmax = warp_engine.buffers.constraints
     one = world_bytes(warp_engine.compiled, Buffers(1, njmax))
-    small = WarpEngine(model, device="cpu", nconmax=1, njmax=njmax, max_memory=int(1.7 * one))
+    small = WarpEngine(model, device="cpu", nconmax=1, njmax=njmax, max_memory=int(1.5 * one) + 12_000)
     with pytest.raises(EngineError, match=r"one variant needs (?!1 )\d+ contacts and \d+ constraint rows"):
         small.run(replace(variants, fields={}), ctrl, record=ROWS)
 
