@@ -4,8 +4,10 @@ A block of threads takes one pair of sets. Each thread keeps some points of the 
 through the second set, which lies in shared memory; one distance serves both directions. The first set's minima stay in
 registers; the second set's go through one warp reduction (`redux`) per point of the second set. Squared distances are
 never negative, so their bits order like integers: minima are taken on the bits, three operands an instruction on
-Hopper (`VIMNMX3`). Differences are formed before they are squared, 6 instructions where |a|^2 + |b|^2 - 2 a.b needs 4:
-in float32 that form is off by percents at a distance of 1 mm with coordinates of 1 m.
+Hopper (`VIMNMX3`). With 16 points a thread that makes 7.5 instructions a pair for both directions, counted in the
+machine code for sm_90: 6 for the distance, 1 for the minima, 0.5 for the loop. Differences are formed before they are
+squared; |a|^2 + |b|^2 - 2 a.b would need 4 for the distance, but in float32 that form is off by percents at a distance
+of 1 mm with coordinates of 1 m.
 
 A missing point moves to a far place, +FAR for the first set and -FAR for the second, so that the inner loop need not
 ask whether it is there.
@@ -21,12 +23,6 @@ import warp as wp
 
 SHARED_POINTS = 1024
 """Most points that the second set of the one-pass kernel may have: they lie in a block's shared memory."""
-
-NEAREST_THREADS = 128
-"""Threads of a block that searches nearest points."""
-
-NEAREST_PER_THREAD = 4
-"""Points that a thread of that block searches for at a time."""
 
 
 @dataclass(frozen=True)
@@ -235,72 +231,9 @@ ONE_PASS = """
     }
 """
 
-NEAREST = """
-    constexpr int K = @K@, THREADS = @THREADS@, TILE = 512;
-    __shared__ float4 tile[TILE];
-    const auto* Q = query.data + set_of(query_batch, n);
-    const auto* R = reference.data + set_of(reference_batch, m);
-    const bool* Q_valid = query_valid.data ? query_valid.data + set_of(query_valid_batch, n) : nullptr;
-    const bool* R_valid = reference_valid.data ? reference_valid.data + set_of(reference_valid_batch, m) : nullptr;
 
-    const int first = chunk * THREADS * K + thread;
-    float x[K], y[K], z[K];
-    int best[K], group[K];
-    bool there[K];
-    #pragma unroll
-    for (int k = 0; k < K; ++k) {
-        const int i = first + k * THREADS;
-        x[k] = y[k] = z[k] = FAR;
-        best[k] = __float_as_int(1.0e36f);
-        group[k] = -1;
-        there[k] = i < n && (!Q_valid || Q_valid[i]) && present(Q[i]);
-        if (there[k]) {
-            x[k] = Q[i].c[0]; y[k] = Q[i].c[1]; z[k] = Q[i].c[2];
-        }
-    }
-    auto fetch = [&](int j) {
-        float4 p = make_float4(-FAR, -FAR, -FAR, 0.0f);
-        if (j < m && (!R_valid || R_valid[j]) && present(R[j])) {
-            p = make_float4(R[j].c[0], R[j].c[1], R[j].c[2], 0.0f);
-        }
-        return p;
-    };
-    for (int start = 0; start < m; start += TILE) {
-        const int size = min(TILE, (m - start + 3) / 4 * 4);
-        __syncthreads();
-        for (int j = thread; j < size; j += THREADS) tile[j] = fetch(start + j);
-        __syncthreads();
-        for (int j = 0; j < size; j += 4) {
-            const float4 p0 = tile[j], p1 = tile[j + 1], p2 = tile[j + 2], p3 = tile[j + 3];
-            #pragma unroll
-            for (int k = 0; k < K; ++k) {
-                int least = distance(x[k], y[k], z[k], 0.0f, p0);
-                least = min(min(least, distance(x[k], y[k], z[k], 0.0f, p1)), distance(x[k], y[k], z[k], 0.0f, p2));
-                least = min(least, distance(x[k], y[k], z[k], 0.0f, p3));
-                if (least < best[k]) {
-                    best[k] = least;
-                    group[k] = start + j;
-                }
-            }
-        }
-    }
-    // Only the group of four is known so far; the same arithmetic finds the point in it.
-    #pragma unroll
-    for (int k = 0; k < K; ++k) {
-        const int i = first + k * THREADS;
-        if (i >= n) continue;
-        int found = there[k] ? -2 : -1;
-        if (there[k] && group[k] >= 0) {
-            for (int j = group[k] + 3; j >= group[k]; --j) {
-                if (distance(x[k], y[k], z[k], 0.0f, fetch(j)) == best[k]) found = j;
-            }
-        }
-        nearest.data[size_t(problem) * n + i] = found;
-    }
-"""
-
-
-def _source(template: str, **fields: object) -> str:
+def filled(template: str, **fields: object) -> str:
+    """The source with a value for each @FIELD@."""
     for name, value in fields.items():
         template = template.replace(f"@{name.upper()}@", str(value))
     return template
@@ -309,7 +242,7 @@ def _source(template: str, **fields: object) -> str:
 @functools.cache
 def one_pass_kernel(tiling: Tiling) -> Any:
     """The kernel of both directions in one pass; launch with dim (problems, tiling.threads)."""
-    source = _source(
+    source = filled(
         COMMON + (EXPANDED if tiling.expanded else DIFFERENCE) + ONE_PASS,
         k=tiling.points_per_lane,
         warps=tiling.warps,
@@ -363,47 +296,3 @@ def one_pass_kernel(tiling: Tiling) -> Any:
         )  # fmt: skip
 
     return chamfer_one_pass
-
-
-@functools.cache
-def nearest_kernel() -> Any:
-    """The kernel of nearest points; launch with dim (problems, chunks of queries, NEAREST_THREADS)."""
-
-    @wp.func_native(_source(COMMON + DIFFERENCE + NEAREST, k=NEAREST_PER_THREAD, threads=NEAREST_THREADS))
-    def search(
-        problem: int,
-        chunk: int,
-        query: wp.array2d[wp.vec3],
-        reference: wp.array2d[wp.vec3],
-        query_valid: wp.array2d[wp.bool],
-        reference_valid: wp.array2d[wp.bool],
-        query_batch: wp.vec2i,
-        reference_batch: wp.vec2i,
-        query_valid_batch: wp.vec2i,
-        reference_valid_batch: wp.vec2i,
-        n: int,
-        m: int,
-        nearest: wp.array2d[int],
-    ): ...
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=NEAREST_THREADS)
-    def chamfer_nearest(
-        query: wp.array2d[wp.vec3],
-        reference: wp.array2d[wp.vec3],
-        query_valid: wp.array2d[wp.bool],
-        reference_valid: wp.array2d[wp.bool],
-        query_batch: wp.vec2i,
-        reference_batch: wp.vec2i,
-        query_valid_batch: wp.vec2i,
-        reference_valid_batch: wp.vec2i,
-        n: int,
-        m: int,
-        nearest: wp.array2d[int],
-    ):
-        problem, chunk, _thread = wp.tid()  # pyright: ignore
-        search(
-            problem, chunk, query, reference, query_valid, reference_valid,
-            query_batch, reference_batch, query_valid_batch, reference_valid_batch, n, m, nearest,
-        )  # fmt: skip
-
-    return chamfer_nearest

@@ -1,4 +1,4 @@
-"""Means of the nearest distances and their gradient, from the indices of the nearest points.
+"""From the indices of nearest points: their mean distance, on either device, and its gradient, on a CPU.
 
 With n_a and n_b points present, d_i = a_i - b_near(i) and e_j = b_j - a_near(j),
 
@@ -67,36 +67,6 @@ def mean_distance(
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def gradient_by_gathering(
-    own: wp.array2d[wp.vec3],
-    other: wp.array2d[wp.vec3],
-    own_batch: wp.vec2i,
-    other_batch: wp.vec2i,
-    own_nearest: wp.array2d[int],
-    other_nearest: wp.array2d[int],
-    own_count: wp.array[int],
-    other_count: wp.array[int],
-    own_upstream: wp.array[float],
-    other_upstream: wp.array[float],
-    squared: bool,
-    gradient: wp.array2d[wp.vec3],
-):
-    """One thread a point looks through the other set for its followers, so that no sum depends on thread order."""
-    problem, i = wp.tid()
-    near = own_nearest[problem, i]
-    total = wp.vec3()
-    if near >= 0:
-        o = batch_index(problem, other_batch)
-        x = own[batch_index(problem, own_batch), i]
-        total = slope(x - other[o, near], squared) * (own_upstream[problem] / float(own_count[problem]))
-        weight = other_upstream[problem] / float(other_count[problem])
-        for j in range(other_nearest.shape[1]):
-            if other_nearest[problem, j] == i:
-                total += slope(x - other[o, j], squared) * weight
-    gradient[problem, i] = total
-
-
-@wp.kernel(module="unique", enable_backward=False)
 def gradient_by_scattering(
     own: wp.array2d[wp.vec3],
     other: wp.array2d[wp.vec3],
@@ -111,7 +81,7 @@ def gradient_by_scattering(
     squared: bool,
     gradient: wp.array2d[wp.vec3],
 ):
-    """One thread a problem adds each point's pull where it belongs: for the CPU."""
+    """Gradient with respect to the own points of each problem; one thread takes a problem, so a CPU kernel."""
     problem = wp.tid()
     s = batch_index(problem, own_batch)
     o = batch_index(problem, other_batch)

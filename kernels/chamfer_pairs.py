@@ -13,14 +13,11 @@ from typing import Any
 
 import warp as wp
 
-from . import chamfer_cpu, chamfer_cuda, chamfer_gradient
+from . import chamfer_cpu, chamfer_cuda, chamfer_cuda_gradient, chamfer_gradient
 from .chamfer_cuda import Tiling
 
 MEAN_THREADS = 128
 """Threads of a block that averages the nearest distances of one pair."""
-
-GRADIENT_THREADS = 128
-"""Threads of a block of the gradient kernel."""
 
 
 def broadcast_shape(shapes: Sequence[Sequence[int]]) -> tuple[int, ...]:
@@ -154,10 +151,10 @@ class Pairs:
         else:
             found.append((chamfer_gradient.mean_distance, MEAN_THREADS if cuda else 1))
         if gradient or not self.fits_one_pass:
-            search = (chamfer_cuda.nearest_kernel(), chamfer_cuda.NEAREST_THREADS)
+            search = (chamfer_cuda_gradient.nearest_kernel(), chamfer_cuda_gradient.NEAREST_THREADS)
             found.append(search if cuda else (chamfer_cpu.nearest_kernel(), 1))
         if gradient:
-            gathering = (chamfer_gradient.gradient_by_gathering, GRADIENT_THREADS)
+            gathering = (chamfer_cuda_gradient.gradient_kernel(), chamfer_cuda_gradient.GATHER_THREADS)
             found.append(gathering if cuda else (chamfer_gradient.gradient_by_scattering, 1))
         return found
 
@@ -204,9 +201,9 @@ class Pairs:
         for pairs, found in ((self, nearest[0]), (self.swapped(), nearest[1])):
             inputs = [*pairs._sets(), pairs.n, pairs.m]
             if device.is_cuda:
-                threads = chamfer_cuda.NEAREST_THREADS
-                chunks = -(-pairs.n // (threads * chamfer_cuda.NEAREST_PER_THREAD))
-                kernel, dim = chamfer_cuda.nearest_kernel(), (self.count, chunks, threads)
+                threads = chamfer_cuda_gradient.NEAREST_THREADS
+                chunks = -(-pairs.n // (threads * chamfer_cuda_gradient.NEAREST_PER_THREAD))
+                kernel, dim = chamfer_cuda_gradient.nearest_kernel(), (self.count, chunks, threads)
             else:
                 kernel, dim, threads = chamfer_cpu.nearest_kernel(), (self.count,), 1
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=[found], device=device, block_dim=threads)
@@ -226,7 +223,8 @@ class Pairs:
             if gradient is None:
                 continue
             if device.is_cuda:
-                kernel, dim, threads = chamfer_gradient.gradient_by_gathering, (self.count, pairs.n), GRADIENT_THREADS
+                threads = chamfer_cuda_gradient.GATHER_THREADS
+                kernel, dim = chamfer_cuda_gradient.gradient_kernel(), (self.count, -(-pairs.n // threads), threads)
             else:
                 kernel, dim, threads = chamfer_gradient.gradient_by_scattering, (self.count,), 1
             inputs = [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from concent_warp.kernels import chamfer_cpu, chamfer_cuda, chamfer_gradient
+from concent_warp.kernels import chamfer_cpu, chamfer_cuda, chamfer_cuda_gradient, chamfer_gradient
 from concent_warp.kernels.chamfer import ChamferPlan, chamfer, chamfer_parts
 from concent_warp.kernels.chamfer_pairs import batch_of
 from scipy.spatial import cKDTree
@@ -190,25 +190,6 @@ def test_gradient_is_finite_and_zero_at_coincident_points(squared):
     assert not any(gradient.any() for gradient in gradients)
 
 
-def test_gradient_by_gathering_equals_gradient_by_scattering():
-    rng = np.random.default_rng(8)
-    a, b = points(rng, 4, 12), points(rng, 2, 15)
-    plan = ChamferPlan(
-        wp.from_torch(a.view(2, 2, 12, 3), dtype=wp.vec3), wp.from_torch(b, dtype=wp.vec3), gradient=True
-    )
-    upstream = [wp.array(rng.normal(size=4).astype(np.float32)) for _ in range(2)]
-    plan.launch()
-    plan.backward(*upstream)
-    pairs, nearest = plan._pairs, plan._nearest
-    assert nearest is not None
-    assert plan.a_gradient is not None
-    gathered = wp.zeros((4, 12), dtype=wp.vec3)
-    counts = (plan.a_count, plan.b_count)
-    inputs = [pairs.a, pairs.b, pairs.a_batch, pairs.b_batch, *nearest, *counts, *upstream, False]
-    wp.launch(chamfer_gradient.gradient_by_gathering, dim=(4, 12), inputs=inputs, outputs=[gathered])
-    np.testing.assert_allclose(gathered.numpy(), plan.a_gradient.numpy(), rtol=1e-5, atol=1e-7)
-
-
 def test_captured_plan_follows_its_inputs_on_replay():
     rng = np.random.default_rng(9)
     a = wp.array(rng.normal(size=(3, 2, 20, 3)).astype(np.float32), dtype=wp.vec3)
@@ -299,9 +280,9 @@ def test_cuda_gives_the_values_and_gradients_of_the_cpu(n, m):
 def test_cuda_kernels_compile_without_a_gpu(tmp_path):
     kernels = [
         chamfer_cuda.one_pass_kernel(chamfer_cuda.best_tiling(512)),
-        chamfer_cuda.nearest_kernel(),
+        chamfer_cuda_gradient.nearest_kernel(),
         chamfer_gradient.mean_distance,
-        chamfer_gradient.gradient_by_gathering,
+        chamfer_cuda_gradient.gradient_kernel(),
     ]
     for k, kernel in enumerate(kernels):
         folder = tmp_path / str(k)
