@@ -73,23 +73,26 @@ class PairContact:
     rotation: np.ndarray
     """Rotation of a at every step, shape (K, 3, 3)."""
     spheres: np.ndarray
-    """Sphere centres of b [m], shape (n, 3)."""
+    """Sphere centres of b [m], shape (n, 3); empty where b collides through its own geoms."""
+    layout: np.ndarray
+    """Where b is [m]: its sphere centres, or if it has none the places where a touches it, shape (n, 3)."""
 
     @staticmethod
     def of(rows: Touches, motion: Motion, pair: tuple[int, int], spheres: np.ndarray) -> PairContact:
         """Bring contacts of a pair of bodies into the frame of the second."""
         a, b = pair
-        feelers = np.unique(np.round(motion.into(a, rows.step, rows.point) / GRAIN), axis=0) * GRAIN
+        point = motion.into(b, rows.step, rows.point)
         origin, rotation = motion.relative(a, b)
         return PairContact(
             step=rows.step,
             normal=motion.turn_into(b, rows.step, rows.normal),
             force=rows.force,
-            point=motion.into(b, rows.step, rows.point),
-            feelers=feelers,
+            point=point,
+            feelers=thinned(motion.into(a, rows.step, rows.point)),
             origin=origin,
             rotation=rotation,
             spheres=spheres,
+            layout=spheres if len(spheres) else thinned(point),
         )
 
     def mean(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,6 +105,11 @@ class PairContact:
         """Return how far the foremost feeler is in front of a plane at each step [m], shape (K,)."""
         reach = np.einsum("kij,i->kj", self.rotation, plane.normal) @ self.feelers.T
         return (self.origin - plane.point) @ plane.normal + reach.min(axis=1)
+
+
+def thinned(points: np.ndarray) -> np.ndarray:
+    """Return points [m], shape (C, 3), one for each cell of a grid that holds any, shape (n, 3)."""
+    return np.unique(np.round(points / GRAIN), axis=0) * GRAIN
 
 
 def object_onsets(
@@ -155,7 +163,9 @@ def first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: Sta
     opposed = [way for way in ways if way @ normal > OPPOSING]
     if not opposed:
         return Plane(point, -approach if approach.any() else normal, barred=not approach.any())
-    plane = Plane(point, fit_normal(contact.spheres, point, opposed[0]), barred=True)
+    if len(contact.spheres):
+        normal = fit_normal(contact.spheres, point, opposed[0])
+    plane = Plane(point, normal, barred=True)
     return replace(plane, barred=not surrounded(contact, plane, first, cfg.depth))
 
 
@@ -223,12 +233,11 @@ def surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> 
     """Return whether b is all around a at a step.
 
     Seen along the plane's normal from the middle of a's feelers, what b has above the foremost feeler, by more than
-    `margin` [m], leaves no gap of half a turn. Without spheres, the places where b has been touched are taken for it.
+    `margin` [m], leaves no gap of half a turn.
     """
     across = np.linalg.svd(plane.normal[None])[2][1:]
-    body = contact.spheres if len(contact.spheres) else contact.point
     middle = contact.origin[step] + contact.rotation[step] @ contact.feelers.mean(axis=0)
-    above = (body - plane.point) @ plane.normal > contact.height(plane)[step] + margin
-    flat = (body[above] - middle) @ across.T
+    above = (contact.layout - plane.point) @ plane.normal > contact.height(plane)[step] + margin
+    flat = (contact.layout[above] - middle) @ across.T
     angle = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
     return len(angle) > 2 and bool(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max() < np.pi)

@@ -8,6 +8,7 @@ from gripper_task import HIGH, HOLE, LOW, OPEN, PICK, SHUT, Task, insert_from
 
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.extract import extract
+from concent_warp.events.overlap import overlap
 from concent_warp.events.sequence import ContactEventSequence, Stage
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -75,6 +76,14 @@ def test_spheres_centred_on_the_surface_close_the_hole_and_never_insert(task: Ta
     sequence = extract(model, task.perform(*insert_from(-0.008, 0.002)), MujocoEngine(model, threads=1))
     assert names(sequence)[:2] == ["pick", "align"]
     assert "insert" not in names(sequence)
+
+
+def test_exact_boxes_without_spheres_give_the_same_stages(task: Task, insertion: ContactEventSequence):
+    model = task.model.with_geometry(None)
+    exact = extract(model, task.perform(*insert_from(-0.008, 0.002)), MujocoEngine(model, threads=1))
+    assert names(exact) == names(insertion)
+    assert "block" not in exact.entity
+    assert all(entity.sphere is None for entity in exact.entities)
 
 
 def test_the_outside_of_the_box_is_no_inner_wall(task: Task):
@@ -145,3 +154,17 @@ def test_a_finer_step_gives_the_same_stages(task: Task, insertion: ContactEventS
     assert names(finer) == names(insertion)
     for a, b in zip(finer.stages[:2], insertion.stages[:2], strict=True):
         assert a.start == pytest.approx(b.start, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_two_engines_give_the_same_stages_and_pairs(task: Task, insertion: ContactEventSequence):
+    from concent_warp.simulate.warp_engine import WarpEngine
+
+    warp = extract(task.model, task.perform(*insert_from(-0.008, 0.002)), WarpEngine(task.model))
+    assert names(warp) == names(insertion)
+    assert [s.start for s in warp.stages] == pytest.approx([s.start for s in insertion.stages], abs=0.02)
+    assert {(c.a, c.b) for c in warp.body_contacts} == {(c.a, c.b) for c in insertion.body_contacts}
+    found = overlap(warp, insertion)
+    assert found.frames.pooled > 0.95
+    assert min(found.primitives.values()) > 0.7
+    assert set(found.links.values()) == {1.0}
