@@ -1,5 +1,7 @@
 """Extraction from contact logs written by hand: a robot link, a block of two spheres, and a fixed plate."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from gripper_task import Task, insert_from
@@ -159,12 +161,13 @@ def test_geoms_of_another_model_are_refused():
 
 def test_a_replay_that_diverges_is_refused(task: Task):
     demonstration = task.perform(*insert_from(-0.008, 0.0))
+    assert demonstration.qpos is not None
     demonstration.qpos[2] = 1e12
     with pytest.raises(EventsError, match="does not stay finite"):
         extract(task.model, demonstration, task.engine)
 
 
 @pytest.mark.parametrize(("setting", "value"), [("gap", -1), ("blip", float("nan")), ("share", 0), ("target", "best")])
-def test_settings_that_cannot_be_are_refused(setting: str, value: object):
+def test_settings_that_cannot_be_are_refused(setting: str, value: Any):
     with pytest.raises(EventsError, match=setting):
         StagingCfg(**{setting: value})

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from concent_warp.events.schedule import label_levels, plot_schedule, schedule_rows
@@ -24,9 +25,9 @@ def test_the_plot_shows_bars_stages_and_target_events(insertion: ContactEventSeq
     for stage in insertion.stages:
         assert stage.name in texts
         assert f"{stage.start:.2f} s" in texts
-    diamonds = [line for line in axes.lines if line.get_marker() == "D"]
-    assert [len(line.get_xdata()) for line in diamonds] == [2, 3, 3]
-    assert [line.get_xdata()[0] for line in diamonds] == [stage.event.time for stage in insertion.stages]
+    diamonds = [np.asarray(line.get_xdata()) for line in axes.lines if line.get_marker() == "D"]
+    assert [len(times) for times in diamonds] == [2, 3, 3]
+    assert [times[0] for times in diamonds] == [stage.event.time for stage in insertion.stages]
     assert axes.get_title(loc="left") == "one"
 
 
