@@ -9,6 +9,7 @@ import numpy as np
 
 from concent_warp.recording.pinhole import Pinhole
 from concent_warp.recording.recording import Channel
+from concent_warp.recording.region import cast
 from concent_warp.scene.scene import Scene
 
 SLACK = 2e-3
@@ -120,22 +121,8 @@ def seen(
     inside = (depth > 0) & (np.abs(pixel + 0.5 - np.array([width, height]) / 2) < np.array([width, height]) / 2).all(1)
     ray = points - camera.position
     distance = np.linalg.norm(ray, axis=1)
-    geom, hit = np.zeros(len(points), dtype=np.int32), np.zeros(len(points))
-    mujoco.mj_multiRay(
-        model,
-        data,
-        camera.position,
-        (ray / distance[:, None]).ravel(),
-        np.ones(6, dtype=np.uint8),
-        1,
-        -1,
-        geom,
-        hit,
-        None,
-        len(points),
-        10.0,
-    )
-    return inside & ((geom < 0) | (hit > distance - slack))
+    hit = cast(model, data, camera.position, ray / distance[:, None])
+    return inside & ((hit < 0) | (hit > distance - slack))
 
 
 def visible_points(

@@ -18,7 +18,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.recording.flow import corners, depth_at, follow, grey, shrunk
 from concent_warp.recording.pinhole import Pinhole
 from concent_warp.recording.recording import Demonstration, ImageStream, PointTrack, Recording
-from concent_warp.recording.region import BodyShape
+from concent_warp.recording.region import BodyShape, shown
 from concent_warp.recording.rigid import consensus, inverse, moved
 from concent_warp.scene.scene import Scene
 
@@ -45,6 +45,8 @@ class TrackingCfg:
     """Distance that new points keep from the outline of what is visible [px]."""
     least: int = 6
     """Points that must agree, or the body counts as lost in this frame."""
+    regain: float = 0.5
+    """Share of the pixels of a lost body that must show it, where it was last, before it is followed again."""
     seed: int = 0
     """Seed of the random samples."""
 
@@ -106,8 +108,13 @@ class BodyTracker:
         self.pixel[rows[agrees]] = pixel[agrees]
 
     def refill(self, image: np.ndarray, depth: np.ndarray) -> None:
-        """Find new points where the body shows."""
-        region = shrunk(self.shape.shown(self.camera, self.pose, depth, self.cfg.region_tolerance), self.cfg.margin)
+        """Find new points where the body shows; a body that was lost must show well enough to be followed again."""
+        expected = self.shape.depth(self.camera, self.pose, *depth.shape)
+        region = shown(expected, depth, self.cfg.region_tolerance)
+        lost = bool(self.history) and not self.alive.any()
+        if lost and region.sum() < self.cfg.regain * (expected > 0).sum():
+            return
+        region = shrunk(region, self.cfg.margin)
         taken = self.pixel[self.alive]
         found = corners(image, region, taken, self.cfg.count - len(taken), self.cfg.spacing)
         distance = depth_at(depth, found)
