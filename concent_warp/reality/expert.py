@@ -21,7 +21,7 @@ class ExpertCfg:
 
     rate: float = 50.0
     """Rate of the commands [Hz]."""
-    grip_height: float = 0.013
+    grip_height: float = 0.014
     """Tool centre above the block's centre in the grasp [m]."""
     clearance: float = 0.05
     """Height above the objects in transfer [m]."""
@@ -108,7 +108,7 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
             position.append(previous[1] + share * (goal - previous[1]))
             force.append(previous[2] + share * (wrench - previous[2]))
             turn.append(previous[3] + share * (yaw_goal - previous[3]))
-            opening.append(width)
+            opening.append(previous[4] + k / steps * (width - previous[4]))
     down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
     rotation = np.array([[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]] for a in turn]) @ down
     return Path(np.array(time), np.array(position), rotation, np.array(force), np.array(opening))

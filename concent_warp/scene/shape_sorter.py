@@ -26,7 +26,7 @@ class ShapeSorterCfg:
     """Edge of the square hole [m]."""
     box_size: float = 0.07
     """Outer edge of the box [m]."""
-    box_height: float = 0.025
+    box_height: float = 0.022
     """Height of the box [m]."""
     floor: float = 0.003
     """Thickness of the box's floor [m]."""
