@@ -175,7 +175,7 @@ class Reader(SafeFile):
             )
         if (kind.length or 0) > MAX_SCENE_BYTES:
             raise self.error("the scene is too long", "scene", expected=f"{MAX_SCENE_BYTES} bytes", found=kind.length)
-        return self.decode(dataset[()], "scene")
+        return self.decode(self.bounded(lambda: dataset[()], "scene"), "scene")
 
     def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
         """Read one demonstration."""

@@ -7,6 +7,7 @@ external storage too), and the size of an array is checked before the array is r
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,8 +22,10 @@ from concent_warp.recording.bounds import (
     MAX_CHUNK_BYTES,
     MAX_INFLATION,
     MAX_SAMPLES,
+    MAX_SCENE_BYTES,
     MAX_TEXT_BYTES,
 )
+from concent_warp.recording.hdf5_heap import memory_bound
 
 KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 """Compression and checksums that come with h5py."""
@@ -117,7 +120,17 @@ class SafeFile:
         identifier = item.attrs.get_id(name)
         if identifier.get_storage_size() > MAX_TEXT_BYTES:
             raise self.error("an attribute is too large", f"{item.name}, attribute {name}")
-        return item.attrs[name]
+        if h5py.check_string_dtype(identifier.dtype) is None:
+            return item.attrs[name]
+        return self.bounded(lambda: item.attrs[name], f"{item.name}, attribute {name}")
+
+    def bounded(self, read: Callable[[], Any], entry: str) -> Any:
+        """Return what `read` reads, a string whose length is not known before."""
+        try:
+            with memory_bound(2 * MAX_SCENE_BYTES):
+                return read()
+        except MemoryError:
+            raise self.error("the text is too long", entry, expected=f"at most {MAX_SCENE_BYTES} bytes") from None
 
     def text_attribute(self, item: h5py.Group, name: str) -> str | None:
         """Return a text attribute, or None."""

@@ -1,13 +1,15 @@
-"""A check of the global heaps of an HDF5 file before the HDF5 library may read them.
+"""What the HDF5 library does not check itself where it reads strings of variable length.
 
-Strings of variable length lie in global heaps, the one part of the format in which damage is not noticed by the
-library (seen with HDF5 2.0): an object of size 0 makes it loop for ever, one that is too long makes it read beyond its
-memory. Layout: HDF5 file format specification, section III.E.
+They lie in global heaps, the one part of the format in which damage is not noticed in time (seen with HDF5 2.0): an
+object of size 0 makes the library loop for ever, one that is too long makes it read beyond its memory, and a wrong
+length of a string makes it allocate gigabytes. Layout: HDF5 file format specification, section III.E.
 """
 
 from __future__ import annotations
 
 import mmap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from concent_warp.errors import RecordingError
@@ -65,3 +67,21 @@ def check_heap(data: mmap.mmap, start: int, path: Path) -> None:
 def not_hdf5(path: Path) -> RecordingError:
     """Return the error about a file of another kind."""
     return RecordingError("not an HDF5 file", where=path, fix="check that the file was copied whole")
+
+
+@contextmanager
+def memory_bound(extra: int) -> Iterator[None]:
+    """Let the process allocate at most `extra` bytes more; without effect where the system has no such limit."""
+    usage = Path("/proc/self/statm")
+    if not usage.is_file():
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    bound = int(usage.read_text().split()[0]) * resource.getpagesize() + extra
+    resource.setrlimit(resource.RLIMIT_AS, (bound if soft == resource.RLIM_INFINITY else min(soft, bound), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
