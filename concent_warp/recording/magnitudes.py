@@ -4,9 +4,10 @@ The bounds are far outside what a sound recording holds, and they grow with the 
 
 - positions: the lower quartile of the distances from the origin is above both 20 m and 50 times the extent of the
   scene. What starts near the scene and flies or falls far away stays below it.
-- joint angles and commanded angles: more than a full turn outside a limited range. Encoders that wrap stay below it;
-  angles of joints without limits cannot be judged and are not.
-- joint slides and commanded slides: more than 1 m, and more than 5 ranges, outside a limited range.
+- joint angles, and those commanded of a position servo: more than a full turn outside the joint's range. Encoders that
+  wrap stay below it; angles of joints without limits cannot be judged and are not.
+- joint slides, commanded or measured: more than 1 m, and more than 5 ranges, outside the joint's range.
+- tendons over joints of one kind: the same, with the range that the joints give them.
 - speeds: above 340 m/s.
 """
 
@@ -64,7 +65,7 @@ def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: Place) -> No
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             check_lengths(np.linalg.norm(qpos[None, start : start + 3], axis=1), model, place)
         else:
-            check_joint(qpos[start : start + 1], model, joint, None, place)
+            check_joint(qpos[start : start + 1], model, joint, place)
 
 
 def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, place: Place) -> None:
@@ -75,7 +76,9 @@ def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, pla
     elif kind in DISTANCE_SENSORS:
         check_lengths(np.abs(value[:, 0]), model, place)
     elif kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
-        check_joint(value[:, 0], model, int(model.sensor_objid[sensor]), None, place)
+        check_joint(value[:, 0], model, int(model.sensor_objid[sensor]), place)
+    elif kind == mujoco.mjtSensor.mjSENS_TENDONPOS:
+        check_tendon(value[:, 0], model, int(model.sensor_objid[sensor]), place)
     elif kind in SPEED_SENSORS:
         speed = np.linalg.norm(np.nan_to_num(value), axis=1)
         row = int(speed.argmax())
@@ -93,30 +96,53 @@ def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place
     """Check the unit of the commands of a position servo, shape (T,); other actuators are not judged."""
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
     servo = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain == -bias != 0
-    on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-    if servo and on_joint and model.actuator_gear[actuator, 0] == 1:
-        limits = model.actuator_ctrlrange[actuator] if model.actuator_ctrllimited[actuator] else None
-        check_joint(value, model, int(model.actuator_trnid[actuator, 0]), limits, place)
-
-
-def check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, limits: np.ndarray | None, place: Place) -> None:
-    """Check positions of a hinge [rad] or slide [m], shape (T,), against `limits`, or else the range of the joint."""
-    if limits is None and not model.jnt_limited[joint]:
+    if not servo or model.actuator_gear[actuator, 0] != 1:
         return
-    low, high = (float(bound) for bound in (model.jnt_range[joint] if limits is None else limits))
-    outside = np.nan_to_num(np.maximum(low - value, value - high))
-    row = int(outside.argmax())
-    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+    target = int(model.actuator_trnid[actuator, 0])
+    if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+        check_joint(value, model, target, place)
+    elif model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON:
+        check_tendon(value, model, target, place)
+
+
+def check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: Place) -> None:
+    """Check positions of a hinge [rad] or slide [m], shape (T,), against its range, where it has one."""
+    if model.jnt_limited[joint]:
+        low, high = (float(bound) for bound in model.jnt_range[joint])
+        check_range(value, low, high, int(model.jnt_type[joint]), f"joint {model.joint(joint).name!r}", place)
+
+
+def check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: Place) -> None:
+    """Check lengths of a fixed tendon, shape (T,), against what the ranges of its joints allow.
+
+    The joints must all be limited and of one type.
+    """
+    rows = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    if (model.wrap_type[rows] != mujoco.mjtWrap.mjWRAP_JOINT).any():
+        return
+    joints = model.wrap_objid[rows]
+    kinds = set(model.jnt_type[joints].tolist())
+    if len(kinds) == 1 and model.jnt_limited[joints].all():
+        ends = model.wrap_prm[rows, None] * model.jnt_range[joints]
+        low, high = float(ends.min(axis=1).sum()), float(ends.max(axis=1).sum())
+        check_range(value, low, high, kinds.pop(), f"tendon {model.tendon(tendon).name!r}", place)
+
+
+def check_range(value: np.ndarray, low: float, high: float, kind: int, name: str, place: Place) -> None:
+    """Check positions [rad or m], shape (T,), of a hinge or slide joint, or a tendon over some, of a given range."""
+    if kind == mujoco.mjtJoint.mjJNT_HINGE:
         allowed, guess, unit, fix = TURN, "degrees", "rad", "write radians"
-    elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+    elif kind == mujoco.mjtJoint.mjJNT_SLIDE:
         allowed, guess, unit, fix = max(SLIDE, SLIDE_RANGES * (high - low)), "millimetres", "m", "write metres"
     else:
         return
+    outside = np.nan_to_num(np.maximum(low - value, value - high))
+    row = int(outside.argmax())
     if outside[row] > allowed:
         raise place.error(
             f"its values look like {guess}",
             row=row,
-            expected=f"near the range {low:.4g} to {high:.4g} {unit} of joint {model.joint(joint).name!r}",
+            expected=f"near the range {low:.4g} to {high:.4g} {unit} of {name}",
             found=f"{value[row]:.4g}",
             fix=fix,
         )

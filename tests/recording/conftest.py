@@ -14,7 +14,9 @@ SCENE = """
     </body>
     <body name="block" pos="0.4 0 0.02"><freejoint name="block"/><geom type="box" size="0.02 0.02 0.02"/></body>
   </worldbody>
+  <tendon><fixed name="opening"><joint joint="grip" coef="2"/></fixed></tendon>
   <actuator>
+    <position name="opening" tendon="opening" kp="20"/>
     <position name="elbow" joint="elbow" kp="20"/>
     <position name="left/grip" joint="grip" kp="20"/>
     <motor name="push" joint="grip"/>
@@ -22,6 +24,7 @@ SCENE = """
   <sensor>
     <jointpos name="elbow_angle" joint="elbow"/>
     <jointpos name="grip_width" joint="grip"/>
+    <tendonpos name="opening" tendon="opening"/>
     <framepos name="block_position" objtype="xbody" objname="block"/>
     <framequat name="block_orientation" objtype="xbody" objname="block"/>
     <framelinvel name="block_velocity" objtype="xbody" objname="block"/>
@@ -51,10 +54,15 @@ def sound_recording() -> Recording:
         success=True,
         qpos=np.array([0.1, 0.02, 0.4, 0, 0.02, 1, 0, 0, 0]),
         qvel=np.zeros(8),
-        action={"elbow": Channel(TIME, angle), "left/grip": Channel(TIME[:1], np.array([0.03]))},
+        action={
+            "elbow": Channel(TIME, angle),
+            "left/grip": Channel(TIME[:1], np.array([0.03])),
+            "opening": Channel(TIME, 0 * TIME + 0.06),
+        },
         measured={
             "elbow_angle": Channel(TIME + 0.002, angle[:, None], noise_std=1e-3),
             "grip_width": Channel(TIME, np.full((len(TIME), 1), 0.03)),
+            "opening": Channel(TIME, np.full((len(TIME), 1), 0.06)),
             "block_position": Channel(TIME, position, frame="table"),
             "block_orientation": Channel(TIME, quaternion),
             "block_velocity": Channel(TIME, np.zeros((len(TIME), 3))),

@@ -82,6 +82,8 @@ CHANNELS = {
     ),
     "degrees": (("measured", "elbow_angle", {"value": lambda v: np.degrees(v)}), "look like degrees"),
     "slide in mm": (("measured", "grip_width", {"value": lambda v: 1e3 * v}), "look like millimetres"),
+    "tendon in mm": (("measured", "opening", {"value": lambda v: 1e3 * v}), "range 0 to 0.08 m of tendon 'opening'"),
+    "tendon command in mm": (("action", "opening", {"value": lambda v: 1e3 * v}), "look like millimetres"),
     "command in degrees": (("action", "elbow", {"value": lambda v: np.degrees(v)}), "look like degrees"),
     "command in mm": (
         ("action", "left/grip", {"value": lambda v: 1e3 * v}),
@@ -125,7 +127,11 @@ def test_a_broken_channel_is_refused_with_its_place(recording, edit, message):
 @pytest.mark.parametrize(
     ("kind", "old", "message"),
     [
-        ("action", "elbow", r"no such actuator; expected one of \['elbow', 'left/grip', 'push'\], found 'shoulder'"),
+        (
+            "action",
+            "elbow",
+            r"no such actuator; expected one of \['opening', 'elbow', 'left/grip', 'push'\], found 'shoulder'",
+        ),
         ("measured", "elbow_angle", "no such sensor; expected one of .*'grip_width'.*found 'shoulder'"),
         ("points", "block", r"no such body; expected one of \['arm', 'finger', 'block'\], found 'shoulder'"),
     ],
