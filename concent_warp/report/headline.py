@@ -1,0 +1,146 @@
+"""The headline of a report: the figures on the cards, and the sentence that says what they mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.comparison_table import percent, shown, unit_shown
+from concent_warp.events.sequence import ContactEventSequence
+
+NULL = "no contact"
+"""Name of the model whose objects do not touch one another, where a comparison has one."""
+ENOUGH_OVERLAP = 0.8
+"""Overlap of contact frames with the truth from which the contact counts as reproduced."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """One figure; `figure` and `note` are HTML."""
+
+    what: str
+    figure: str
+    note: str = ""
+
+    def html(self) -> str:
+        """Return the card."""
+        note = f'<div class="note">{self.note}</div>' if self.note else ""
+        return (
+            f'<div class="card"><div class="what">{escape(self.what)}</div>'
+            f'<div class="figure">{self.figure}</div>{note}</div>'
+        )
+
+
+def cards(
+    comparison: Comparison,
+    events: Mapping[str, ContactEventSequence],
+    fitted: Sequence[str],
+    overlap: Mapping[str, Mapping[str, float]],
+) -> list[Card]:
+    """Return the cards of a report."""
+    channel, phases = comparison.main_channel(), comparison.contact_phases()
+    where = f"Mean error of {words(channel)}" + (f", {' + '.join(phases)}" if phases else "")
+    unseen = tuple(d for d in comparison.demonstrations if fitted and d not in fitted)
+    seen = tuple(d for d in comparison.demonstrations if d not in unseen)
+    found = []
+    if seen:
+        suffix = " (demonstrations that were fitted)" if unseen else ""
+        found.append(error_card(comparison, where + suffix, channel, phases, seen))
+    if unseen:
+        found.append(error_card(comparison, where + " (demonstrations not seen by the fit)", channel, phases, unseen))
+    if overlap:
+        ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
+        if ends:
+            figure = arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
+            found.append(Card("Overlap (IoU) of object contact with the truth; 1 is perfect", figure))
+    if events:
+        counts = sorted({len(sequence.stages) for sequence in events.values()})
+        names = " · ".join(stage.name for stage in next(iter(events.values())).stages)
+        figure = " or ".join(map(str, counts)) + " <small>stages</small>"
+        found.append(Card("Contact stages found in the replay", figure, escape(names)))
+    last = comparison.summarise(comparison.after, channel, phases)
+    noise = "" if last.noise is None else f"{shown(last.noise, last.unit)} {unit_shown(last.unit)}"
+    if NULL in comparison.models:
+        null = comparison.summarise(NULL, channel, phases)
+        figure = f"{shown(null.mean, null.unit)} <small>{unit_shown(null.unit)}</small>"
+        note = f"Measurement noise alone would leave {noise}." if noise else ""
+        found.insert(
+            bool(seen) + bool(unseen), Card("The same error if objects did not touch one another", figure, note)
+        )
+    elif noise:
+        found.append(Card("Error that the measurement noise alone would leave", noise))
+    return found
+
+
+def error_card(
+    comparison: Comparison, what: str, channel: str, phases: tuple[str, ...], demonstrations: tuple[str, ...]
+) -> Card:
+    """Return the card of an error before and after."""
+    before, after = (
+        comparison.summarise(model, channel, phases, demonstrations) for model in (comparison.before, comparison.after)
+    )
+    unit = unit_shown(after.unit)
+    if len(comparison.models) < 2:
+        return Card(what, f"{shown(after.mean, after.unit)} <small>{unit}</small>")
+    found = comparison.difference(channel, phases, demonstrations)
+    note = ""
+    if np.isfinite(found.share):
+        kind = {"fallen": "good", "risen": "bad"}.get(found.verdict, "")
+        note = f'<b class="{kind}">{percent(found.share)}</b>'
+        if np.isfinite(found.low):
+            low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
+            note += f", difference {low} to {high} {unit} (95 %)"
+    return Card(what, arrow([shown(before.mean, before.unit), shown(after.mean, after.unit)], unit), note)
+
+
+def arrow(ends: Sequence[str], unit: str) -> str:
+    """Return two figures with an arrow between them as HTML."""
+    tail = f" <small>{unit}</small>" if unit else ""
+    return f'<span class="from">{ends[0]}</span><span class="arrow">→</span><span class="to">{ends[1]}</span>{tail}'
+
+
+def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
+    """Return what the figures mean, in one or two sentences."""
+    channel, phases = comparison.main_channel(), comparison.contact_phases()
+    after = comparison.summarise(comparison.after, channel, phases)
+    unit = unit_shown(after.unit)
+    during = f" during {' and '.join(phases)}" if phases else ""
+    if not np.isfinite(after.mean):
+        return f"The simulation of “{comparison.after}” does not stay finite: see the table for when it diverges."
+    if len(comparison.models) < 2:
+        return f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}."
+    before = comparison.summarise(comparison.before, channel, phases)
+    found = comparison.difference(channel, phases)
+    change = {
+        "fallen": "has fallen",
+        "risen": "has risen",
+        "unclear": "has not changed by more than chance explains",
+    }[found.verdict]
+    text = (
+        f"The error of {words(channel)}{during} {change}: {shown(before.mean, before.unit)} {unit} "
+        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}."
+    )
+    if NULL in comparison.models:
+        null = comparison.summarise(NULL, channel, phases)
+        text += f" Ignoring the contact would leave {shown(null.mean, null.unit)} {unit}"
+        if after.mean < 0.5 * null.mean:
+            text += ", so it is the contact that explains the motion."
+        else:
+            text += ": this error alone does not show that the contact is right."
+    ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
+    if ends and ends[-1] < ENOUGH_OVERLAP:
+        text += f" The contact itself overlaps with the truth by only {ends[-1]:.2f}."
+    if unseen := tuple(d for d in comparison.demonstrations if fitted and d not in fitted):
+        held = comparison.difference(channel, phases, unseen)
+        if held.verdict != "fallen":
+            text += " On demonstrations that the fit has not seen, no gain can be shown."
+    return text
+
+
+def words(channel: str) -> str:
+    """Return a channel's name as words: ``block_position`` is "block position"."""
+    return channel.replace("_", " ")

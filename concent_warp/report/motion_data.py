@@ -1,0 +1,102 @@
+"""What the replay on the page needs: poses of the bodies over time, simulated and measured, and tracked points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.report.scene_data import packed
+from concent_warp.simulate.replay import interpolate, replay
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack
+    from concent_warp.simulate.engine import Engine
+
+RATE = 25.0
+"""Frames a second of the replay."""
+MOST_FRAMES = 400
+"""Frames of a demonstration; longer ones are shown at a lower rate."""
+MOST_POINTS = 48
+"""Tracked points shown of a body."""
+
+
+def motion_data(
+    models: Mapping[str, Model],
+    engines: Mapping[str, Engine],
+    demonstration: Demonstration,
+    bodies: Sequence[str],
+) -> dict[str, Any]:
+    """Return the replay of a demonstration in each model, beside what was measured, at common times."""
+    duration = demonstration.duration
+    count = int(np.clip(np.ceil(duration * RATE) + 1, 2, MOST_FRAMES))
+    time = np.linspace(0, duration, count)
+    poses = {}
+    for name, model in models.items():
+        engine = engines[name]
+        steps = np.unique(np.round(time / engine.timestep).astype(int))
+        rollout = replay(model, demonstration, engine, record=steps, bodies=bodies).numpy()
+        rows = np.searchsorted(rollout.time, time - engine.timestep / 2).clip(0, len(rollout.time) - 1)
+        pose = np.concatenate([rollout.body_position[0], rollout.body_quaternion[0]], axis=2)
+        poses[name] = packed(pose[rows])
+    compiled = next(iter(models.values())).scene.model
+    measured = measured_poses(compiled, demonstration, time)
+    points = {
+        body: point_data(track)
+        for body, track in demonstration.points.items()
+        if body not in measured and moves(compiled, body)
+    }
+    return {
+        "time": packed(time),
+        "poses": poses,
+        "measured": {body: packed(pose) for body, pose in measured.items() if body in bodies},
+        "points": points,
+    }
+
+
+def measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the measured poses (T, 7) at `time` (T,) of the bodies that move and were measured in full."""
+    found: dict[str, dict[int, Channel]] = {}
+    for name, channel in demonstration.measured.items():
+        row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if row >= 0 and int(compiled.sensor_objtype[row]) == mujoco.mjtObj.mjOBJ_XBODY:
+            body = compiled.body(compiled.sensor_objid[row]).name
+            found.setdefault(body, {})[int(compiled.sensor_type[row])] = channel
+    poses = {}
+    for body, channels in found.items():
+        position = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEPOS))
+        rotation = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
+        if position is not None and rotation is not None and moves(compiled, body):
+            quaternion = resampled(rotation, time, align=True)
+            quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+            poses[body] = np.concatenate([resampled(position, time), quaternion], axis=1)
+    return poses
+
+
+def resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.ndarray:
+    """Return a channel at other times, shape (T, dim); gaps are bridged. `align` flips quaternions to one side."""
+    valid = np.isfinite(channel.value).all(axis=1)
+    value = channel.value[valid]
+    if not len(value):
+        return np.full((len(time), channel.value.shape[1]), np.nan)
+    if align:
+        flips = np.where((value[1:] * value[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        value = value * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    return interpolate(channel.time[valid], value, time)
+
+
+def point_data(track: PointTrack) -> dict[str, Any]:
+    """Return the tracked points of a body, thinned in number and time."""
+    frames = np.unique(np.linspace(0, len(track.time) - 1, min(len(track.time), MOST_FRAMES // 2)).astype(int))
+    chosen = np.unique(np.linspace(0, track.value.shape[1] - 1, min(track.value.shape[1], MOST_POINTS)).astype(int))
+    value = np.where(track.visible[..., None], track.value, np.nan)[frames][:, chosen]
+    return {"time": packed(track.time[frames]), "xyz": packed(value), "count": len(chosen)}
+
+
+def moves(compiled: mujoco.MjModel, body: str) -> bool:
+    """Return whether a body can move."""
+    row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_BODY, body)
+    return row >= 0 and compiled.body_weldid[row] != 0

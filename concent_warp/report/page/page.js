@@ -1,0 +1,224 @@
+"use strict";
+// Ties the charts, the 3D views and the controls of the page to the data that the report carries.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+
+/** Arrays travel as base64 of little-endian 32-bit numbers. */
+function numbers(packed) {
+  const bytes = Uint8Array.from(atob(packed.data), (c) => c.charCodeAt(0));
+  return new (packed.type === "i" ? Int32Array : Float32Array)(bytes.buffer);
+}
+const meshes = Object.fromEntries(Object.entries(data.meshes).map(([name, m]) => [name, { vertices: numbers(m.vertices), faces: numbers(m.faces) }]));
+const shown = data.shown;
+const state = { demonstration: data.demonstrations[0], time: 0, playing: false, spheres: false, log: false, ghost: true };
+
+// ---- charts --------------------------------------------------------------------------------------------------------
+const narrow = () => document.body.clientWidth < 640;
+const errors = new LineChart($("errors"), (t) => setTime(t));
+const schedule = $("schedule") ? new Schedule($("schedule"), (t) => setTime(t)) : null;
+
+function leftMargin() {
+  if (narrow() || !schedule) return 46;
+  return 18 + 7 * Math.max(5, ...(state.demonstration.schedule?.rows || []).map((r) => r.label.length));
+}
+function drawErrors() {
+  const d = state.demonstration, channel = d.channels.find((c) => c.name === $("channel").value) || d.channels[0];
+  const time = numbers(channel.time);
+  errors.show({
+    x: [0, d.duration], xlabel: "time [s]", unit: channel.unit, left: leftMargin(), log: state.log, noise: channel.noise && channel.noise * channel.factor,
+    label: `error of ${channel.name} over time`, phases: d.phases, at: (t) => `${t.toFixed(2)} s`,
+    series: data.models.map((m) => ({ name: m.name, kind: m.kind, time, value: numbers(channel.errors[m.name]).map((v) => v * channel.factor) })),
+  });
+  $("errors-title").textContent = `Error of ${channel.name} [${channel.unit}]`;
+}
+function drawSchedule() {
+  if (!schedule) return;
+  const d = state.demonstration, s = d.schedule;
+  schedule.show({ x: [0, d.duration], rows: s?.rows || [], targets: s?.targets || [], phases: d.phases, left: leftMargin(), narrow: narrow() });
+  $("stages").innerHTML = (s?.stages || []).map((stage) => `<tr><th>${Chart.escape(stage.name)}</th><td>${stage.start.toFixed(2)} – ${stage.end.toFixed(2)}</td><td>${Chart.escape(stage.bodies.join(" · "))}</td><td>${Chart.escape(stage.links.join(", ") || "–")}</td><td class="number">${stage.primitives}</td><td class="number">${stage.pairs}</td></tr>`).join("");
+}
+
+// ---- what the 3D views draw ----------------------------------------------------------------------------------------
+const IDENTITY = [1, 0, 0, 0];
+function turned(q, v) {
+  const [w, x, y, z] = q, t = Vec.cross([x, y, z], v).map((c) => 2 * c);
+  return Vec.plus(Vec.plus(v, t, w), Vec.cross([x, y, z], t));
+}
+function times(p, q) {
+  return [p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3], p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+    p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1], p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]];
+}
+/** Items of one geom of a body at a pose. */
+function geomItems(geom, position, quaternion, colour) {
+  const at = Vec.plus(position, turned(quaternion, geom.position)), q = times(quaternion, geom.quaternion), [a, b, c] = geom.size;
+  const item = (shape, scale, offset = 0) => ({ shape, scale, colour, quaternion: q, position: offset ? Vec.plus(at, turned(q, [0, 0, offset])) : at });
+  switch (geom.shape) {
+    case "capsule": return [item("cylinder", [a, a, b]), item("sphere", [a, a, a], b), item("sphere", [a, a, a], -b)];
+    case "cylinder": return [item("cylinder", [a, a, b])];
+    case "sphere": return [item("sphere", [a, a, a])];
+    case "ellipsoid": return [item("sphere", [a, b, c])];
+    case "mesh": return [item(`mesh:${geom.mesh}`, [1, 1, 1])];
+    default: return [item("box", [a, b, c])];
+  }
+}
+const COLOURS = { moved: [0.90, 0.32, 0.17], touched: [0.95, 0.70, 0.20], gripped: [0.36, 0.42, 0.78], other: [0.60, 0.66, 0.72], measured: [0.13, 0.68, 0.40] };
+const ARROW = window.matchMedia("(prefers-color-scheme: dark)").matches ? [1, 1, 1, 1] : [0.1, 0.1, 0.12, 1];
+const ball = (position, r, colour) => ({ shape: "sphere", position, quaternion: IDENTITY, scale: [r, r, r], colour });
+
+// ---- replay --------------------------------------------------------------------------------------------------------
+const motion = new Map();
+function motionOf(d) {
+  if (!motion.has(d.name)) {
+    const m = d.motion;
+    motion.set(d.name, {
+      time: numbers(m.time), poses: Object.fromEntries(Object.entries(m.poses).map(([k, v]) => [k, numbers(v)])),
+      measured: Object.fromEntries(Object.entries(m.measured).map(([k, v]) => [k, numbers(v)])),
+      points: Object.fromEntries(Object.entries(m.points).map(([k, v]) => [k, { time: numbers(v.time), xyz: numbers(v.xyz), count: v.count }])),
+    });
+  }
+  return motion.get(d.name);
+}
+const pose = (array, row) => [Array.from(array.subarray(7 * row, 7 * row + 3)), Array.from(array.subarray(7 * row + 3, 7 * row + 7))];
+function sphereRows(model, body) {
+  const g = data.geometry?.[model];
+  if (!g) return null;
+  if (!g.decoded) g.decoded = { body: numbers(g.body), position: numbers(g.position), radius: numbers(g.radius) };
+  const index = data.geometry.bodies.indexOf(body);
+  return index < 0 ? null : { ...g.decoded, rows: [...g.decoded.body.keys()].filter((i) => g.decoded.body[i] === index) };
+}
+function replayItems(model) {
+  const d = state.demonstration, m = motionOf(d), frame = nearest(m.time, state.time), items = [];
+  data.bodies.forEach((body, b) => {
+    const [p, q] = pose(m.poses[model], frame * data.bodies.length + b);
+    if (!Number.isFinite(p[0])) return;
+    const spheres = state.spheres ? sphereRows(model, body.name) : null;
+    if (spheres) for (const i of spheres.rows) items.push(ball(Vec.plus(p, turned(q, Array.from(spheres.position.subarray(3 * i, 3 * i + 3)))), spheres.radius[i], [...COLOURS[data.geometry.state[i]], 1]));
+    else for (const geom of body.geoms) items.push(...geomItems(geom, p, q, geom.colour));
+    const ghost = state.ghost && m.measured[body.name];
+    if (ghost) {
+      const [gp, gq] = pose(ghost, frame);
+      for (const geom of body.geoms) items.push(...geomItems(geom, gp, gq, [...COLOURS.measured, 0.45]));
+    }
+    const points = state.ghost && m.points[body.name];
+    if (points) {
+      const k = nearest(points.time, state.time);
+      for (let i = 0; i < points.count; i++) {
+        const at = Array.from(points.xyz.subarray(3 * (k * points.count + i), 3 * (k * points.count + i) + 3));
+        if (Number.isFinite(at[0])) items.push(ball(at, 0.0015, [...COLOURS.measured, 1]));
+      }
+    }
+  });
+  return items;
+}
+const replayCamera = new Camera(data.view.scene.target, data.view.scene.distance, data.view.azimuth, data.view.elevation);
+const replayViews = shown.map((model, i) => new View($(`replay-${i}`), replayCamera, meshes, () => replayItems(model)));
+
+/** Where the followed body is: as measured, else as the last model has it. */
+function followed() {
+  const m = motionOf(state.demonstration), name = $("follow").value, frame = nearest(m.time, state.time);
+  if (m.measured[name]) return pose(m.measured[name], frame)[0];
+  const row = data.bodies.findIndex((b) => b.name === name), at = pose(m.poses[shown[shown.length - 1]], frame * data.bodies.length + row)[0];
+  return Number.isFinite(at[0]) ? at : state.at || data.view.scene.target;
+}
+function aimReplay() {
+  const body = data.view.bodies[$("follow").value];
+  state.at = body ? followed() : null;
+  replayCamera.aim(body ? state.at : data.view.scene.target, body ? body.distance : data.view.scene.distance);
+}
+function setTime(t) {
+  const d = state.demonstration;
+  state.time = Math.min(Math.max(t, 0), d.duration);
+  $("time").value = state.time;
+  const phase = d.phases.find((p) => state.time >= p.start && state.time < p.end);
+  $("clock").textContent = `${state.time.toFixed(2)} s${phase ? " · " + phase.name : ""}`;
+  errors.setCursor(state.time); schedule?.setCursor(state.time);
+  if (state.at) { const at = followed(); replayCamera.shift(Vec.minus(at, state.at)); state.at = at; }
+  replayViews.forEach((v) => v.refresh());
+}
+let before = 0;
+function play(now) {
+  if (!state.playing) return;
+  const next = state.time + Math.min((now - before) / 1000, 0.1) * Number($("speed").value);
+  before = now;
+  if (next >= state.demonstration.duration) { setTime(state.demonstration.duration); setPlaying(false); return; }
+  setTime(next); requestAnimationFrame(play);
+}
+function setPlaying(on) {
+  state.playing = on; $("play").textContent = on ? "❚❚" : "▶"; $("play").setAttribute("aria-label", on ? "pause" : "play");
+  if (!on) return;
+  if (state.time >= state.demonstration.duration - 1e-3) setTime(0);
+  before = performance.now(); requestAnimationFrame(play);
+}
+
+// ---- contact geometry ----------------------------------------------------------------------------------------------
+let geometryViews = [];
+function geometryItems(model) {
+  const body = $("body").value, spheres = sphereRows(model, body), items = [], start = sphereRows(shown[0], body);
+  const after = model === shown[shown.length - 1] && shown.length > 1;
+  for (const i of spheres.rows) {
+    const at = Array.from(spheres.position.subarray(3 * i, 3 * i + 3)), kind = data.geometry.state[i];
+    items.push(ball(at, spheres.radius[i], [...COLOURS[kind], 1]));
+    if (!after || kind !== "moved" || !$("arrows").checked) continue;
+    const from = Array.from(start.position.subarray(3 * i, 3 * i + 3)), shift = Vec.minus(at, from), length = Vec.length(shift);
+    if (length < 2e-4) continue;
+    const q = alongZ(shift), u = Vec.unit(shift), r = spheres.radius[i] + 0.0002, tail = Vec.plus(at, u, r), reach = 3 * length;
+    items.push({ shape: "cylinder", position: Vec.plus(tail, u, reach / 2), quaternion: q, scale: [0.00035, 0.00035, reach / 2], colour: ARROW });
+    items.push({ shape: "cone", position: Vec.plus(tail, u, reach + 0.0008), quaternion: q, scale: [0.0009, 0.0009, 0.0012], colour: ARROW });
+  }
+  const owner = data.bodies.find((b) => b.name === body);
+  if (owner && $("hull").checked) for (const geom of owner.geoms) items.push(...geomItems(geom, [0, 0, 0], IDENTITY, [0.35, 0.45, 0.55, 0.22]));
+  return items;
+}
+function setUpGeometry() {
+  if (!data.geometry) return;
+  const camera = new Camera([0, 0, 0], 0.2, -0.9, 0.65);
+  const aim = () => {
+    const spheres = sphereRows(shown[0], $("body").value), low = [1e9, 1e9, 1e9], high = [-1e9, -1e9, -1e9];
+    for (const i of spheres.rows) for (let k = 0; k < 3; k++) {
+      low[k] = Math.min(low[k], spheres.position[3 * i + k] - spheres.radius[i]); high[k] = Math.max(high[k], spheres.position[3 * i + k] + spheres.radius[i]);
+    }
+    camera.aim(low.map((v, k) => (v + high[k]) / 2), 2.1 * Vec.length(Vec.minus(high, low)));
+    $("geometry-facts").textContent = data.geometry.facts[$("body").value];
+  };
+  geometryViews = shown.map((model, i) => new View($(`geometry-${i}`), camera, meshes, () => geometryItems(model)));
+  $("body").addEventListener("change", aim);
+  for (const id of ["arrows", "hull"]) $(id).addEventListener("change", () => geometryViews.forEach((v) => v.refresh()));
+  aim();
+}
+
+// ---- fit -----------------------------------------------------------------------------------------------------------
+function drawFit() {
+  if (!data.history.length) return;
+  const generation = data.history.map((h) => h.generation), line = (key) => data.history.map((h) => h[key] === null ? NaN : 1e3 * h[key]);
+  const series = [
+    { name: "median candidate", kind: "null", key: "candidates" }, { name: "estimate", kind: "before", key: "loss" },
+    { name: "estimate, held-out frames", kind: "held", key: "held_out" }, { name: "best so far", kind: "after", key: "best" },
+  ].filter((s) => s.key in data.history[0]);
+  new LineChart($("fit-chart")).show({
+    x: [generation[0], Math.max(generation[generation.length - 1], generation[0] + 1)], xlabel: "generation", unit: "mm", log: true, label: "convergence of the fit",
+    at: (g) => `generation ${Math.round(g)}`, series: series.map((s) => ({ ...s, time: generation, value: line(s.key) })),
+  });
+  $("fit-keys").innerHTML = series.map((s) => `<span><span class="key ${s.kind}"></span>${s.name}</span>`).join("");
+}
+
+// ---- controls ------------------------------------------------------------------------------------------------------
+function setDemonstration(name) {
+  state.demonstration = data.demonstrations.find((d) => d.name === name);
+  $("time").max = state.demonstration.duration;
+  drawErrors(); drawSchedule(); setTime(state.demonstration.duration); aimReplay();
+}
+$("demonstration").addEventListener("change", (e) => { setPlaying(false); setDemonstration(e.target.value); });
+$("channel").addEventListener("change", drawErrors);
+$("log").addEventListener("change", (e) => { state.log = e.target.checked; drawErrors(); });
+$("time").addEventListener("input", (e) => { setPlaying(false); setTime(Number(e.target.value)); });
+$("follow").addEventListener("change", aimReplay);
+$("play").addEventListener("click", () => setPlaying(!state.playing));
+$("spheres")?.addEventListener("change", (e) => { state.spheres = e.target.checked; replayViews.forEach((v) => v.refresh()); });
+$("ghost").addEventListener("change", (e) => { state.ghost = e.target.checked; replayViews.forEach((v) => v.refresh()); });
+window.addEventListener("resize", () => { drawErrors(); drawSchedule(); });
+setUpGeometry();
+drawFit();
+state.log = $("log").checked;
+setDemonstration(data.demonstrations[0].name);
+document.documentElement.dataset.ready = "yes";

@@ -1,0 +1,175 @@
+"""What the page's scripts draw: errors over time, contact schedules, motions and spheres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.comparison_table import SHOWN, unit_shown
+from concent_warp.events.schedule import contact_count, schedule_rows
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.report.motion_data import motion_data
+from concent_warp.report.scene_data import geometry_data, packed, scene_bodies
+from concent_warp.simulate.replay import initial_state
+from concent_warp.simulate.select import make_engine
+
+if TYPE_CHECKING:
+    from concent_warp.fit.geometry import FitResult
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Demonstration
+
+MOST_SAMPLES = 3000
+"""Samples of a line in a chart; longer series are thinned, each piece shown by its largest error."""
+BANDS = 5
+"""Colours of phases that the style sheet has."""
+
+
+def page_data(
+    models: Mapping[str, Model],
+    demonstrations: Sequence[Demonstration],
+    comparison: Comparison,
+    events: Mapping[str, ContactEventSequence],
+    fit: FitResult | None,
+) -> dict[str, Any]:
+    """Return what the page's scripts draw."""
+    last = models[comparison.after]
+    bodies, meshes = scene_bodies(last.scene.model)
+    names = [body["name"] for body in bodies]
+    engines = {name: make_engine("mujoco", model) for name, model in models.items()}
+    found = [
+        {
+            "name": d.name,
+            "duration": d.duration,
+            "phases": phase_bands(comparison, d),
+            "channels": channel_lines(comparison, d.name),
+            "schedule": schedule_data(events[d.name]) if d.name in events else None,
+            "motion": motion_data(models, engines, d, names),
+        }
+        for d in demonstrations
+    ]
+    return {
+        "models": [{"name": name, "kind": kind_of(comparison, name)} for name in comparison.models],
+        "shown": list(models),
+        "bodies": [{"name": body["name"], "geoms": body["geoms"]} for body in bodies],
+        "meshes": meshes,
+        "geometry": geometry_data(models, events),
+        "demonstrations": found,
+        "history": [] if fit is None else fit.history,
+        "view": camera_views(last, demonstrations[0]),
+    }
+
+
+def phase_bands(comparison: Comparison, demonstration: Demonstration) -> list[dict[str, Any]]:
+    """Return the phases of a demonstration with the number of their colour."""
+    found = []
+    for phase in comparison.phases.get(demonstration.name, ()):
+        start, end = max(phase.start, 0.0), min(phase.end, demonstration.duration + 1e-6)
+        colour = comparison.phase_names.index(phase.name)
+        found.append(
+            {"name": phase.name, "start": start, "end": end, "band": (colour - 1) % BANDS + 1 if colour else 0}
+        )
+    return found
+
+
+def channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str, Any]]:
+    """Return the errors of every channel of a demonstration over time."""
+    found = []
+    for channel in ordered_channels(comparison):
+        residuals = {model: comparison.residual(model, demonstration, channel) for model in comparison.models}
+        first = residuals[comparison.before]
+        if first is None:
+            continue
+        pieces = np.array_split(np.arange(len(first.time)), min(len(first.time), MOST_SAMPLES))
+        errors = {model: r.error for model, r in residuals.items() if r is not None}
+        found.append(
+            {
+                "name": channel,
+                "unit": unit_shown(first.unit),
+                "factor": SHOWN.get(first.unit, (1.0, first.unit))[0],
+                "noise": first.noise,
+                "time": packed(np.array([first.time[rows[0]] for rows in pieces])),
+                "errors": {model: packed(np.array([e[rows].max() for rows in pieces])) for model, e in errors.items()},
+            }
+        )
+    return found
+
+
+def schedule_data(sequence: ContactEventSequence) -> dict[str, Any]:
+    """Return rows, bars, stages and target events of a contact schedule."""
+    entity = sequence.entity
+    role = {e.body: e.role for e in sequence.entities}
+    rows, keys = [], schedule_rows(sequence)
+    for a, b in keys:
+        parts = [c for c in sequence.contacts if (entity[c.a].body, entity[c.b].body) == (a, b)]
+        time, count = contact_count(parts)
+        rows.append(
+            {
+                "label": f"{a} · {b}",
+                "kind": "world" if role[b] == "world" else role[a],
+                "bars": [[c.start, c.end] for c in sequence.body_contacts if (c.a, c.b) == (a, b)],
+                "count": [[round(float(t), 4), int(n)] for t, n in zip(time, count, strict=True)],
+            }
+        )
+    targets, stages = [], []
+    for stage in sequence.stages:
+        touched = {(entity[p.a].body, entity[p.b].body) for p in stage.event.pairs}
+        marked = [i for i, key in enumerate(keys) if key in touched]
+        targets.append({"name": stage.name, "time": stage.event.time, "rows": marked})
+        stages.append(
+            {
+                "name": stage.name,
+                "start": stage.start,
+                "end": stage.end,
+                "bodies": list(stage.bodies),
+                "links": list(stage.event.links),
+                "primitives": len(stage.event.primitives),
+                "pairs": len(stage.event.pairs),
+            }
+        )
+    return {"rows": rows, "targets": targets, "stages": stages}
+
+
+def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
+    """Return where the camera of the replay may stand: before the whole scene, or with an object.
+
+    Distances follow from the sizes of the objects and from how far apart they are at the start.
+    """
+    compiled = model.scene.model
+    data = mujoco.MjData(compiled)
+    data.qpos[:] = initial_state(compiled, demonstration)[0]
+    mujoco.mj_kinematics(compiled, data)
+    objects = model.scene.objects() or tuple(compiled.body(i).name for i in range(1, compiled.nbody))
+    size = {name: extent(compiled, compiled.body(name).id) for name in objects}
+    places = np.array([data.body(name).xpos for name in objects])
+    spread = float(np.linalg.norm(np.ptp(places, axis=0))) + max(size.values())
+    return {
+        "scene": {"target": places.mean(axis=0).tolist(), "distance": 3.5 * spread},
+        "bodies": {name: {"distance": 10 * size[name]} for name in objects},
+        "azimuth": -0.75,
+        "elevation": 0.45,
+    }
+
+
+def extent(compiled: mujoco.MjModel, body: int) -> float:
+    """Return the radius of a ball about a body's frame that holds its geoms [m]; 0.05 where it has none."""
+    mine = (compiled.geom_bodyid == body) & (compiled.geom_rbound > 0)
+    if not mine.any():
+        return 0.05
+    return float((np.linalg.norm(compiled.geom_pos[mine], axis=1) + compiled.geom_rbound[mine]).max())
+
+
+def ordered_channels(comparison: Comparison) -> list[str]:
+    """Return the channels with the main one first."""
+    main = comparison.main_channel()
+    return [main, *(channel for channel in comparison.channels if channel != main)]
+
+
+def kind_of(comparison: Comparison, model: str) -> str:
+    """Return the style of a model's line."""
+    if model == comparison.after:
+        return "after"
+    return "before" if model == comparison.before else "null"

@@ -1,0 +1,191 @@
+"""One HTML file that shows a comparison, the contact events and the fit behind them; it needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import concent_warp
+from concent_warp.diagnose.bootstrap import RULE
+from concent_warp.diagnose.comparison import Comparison, finite
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.model import write_text
+from concent_warp.report.headline import cards, verdict
+from concent_warp.report.page_data import kind_of, ordered_channels, page_data
+from concent_warp.report.tables import demonstration_table, error_table, provenance
+
+if TYPE_CHECKING:
+    from concent_warp.fit.geometry import FitResult
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Recording
+
+MOST_DEMONSTRATIONS = 6
+"""Demonstrations with charts and replay; further ones are in the tables alone, so that the page stays small."""
+
+
+def write_report(
+    path: Path,
+    recording: Recording,
+    models: Mapping[str, Model],
+    comparison: Comparison,
+    *,
+    events: Mapping[str, ContactEventSequence] | None = None,
+    fit: FitResult | None = None,
+    fitted: Sequence[str] = (),
+    overlap: Mapping[str, Mapping[str, float]] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the report, in one piece or not at all.
+
+    Args:
+        path: The ``.html`` file.
+        recording: What was commanded and measured.
+        models: The models of the comparison, by the same names.
+        comparison: Of these models on this recording.
+        events: Contact event sequences of the last model, by demonstration.
+        fit: The fit that led from the first model to the last.
+        fitted: Demonstrations that the fit has seen; empty where there was none.
+        overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
+        settings: ``command``, ``versions`` and ``settings`` to show.
+    """
+    events, overlap = events or {}, overlap or {}
+    shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
+    shown_demonstrations = [recording[name] for name in comparison.demonstrations[:MOST_DEMONSTRATIONS]]
+    data = page_data(shown_models, shown_demonstrations, comparison, events, fit)
+    parts = {
+        "title": escape(title(recording, fit)),
+        "subtitle": escape(subtitle(recording, comparison, fitted)),
+        "verdict": escape(verdict(comparison, fitted, overlap)),
+        "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap)),
+        "demonstration_options": options([d.name for d in shown_demonstrations]),
+        "channel_options": options(ordered_channels(comparison)),
+        "model_keys": "".join(
+            f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
+        )
+        + '<span class="key noise"></span>noise floor',
+        "errors_about": (
+            "How far the simulation is from the measurement at each instant of the replay. The bands are the contact "
+            "stages, found in the replay of the last model. Click to move the replay below to that instant."
+        ),
+        "schedule": page_file("schedule.html") if events else "",
+        "replay_about": (
+            "The recorded commands, replayed open loop from the recorded initial state. "
+            "Green: the measured pose of the objects, or the tracked points where no pose was measured."
+        ),
+        "follow_options": options(follow_order(data, comparison)) + '<option value="">the scene</option>',
+        "replay_views": views("replay", comparison, shown_models),
+        "sphere_switch": SPHERE_SWITCH if data["geometry"] else "",
+        "geometry": geometry_section(data, comparison, shown_models),
+        "fit": fit_section(fit),
+        "tables_about": escape(
+            f"Mean error over time with its 95 % interval ({RULE}); RMS, 95th percentile, largest error and noise "
+            f"floor of “{comparison.after}”. Green and red changes are those whose interval excludes none."
+        ),
+        "tables": tables(comparison, fitted, overlap),
+        "provenance": provenance(settings or {}),
+        "footer": escape(f"Written by concent {concent_warp.__version__}. {left_out(comparison)}"),
+        "data": script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
+        "style": page_file("style.css"),
+        "script": "\n".join(page_file(name) for name in ("scene3d.js", "charts.js", "page.js")),
+    }
+    write_text(path, filled(page_file("page.html"), parts))
+
+
+def follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
+    """Return the objects that the camera can go with, first the one that the main channel is about."""
+    main = comparison.main_channel()
+    about = {r.body for d in comparison.demonstrations if (r := comparison.residual(comparison.before, d, main))}
+    return sorted(data["view"]["bodies"], key=lambda name: name not in about)
+
+
+def geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:
+    """Return the section of the contact geometry, empty where there is none to show."""
+    if not data["geometry"]:
+        return ""
+    bodies = options(data["geometry"]["bodies"])
+    return filled(page_file("geometry.html"), {"bodies": bodies, "views": views("geometry", comparison, models)})
+
+
+def fit_section(fit: FitResult | None) -> str:
+    """Return the section of the fit, empty where there was none."""
+    if fit is None or not fit.history:
+        return ""
+    last = fit.history[-1]
+    text = (
+        f"{len(fit.history)} generations, {last['simulations']:,} simulations in {last['seconds']:.0f} s; "
+        f"ended because: {fit.stopped}. {int(fit.mask.sum())} of {len(fit.mask)} spheres have moved."
+    )
+    return filled(page_file("fit.html"), {"text": escape(text)})
+
+
+def tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
+    """Return all tables: objects by phase, demonstrations, and everything else folded away."""
+    objects = comparison.object_channels
+    others = [c for c in comparison.channels if c not in objects]
+    parts = [error_table(comparison, objects or others, phases=True)]
+    if len(comparison.demonstrations) > 1:
+        parts.append("<h3 style='margin-top:18px'>By demonstration</h3>")
+        parts.append(demonstration_table(comparison, fitted, overlap))
+    if objects and others:
+        parts.append(
+            f"<details><summary>{len(others)} further channels</summary>"
+            f"{error_table(comparison, others, phases=True)}</details>"
+        )
+    return "\n".join(parts)
+
+
+def views(name: str, comparison: Comparison, models: Mapping[str, Model]) -> str:
+    """Return a canvas for each model shown."""
+    return "".join(
+        f'<figure><figcaption><span class="{kind_of(comparison, model)}">{escape(model)}</span></figcaption>'
+        f'<canvas id="{name}-{i}" aria-label="{name} of {escape(model)}"></canvas></figure>'
+        for i, model in enumerate(models)
+    )
+
+
+def title(recording: Recording, fit: FitResult | None) -> str:
+    """Return the title of the page."""
+    task = next((d.task for d in recording.demonstrations if d.task), "")
+    return ("Grounded simulation" if fit is not None else "Model against measurement") + (f": {task}" if task else "")
+
+
+def subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]) -> str:
+    """Return what the report is about."""
+    number = len(comparison.demonstrations)
+    length = sum(recording[name].duration for name in comparison.demonstrations)
+    text = f"{number} demonstration{'s' if number != 1 else ''}, {length:.1f} s in all, from {recording.source}"
+    return text + (f"; the fit has seen {', '.join(fitted)}" if fitted else "")
+
+
+def left_out(comparison: Comparison) -> str:
+    """Return which demonstrations have no charts."""
+    more = len(comparison.demonstrations) - MOST_DEMONSTRATIONS
+    return f"Charts and replay show the first {MOST_DEMONSTRATIONS}; {more} more are in the tables." if more > 0 else ""
+
+
+def options(names: Sequence[str]) -> str:
+    """Return the options of a list to choose from."""
+    return "".join(f'<option value="{escape(name)}">{escape(name)}</option>' for name in names)
+
+
+def page_file(name: str) -> str:
+    """Return a file of the page that comes with this package."""
+    return files("concent_warp.report").joinpath("page", name).read_text(encoding="utf-8")
+
+
+def filled(template: str, parts: Mapping[str, str]) -> str:
+    """Return a template with every ``[[name]]`` replaced, in one pass: what is put in is not looked at again."""
+    return re.sub(r"\[\[(\w+)\]\]", lambda found: parts[found[1]], template)
+
+
+def script_safe(text: str) -> str:
+    """Return JSON that cannot end the script element that it stands in."""
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+SPHERE_SWITCH = '<label><input type="checkbox" id="spheres"> objects as spheres</label>'
