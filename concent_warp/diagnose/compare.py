@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.diagnose.comparison import FREE, Comparison, Phase
 from concent_warp.diagnose.residuals import residuals
-from concent_warp.errors import ModelError, RecordingError
+from concent_warp.errors import ModelError
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -65,12 +65,7 @@ def compare(
     """
     if not models:
         raise ModelError("there is no model to compare")
-    names = [d.name for d in recording.demonstrations]
-    if unknown := sorted(set(demonstrations or ()) - set(names)):
-        raise RecordingError(
-            "no such demonstration", where=recording.source, expected=f"some of {names}", found=unknown
-        )
-    chosen = [d for d in recording.demonstrations if demonstrations is None or d.name in demonstrations]
+    chosen = recording.only(demonstrations or ()).demonstrations
     found, diverged = {}, {}
     for name, model in models.items():
         simulator = make_engine(engine, model)

@@ -110,6 +110,12 @@ class Comparison:
         return tuple(dict.fromkeys(r.channel for d in self.demonstrations for r in self.residuals[self.before, d]))
 
     @cached_property
+    def object_channels(self) -> tuple[str, ...]:
+        """Names of the channels that are about where bodies are: positions, orientations and points."""
+        kinds = {r.channel: r.kind for d in self.demonstrations for r in self.residuals[self.before, d]}
+        return tuple(c for c in self.channels if kinds[c] in ("position", "orientation", "points"))
+
+    @cached_property
     def phase_names(self) -> tuple[str, ...]:
         """Names of all phases, in the order of time."""
         return tuple(dict.fromkeys(phase.name for d in self.demonstrations for phase in self.phases.get(d, ())))
@@ -122,36 +128,42 @@ class Comparison:
         """Return one residual, None where the demonstration lacks the channel."""
         return next((r for r in self.residuals[model, demonstration] if r.channel == channel), None)
 
-    def errors(self, model: str, channel: str, phases: Collection[str] = ()) -> list[np.ndarray]:
-        """Return the errors of the samples in `phases` (all where empty), one array (n_d,) a demonstration."""
-        return [r.error[mask] for _, r, mask in self._samples(model, channel, phases)]
+    def errors(
+        self, model: str, channel: str, phases: Collection[str] = (), demonstrations: Collection[str] = ()
+    ) -> list[np.ndarray]:
+        """Return the errors of the samples in `phases`, one array (n_d,) a demonstration; all of either where empty."""
+        return [r.error[mask] for r, mask in self._samples(model, channel, phases, demonstrations)]
 
-    def _samples(self, model: str, channel: str, phases: Collection[str]) -> Iterator[tuple[str, Residual, np.ndarray]]:
-        """Yield demonstration, residual and which of its samples (T,) were measured in `phases`."""
-        for d in self.demonstrations:
+    def _samples(
+        self, model: str, channel: str, phases: Collection[str], demonstrations: Collection[str]
+    ) -> Iterator[tuple[Residual, np.ndarray]]:
+        """Yield the residual of each demonstration and which of its samples (T,) were measured in `phases`."""
+        for d in demonstrations or self.demonstrations:
             if (r := self.residual(model, d, channel)) is None:
                 continue
             mask = ~np.isnan(r.error)
             if phases:
                 within = [(r.time >= p.start) & (r.time < p.end) for p in self.phases.get(d, ()) if p.name in phases]
                 mask &= np.any(within, axis=0) if within else False
-            yield d, r, mask
+            yield r, mask
 
-    def summarise(self, model: str, channel: str, phases: Collection[str] = ()) -> Summary:
-        """Return the summary of one model on one channel, over `phases` or all times where empty."""
-        found = list(self._samples(model, channel, phases))
+    def summarise(
+        self, model: str, channel: str, phases: Collection[str] = (), demonstrations: Collection[str] = ()
+    ) -> Summary:
+        """Return the summary of one model on one channel; over all `phases` or `demonstrations` where empty."""
+        found = list(self._samples(model, channel, phases, demonstrations))
         if not found:
             raise ModelError(f"no channel {channel!r} to summarise", expected=f"one of {list(self.channels)}")
-        parts = [r.error[mask] for _, r, mask in found]
+        parts = [r.error[mask] for r, mask in found]
         pooled = np.concatenate(parts)
         low, high = mean_interval(parts, self.seed)
-        noises = [(r.noise, mask.sum()) for _, r, mask in found if r.noise is not None]
+        noises = [(r.noise, mask.sum()) for r, mask in found if r.noise is not None]
         weight = sum(n for _, n in noises)
         return Summary(
             model=model,
             channel=channel,
             phase=" + ".join(phases) or "all",
-            unit=found[0][1].unit,
+            unit=found[0][0].unit,
             count=len(pooled),
             effective=effective_count([p for p in parts if np.isfinite(p).all()]),
             mean=statistic(np.mean, pooled),
@@ -164,17 +176,23 @@ class Comparison:
         )
 
     def difference(
-        self, channel: str, phases: Collection[str] = (), before: str | None = None, after: str | None = None
+        self,
+        channel: str,
+        phases: Collection[str] = (),
+        demonstrations: Collection[str] = (),
+        *,
+        before: str | None = None,
+        after: str | None = None,
     ) -> Difference:
         """Return what `after` (the last model) has gained over `before` (the first), sample by sample."""
         before, after = before or self.before, after or self.after
-        first, second = self.errors(before, channel, phases), self.errors(after, channel, phases)
+        summary = self.summarise(after, channel, phases, demonstrations)
+        first, second = (self.errors(model, channel, phases, demonstrations) for model in (before, after))
         with np.errstate(invalid="ignore"):
             parts = [b - a for a, b in zip(first, second, strict=True)]
             mean = statistic(np.mean, np.concatenate(second)) - (base := statistic(np.mean, np.concatenate(first)))
         finite = bool(np.isfinite(mean))
         low, high = mean_interval(parts, self.seed) if finite else (mean, mean)
-        summary = self.summarise(after, channel, phases)
         share = mean / base if finite and base else np.nan
         return Difference(before, after, channel, summary.phase, summary.unit, float(mean), low, high, float(share))
 

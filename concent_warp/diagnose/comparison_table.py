@@ -26,6 +26,12 @@ def shown(value: float | None, unit: str, *, sign: bool = False) -> str:
     return f"{value:{'+' if sign else ''}.{digits}f}"
 
 
+def percent(share: float) -> str:
+    """Return a relative change in whole percent with its sign."""
+    whole = round(100 * share)
+    return f"{whole:+d} %" if whole else "0 %"
+
+
 def unit_shown(unit: str) -> str:
     """Return the name of the unit in which a unit is shown."""
     return SHOWN.get(unit, (1, unit))[1]
@@ -39,8 +45,10 @@ def mean_and_interval(summary: Summary) -> str:
     return f"{mean} [{shown(summary.low, summary.unit)}, {shown(summary.high, summary.unit)}]"
 
 
-def cells(comparison: Comparison, *, phases: bool = True) -> tuple[list[str], list[list[str]]]:
+def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table as text.
+
+    Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
 
     Per channel and phase: number of samples, mean error of each model with its 95 % interval, RMS, 95th percentile and
     largest error of the last, noise floor, and with two models or more the change of the mean, with its interval.
@@ -51,7 +59,7 @@ def cells(comparison: Comparison, *, phases: bool = True) -> tuple[list[str], li
     header += ["RMS", "p95", "max", "noise"]
     rows = []
     for channel, phase in comparison.rows():
-        if phase and not phases:
+        if phase and not every_phase and channel not in (comparison.object_channels or comparison.channels):
             continue
         summaries = [comparison.summarise(model, channel, phase) for model in comparison.models]
         last = summaries[-1]
@@ -71,19 +79,19 @@ def change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str:
     found = comparison.difference(channel, phase)
     if not np.isfinite(found.share):
         return "-"
-    text = f"{100 * found.share:+.0f} %"
+    text = percent(found.share)
     if not np.isfinite(found.low):
         return text
     low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
     return f"{text} [{low}, {high}]"
 
 
-def rich_table(comparison: Comparison, *, phases: bool = True) -> Table:
+def rich_table(comparison: Comparison, *, every_phase: bool = False) -> Table:
     """Return the table for a terminal."""
     from rich.table import Table
 
-    header, rows = cells(comparison, phases=phases)
-    table = Table(header_style="bold", row_styles=["", "dim"] if not phases else [])
+    header, rows = cells(comparison, every_phase=every_phase)
+    table = Table(header_style="bold")
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < 3 else "right", no_wrap=i == 0)
     for i, row in enumerate(rows):
@@ -91,8 +99,8 @@ def rich_table(comparison: Comparison, *, phases: bool = True) -> Table:
     return table
 
 
-def markdown_table(comparison: Comparison, *, phases: bool = True) -> str:
+def markdown_table(comparison: Comparison, *, every_phase: bool = False) -> str:
     """Return the table as Markdown."""
-    header, rows = cells(comparison, phases=phases)
+    header, rows = cells(comparison, every_phase=every_phase)
     rule = [":---" if i < 3 else "---:" for i in range(len(header))]
     return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows)) + "\n"

@@ -6,10 +6,12 @@ Each channel has clock readings of its own; a value may be NaN (missing), a time
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+
+from concent_warp.errors import RecordingError
 
 
 @dataclass(frozen=True)
@@ -99,3 +101,14 @@ class Recording:
             if demonstration.name == name:
                 return demonstration
         raise KeyError(f"{self.source}: no demonstration {name!r}; it has {[d.name for d in self.demonstrations]}")
+
+    def only(self, names: Sequence[str]) -> Recording:
+        """Return the recording with some of its demonstrations, in its own order; with all where `names` is empty.
+
+        Raises:
+            RecordingError: There is no such demonstration.
+        """
+        known = [d.name for d in self.demonstrations]
+        if unknown := sorted(set(names) - set(known)):
+            raise RecordingError("no such demonstration", where=self.source, expected=f"some of {known}", found=unknown)
+        return replace(self, demonstrations=tuple(d for d in self.demonstrations if not names or d.name in names))
