@@ -1,0 +1,83 @@
+"""``concent compare``: how far a model is off, or what a change of it has gained."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from concent_warp.cli.run_folder import claim_file, command_line, plain, versions
+from concent_warp.cli.summary import say_diverged
+from concent_warp.cli.terminal import say
+from concent_warp.diagnose.compare import compare
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.comparison_table import markdown_table, rich_table
+from concent_warp.errors import EventsError
+from concent_warp.ground import extract_all
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Compare what a model predicts with what was measured, by channel and contact phase; with a baseline, say what
+    has changed.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Recording."""
+    model: Path
+    """Model (.toml) or MJCF (.xml)."""
+    baseline: Path | None = None
+    """Model to compare it with."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations; all by default."""
+    engine: EngineName = "mujoco"
+    """Engine."""
+    json: bool = False
+    """Print one JSON object with all figures in SI units instead of the table."""
+    markdown: bool = False
+    """Print the table as Markdown."""
+    every_phase: bool = False
+    """Tell phases apart for joints and other sensors too, not only for bodies."""
+    html: Path | None = None
+    """Write a report with charts, replay and 3D views to this file."""
+    phases: bool = True
+    """Tell contact phases apart; they are found in the replay of the model."""
+    overwrite: bool = False
+    """Replace the report if it is there."""
+
+
+def run(arguments: Arguments) -> Comparison:
+    """Compare, and print or write what was asked for."""
+    recording = load_recording(arguments.recording).only(arguments.demonstrations)
+    models = {} if arguments.baseline is None else {"baseline": Model.load(arguments.baseline)}
+    models["model"] = Model.load(arguments.model)
+    if arguments.html is not None:
+        claim_file(arguments.html, overwrite=arguments.overwrite)
+    events = {}
+    if arguments.phases:
+        try:
+            events = extract_all(models["model"], recording, arguments.engine)
+        except EventsError as error:
+            say(f"No contact phases: {error}")
+    stages = {name: sequence.stages for name, sequence in events.items()}
+    found = compare(models, recording, arguments.engine, phases=stages or None)
+    if arguments.json:
+        print(json.dumps(found.to_json(), indent=1, allow_nan=False))
+    elif arguments.markdown:
+        print(markdown_table(found, every_phase=arguments.every_phase), end="")
+    else:
+        say(rich_table(found, every_phase=arguments.every_phase))
+        say_diverged(found)
+    if arguments.html is not None:
+        from concent_warp.report.report import write_report
+
+        settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+        write_report(arguments.html, recording, models, found, events=events, settings=settings)
+        if not arguments.json:
+            say(f"wrote [bold]{arguments.html}[/]")
+    return found

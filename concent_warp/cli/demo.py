@@ -1,0 +1,65 @@
+"""``concent demo``: the main job where no robot is at hand, with the stand-in of the real world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from concent_warp.cli.run_folder import claim_folder, write_settings
+from concent_warp.cli.summary import fit_progress, say_grounded
+from concent_warp.cli.terminal import progress_bar, say
+from concent_warp.fit.geometry import FitCfg
+from concent_warp.ground import GroundCfg, Grounded, ground
+from concent_warp.reality.record import RealityCfg, record
+from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Record demonstrations of the shape sorter in the stand-in world, fit the contact geometry, extract the contact
+    events, compare, and write a report. The fit starts from the paper's geometry: spheres centred on the surface.
+    """
+
+    out: Path = Path("runs/demo")
+    """Run folder."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Demonstrations to fit, by the seed that draws them."""
+    unseen_seeds: tuple[int, ...] = (2,)
+    """Further demonstrations, which the fit never sees, to judge it by."""
+    engine: EngineName = "auto"
+    """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
+    resume: bool = False
+    """Go on with an interrupted run, to the same result."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+    geometry: Annotated[ContactGeometryCfg, tyro.conf.OmitArgPrefixes] = field(
+        default_factory=lambda: ContactGeometryCfg(placement="surface")
+    )
+    fit: FitCfg = field(default_factory=FitCfg)
+    reality: RealityCfg = field(default_factory=RealityCfg)
+
+
+def run(arguments: Arguments) -> Grounded:
+    """Run the demonstration and write the run folder."""
+    folder = arguments.out
+    claim_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
+    settings = write_settings(folder, arguments)
+    with progress_bar("recording") as progress:
+        seeds = [*arguments.seeds, *arguments.unseen_seeds]
+        recording, truths = record(arguments.reality, seeds, progress=progress)
+    write_hdf5(recording, folder / "demo.h5")
+    names = tuple(d.name for d in recording.demonstrations)
+    say(f"recorded {len(names)} demonstrations to [bold]{folder / 'demo.h5'}[/]")
+    truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
+    cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, names[: len(arguments.seeds)])
+    with fit_progress(f"concent demo --out {folder} --resume") as progress:
+        found = ground(
+            recording, folder, cfg, truth=truth, settings=settings, resume=arguments.resume, progress=progress
+        )
+    say_grounded(found, folder)
+    return found

@@ -1,0 +1,84 @@
+"""Which command is meant, and what becomes of errors. The commands are imported only when they are called."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import concent_warp
+from concent_warp.errors import ConcentError
+
+COMMANDS = {
+    "demo": "the main job on a simulated stand-in of the real world, from recording to report",
+    "record": "record demonstrations in the stand-in world",
+    "geometry": "lay contact spheres on the objects of a scene; export a model as MJCF",
+    "fit": "fit the contact geometry to a recording; contact events and a report come with it",
+    "replay": "replay a recording in a model and save what the model predicts",
+    "events": "extract the contact event sequence of a recording",
+    "compare": "compare a model, or two, with a recording",
+}
+"""Names of the commands, each a module of this package, with what they do."""
+ERROR, INTERRUPTED = 2, 130
+
+
+def usage() -> str:
+    """Return the text of ``concent --help``."""
+    lines = [f"  {name:<10}{text}" for name, text in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: concent [-h] [--version] COMMAND ...",
+            "",
+            "From one measured demonstration to a grounded simulation.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "concent COMMAND --help lists the options of a command; concent demo is the place to start.",
+        ]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    0: done. 2: an input or a setting cannot be worked with, said in one sentence on standard error. 130: interrupted.
+
+    Args:
+        argv: Arguments without the program's name; those of the process by default.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    if arguments[0] == "--version":
+        print(f"concent {concent_warp.__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
+        return ERROR
+    return run(arguments[0], arguments[1:])
+
+
+def run(command: str, arguments: Sequence[str]) -> int:
+    """Run one command."""
+    try:
+        import tyro
+
+        module = import_module(f"concent_warp.cli.{command}")
+        settings = tyro.cli(
+            module.Arguments,
+            args=arguments,
+            prog=f"concent {command}",
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
+        )
+        module.run(settings)
+    except ConcentError as error:
+        print(f"concent {command}: {error}", file=sys.stderr)
+        return ERROR
+    except KeyboardInterrupt as interrupt:
+        print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
+        return INTERRUPTED
+    except SystemExit as end:  # tyro ends the process after a wrong option or --help
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0

@@ -1,0 +1,59 @@
+"""``concent fit``: a recording becomes a grounded model, with its contact events, a comparison and a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from concent_warp.cli.run_folder import claim_folder, write_settings
+from concent_warp.cli.summary import fit_progress, say_grounded
+from concent_warp.fit.geometry import FitCfg
+from concent_warp.ground import GroundCfg, Grounded, ground
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fit the contact geometry of the objects so that replaying the recording reproduces the observed motion.
+
+    Writes model.toml, the contact events, a comparison with the starting geometry, and report.html to a run folder.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Recording: an HDF5 file, a folder of CSV files, or ContactNets tosses."""
+    out: Path | None = None
+    """Run folder; by default runs/<name of the recording>."""
+    model: Path | None = None
+    """Model to start from (.toml); by default spheres are laid on the objects of the recording's scene."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations to fit; all by default. The comparison is about all in any case."""
+    engine: EngineName = "auto"
+    """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
+    resume: bool = False
+    """Go on with an interrupted run, to the same result."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+    geometry: Annotated[ContactGeometryCfg, tyro.conf.OmitArgPrefixes] = field(default_factory=ContactGeometryCfg)
+    fit: FitCfg = field(default_factory=FitCfg)
+
+
+def run(arguments: Arguments) -> Grounded:
+    """Fit and write the run folder."""
+    recording = load_recording(arguments.recording)
+    start = None if arguments.model is None else Model.load(arguments.model)
+    folder = arguments.out or Path("runs") / arguments.recording.stem
+    claim_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
+    settings = write_settings(folder, arguments)
+    cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, arguments.demonstrations)
+    with fit_progress(f"concent fit {arguments.recording} --out {folder} --resume") as progress:
+        found = ground(
+            recording, folder, cfg, start=start, settings=settings, resume=arguments.resume, progress=progress
+        )
+    say_grounded(found, folder)
+    return found

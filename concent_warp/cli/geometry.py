@@ -1,0 +1,86 @@
+"""``concent geometry``: a scene becomes a model with contact spheres; a model becomes MJCF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from concent_warp.cli.run_folder import claim_file
+from concent_warp.cli.terminal import say
+from concent_warp.errors import SceneError
+from concent_warp.model import Model
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.export import save_mjcf
+from concent_warp.scene.objects import load_object
+from concent_warp.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Lay contact spheres on the objects of a scene and save the model, or export a model as plain MJCF."""
+
+    scene: tyro.conf.Positional[Path]
+    """MJCF scene (.xml), recording (.h5), or model.toml whose geometry is kept."""
+    out: Path | None = None
+    """Model file to write (.toml); the scene and the spheres go beside it."""
+    export: Path | None = None
+    """MJCF to write (.xml), with the spheres, for plain MuJoCo."""
+    objects: tuple[str, ...] = ()
+    """Bodies to lay spheres on; by default those that the scene names, else those with a free joint."""
+    add: Mapping[str, Path] = field(default_factory=dict)
+    """Objects to add to the scene first, as name and file: a mesh, a point cloud or Gaussian splats."""
+    scale: float = 1.0
+    """Factor from the unit of these files to metres."""
+    overwrite: bool = False
+    """Replace files that are there."""
+    geometry: Annotated[ContactGeometryCfg, tyro.conf.OmitArgPrefixes] = field(default_factory=ContactGeometryCfg)
+
+
+def run(arguments: Arguments) -> Model:
+    """Build or read the model, and write what was asked for."""
+    if arguments.out is None and arguments.export is None:
+        raise SceneError("nothing to write", fix="pass --out model.toml, --export model.xml, or both")
+    for path in (arguments.out, arguments.export):
+        if path is not None:
+            claim_file(path, overwrite=arguments.overwrite)
+    model = build(arguments)
+    if arguments.out is not None:
+        model.save(arguments.out)
+        say(f"wrote [bold]{arguments.out}[/]")
+    if arguments.export is not None:
+        save_mjcf(model, arguments.export)
+        say(f"wrote [bold]{arguments.export}[/]")
+    if (geometry := model.geometry) is None:
+        return model
+    for body in geometry.bodies:
+        rows = geometry.of(body)
+        radius = geometry.radius[rows] * 1e3
+        say(f"{body}: {len(rows)} spheres, radius {radius.min():.1f} to {radius.max():.1f} mm")
+    return model
+
+
+def build(arguments: Arguments) -> Model:
+    """Return the model of a scene, a recording or a model file."""
+    path = arguments.scene
+    if path.suffix == ".toml":
+        return Model.load(path)
+    if path.suffix == ".xml":
+        scene = Scene.from_mjcf(path)
+    else:
+        from concent_warp.recording.load import load_recording
+
+        scene = Scene(load_recording(path).scene, source=str(path))
+    surfaces = {}
+    if arguments.add:
+        spec = scene.spec()
+        for name, file in arguments.add.items():
+            found = load_object(file, name, scale=arguments.scale)
+            found.add_to(spec)
+            surfaces[name] = found.surface
+        scene = Scene.from_spec(spec, source=scene.source)
+    objects = arguments.objects or None
+    return Model(scene, arguments.geometry.build(scene, objects, surfaces=surfaces))

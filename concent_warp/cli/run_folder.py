@@ -1,0 +1,100 @@
+"""Where a command writes: a run folder or a file that is not overwritten unasked, the settings beside the results."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import concent_warp
+from concent_warp.errors import ConcentError
+from concent_warp.model import write_text
+
+SETTINGS = "settings.toml"
+"""File of the resolved settings; a folder that holds one is a run folder."""
+PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
+
+
+def claim_file(path: Path, *, overwrite: bool) -> None:
+    """Check that a file may be written, and make its folder.
+
+    Raises:
+        ConcentError: It exists and `overwrite` was not asked for, or its folder cannot be made.
+    """
+    if path.is_dir():
+        raise ConcentError("this is a folder", where=path, expected="the name of a file to write")
+    if path.exists() and not overwrite:
+        raise ConcentError("the file exists", where=path, fix="choose another name or pass --overwrite")
+    make_folder(path.parent)
+
+
+def claim_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> None:
+    """Check that a run may write to a folder, make it, and empty it of an earlier run's results where that was asked.
+
+    Raises:
+        ConcentError: It holds a run and neither `overwrite` nor `resume` was asked for, or holds other things.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConcentError("this is a file", where=folder, expected="a folder for the results")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not (folder / SETTINGS).is_file():
+            raise ConcentError(
+                "the folder holds other things than a run", where=folder, fix="choose another folder with --out"
+            )
+        if not overwrite and not resume:
+            raise ConcentError(
+                "the folder holds a run", where=folder, fix="choose another folder, or pass --overwrite or --resume"
+            )
+        if overwrite and not resume:
+            for path in folder.iterdir():
+                if path.is_file():
+                    path.unlink()
+    make_folder(folder)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConcentError("the folder cannot be made", where=folder, found=error.strerror) from None
+
+
+def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
+    """Write the resolved settings, the command and the versions to the run folder, and return them."""
+    import tomli_w
+
+    document = {"command": command_line(), "versions": versions(), "settings": plain(settings)}
+    write_text(folder / SETTINGS, tomli_w.dumps(document))
+    return document
+
+
+def command_line() -> str:
+    """Return the command that is running, as one would type it."""
+    return shlex.join(["concent", *sys.argv[1:]])
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of the packages that results depend on."""
+    found = {"concent-warp": concent_warp.__version__, "python": sys.version.split()[0]}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Return nested settings as TOML holds them: tables, lists, numbers, text; what is None is left out."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value if item is not None]
+    return value if isinstance(value, bool | int | float | str) else str(value)

@@ -1,0 +1,78 @@
+"""What the commands write to the terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Return the console for results, or for progress and remarks, which go to standard error."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, highlight=False, width=None if sys.stdout.isatty() else 160)
+
+
+def say(message: RenderableType) -> None:
+    """Write a remark or a table to standard output; text may carry rich's markup."""
+    console().print(message)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar with an estimate of the time left; what is given is to be called with the share done, 0..1."""
+    with status_bar(title) as update:
+        yield lambda share: update(share, "", None)
+
+
+@contextmanager
+def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None]]:
+    """Show a bar, a line of text beside it and the time left.
+
+    What is given is to be called with the share done, 0..1, the text, and the seconds left, None to estimate them from
+    the share. Where there is no terminal, plain lines come now and then.
+    """
+    out = console(stderr=True)
+    begun = time.monotonic()
+    if not out.is_terminal:
+        last = -PLAIN_PERIOD
+
+        def plain(share: float, text: str, left: float | None) -> None:
+            nonlocal last
+            spent = time.monotonic() - begun
+            if spent - last >= PLAIN_PERIOD:
+                last = spent
+                out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{time_left(share, spent, left)}")
+
+        yield plain
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn(title), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+    with Progress(*columns, console=out, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, text="")
+
+        def update(share: float, text: str, left: float | None) -> None:
+            remaining = time_left(share, time.monotonic() - begun, left)
+            bar.update(task, completed=share, text=f"{text}{remaining}".lstrip(", "))
+
+        yield update
+
+
+PLAIN_PERIOD = 5.0
+"""Time between lines of progress where there is no terminal [s]."""
+
+
+def time_left(share: float, spent: float, left: float | None) -> str:
+    """Return the time left as words, empty while it is not known."""
+    if left is None:
+        if share <= 0.02:
+            return ""
+        left = spent * (1 - share) / share
+    return f", {left / 60:.0f} min left" if left > 90 else f", {left:.0f} s left"

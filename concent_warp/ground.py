@@ -1,0 +1,193 @@
+"""The main job: from a recording to a grounded simulation (paper, section 3.1), with all that shows how good it is.
+
+Fit the contact geometry, replay, extract the contact event sequence, compare with what was measured, write the report.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from concent_warp.diagnose.compare import compare
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.null import without_object_contact
+from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.extract import extract
+from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid
+from concent_warp.events.schedule import plot_schedule
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
+from concent_warp.model import Model, write_text
+from concent_warp.report.report import write_report
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.select import EngineName, make_engine
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Recording
+
+BEFORE, NULL, AFTER = "before", "no contact", "after"
+"""Names of the models that are compared: the starting geometry, the null model, the fitted geometry."""
+OVERLAP_FRAME = 0.01
+"""Length of the frames in which contact is compared with the truth [s]."""
+
+
+@dataclass(frozen=True)
+class GroundCfg:
+    """Settings of the main job."""
+
+    geometry: ContactGeometryCfg = field(default_factory=ContactGeometryCfg)
+    """The starting geometry."""
+    fit: FitCfg = field(default_factory=FitCfg)
+    engine: EngineName = "auto"
+    """Engine of the fit: "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations to fit; all where empty. The comparison is about all in any case."""
+
+
+@dataclass(frozen=True)
+class Grounded:
+    """What the main job found."""
+
+    fit: FitResult
+    comparison: Comparison
+    """Of the models named `BEFORE`, `NULL` (where there are two objects) and `AFTER`."""
+    events: dict[str, ContactEventSequence]
+    """By demonstration, of the fitted model."""
+    overlap: dict[str, dict[str, float]]
+    """Overlap (IoU) of the frames in which objects touch one another with the truth, by model and demonstration."""
+    fitted: tuple[str, ...]
+    """Demonstrations that the fit has seen."""
+
+
+def ground(
+    recording: Recording,
+    folder: Path,
+    cfg: GroundCfg | None = None,
+    *,
+    start: Model | None = None,
+    truth: Mapping[str, tuple[np.ndarray, Frames]] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> Grounded:
+    """Run the main job and write its results to a folder.
+
+    Files: ``start.toml`` and ``model.toml`` with what belongs to them, ``checkpoint.npz``, ``history.json``,
+    ``events_<demonstration>.json`` and ``schedule_<demonstration>.png``, ``comparison.json``, ``report.html``.
+
+    Args:
+        recording: What was commanded and measured.
+        folder: An existing folder.
+        cfg: Settings.
+        start: Model to start from; by default spheres are laid on the objects of the recording's scene.
+        truth: When pairs of bodies really touched, with the times [s] (T,) of these frames, by demonstration, where it
+            is known.
+        settings: What the report shows as settings.
+        resume: Go on from the folder's checkpoint.
+        progress: Called after each generation of the fit.
+
+    Raises:
+        RecordingError: There is no such demonstration, or it cannot be replayed.
+        ConcentError: The model cannot be built, simulated or fitted.
+    """
+    cfg = cfg or GroundCfg()
+    fitted = tuple(d.name for d in recording.only(cfg.demonstrations).demonstrations)
+    if start is None:
+        scene = Scene(recording.scene, source=recording.source)
+        start = Model(scene, cfg.geometry.build(scene))
+    start.save(folder / "start.toml")
+    fit = fit_geometry(
+        start,
+        recording,
+        cfg.fit,
+        demonstrations=fitted,
+        engine=cfg.engine,
+        checkpoint=folder / "checkpoint.npz",
+        resume=resume,
+        progress=progress,
+    )
+    fit.model.save(folder / "model.toml")
+    write_json(folder / "history.json", {"stopped": fit.stopped, "generations": fit.history})
+    models = {BEFORE: start, NULL: without_object_contact(fit.model), AFTER: fit.model}
+    models = {name: model for name, model in models.items() if model is not None}
+    events = extract_all(fit.model, recording)
+    save_events(events, folder, plain_name=False)
+    stages = {name: sequence.stages for name, sequence in events.items()}
+    comparison = compare(models, recording, "mujoco", phases=stages)
+    overlap = {}
+    if truth is not None:
+        overlap = {
+            BEFORE: contact_overlap(extract_all(start, recording), truth, start.scene.objects()),
+            AFTER: contact_overlap(events, truth, start.scene.objects()),
+        }
+    document = comparison.to_json()
+    write_json(folder / "comparison.json", {**document, "fitted": list(fitted), "contact_overlap": overlap})
+    write_report(
+        folder / "report.html",
+        recording,
+        models,
+        comparison,
+        events=events,
+        fit=fit,
+        fitted=fitted,
+        overlap=overlap,
+        settings=settings,
+    )
+    return Grounded(fit, comparison, events, overlap, fitted)
+
+
+def extract_all(
+    model: Model, recording: Recording, engine: EngineName = "mujoco", cfg: StagingCfg | None = None
+) -> dict[str, ContactEventSequence]:
+    """Return the contact event sequence of each demonstration."""
+    simulator = make_engine(engine, model)
+    return {d.name: extract(model, d, simulator, cfg) for d in recording.demonstrations}
+
+
+def event_paths(names: Sequence[str], folder: Path, *, plain_name: bool = True) -> list[tuple[Path, Path]]:
+    """Return the paths of the event file and the schedule plot of each demonstration.
+
+    They are ``events_<demonstration>.json`` and ``schedule_<demonstration>.png``; with `plain_name`, those of a single
+    demonstration are ``events.json`` and ``schedule.png``.
+    """
+    short = plain_name and len(names) == 1
+    suffixes = ["" if short else f"_{name.replace('/', '_')}" for name in names]
+    return [(folder / f"events{suffix}.json", folder / f"schedule{suffix}.png") for suffix in suffixes]
+
+
+def save_events(events: Mapping[str, ContactEventSequence], folder: Path, *, plain_name: bool = True) -> list[Path]:
+    """Write the event file and the schedule plot of each demonstration, and return all paths."""
+    paths = event_paths(list(events), folder, plain_name=plain_name)
+    for sequence, (file, plot) in zip(events.values(), paths, strict=True):
+        sequence.save(file)
+        plot_schedule(sequence, plot)
+    return [path for pair_of in paths for path in pair_of]
+
+
+def contact_overlap(
+    events: Mapping[str, ContactEventSequence],
+    truth: Mapping[str, tuple[np.ndarray, Frames]],
+    objects: Sequence[str],
+) -> dict[str, float]:
+    """Return the overlap (IoU) of the frames in which objects touch one another with the truth, by demonstration."""
+    pairs = [pair(a, b) for a, b in combinations(objects, 2)]
+    found = {}
+    for name, sequence in events.items():
+        if name in truth and pairs:
+            time, frames = truth[name]
+            grid = time_grid(sequence.duration, OVERLAP_FRAME)
+            real = settle_frames(resample(frames, time, grid), OVERLAP_FRAME, sequence.settings)
+            found[name] = iou(sequence_frames(sequence, grid), real, pairs).pooled
+    return found
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a JSON file, in one piece or not at all."""
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
