@@ -4,7 +4,8 @@
 
 Each case goes through ``concent compare <recording> --model <model>`` in a working folder of its own. It passes if the
 command fails, says exactly one sentence on stderr without a traceback, and leaves no file behind, neither in the
-working folder nor beside the inputs. Before, the same inputs without a fault must be accepted.
+working folder nor beside the inputs. Before, the sound recording and model that the cases
+start from must be accepted.
 """
 
 from __future__ import annotations
@@ -140,9 +141,10 @@ def table(outcomes: list[Outcome], command: bool) -> str:
     lines = [
         "# Broken inputs",
         "",
-        f"{len(outcomes)} inputs, each with one fault, given to {way}; without its fault each of them is accepted.",
-        f"{passed} of {len(outcomes)} are refused as they should be: exit status other than 0, one sentence on stderr, no",
-        f"traceback, no file left behind. The longest took {max(outcome.seconds for outcome in outcomes):.1f} s. Made by",
+        f"{len(outcomes)} inputs, each with one fault, given to {way}. The sound recording and model",
+        f"that they start from are accepted; {passed} of {len(outcomes)} are refused as they should be: exit status other",
+        "than 0, one sentence on stderr, no traceback, no file left behind.",
+        f"The longest took {max(outcome.seconds for outcome in outcomes):.1f} s. Made by",
         "`python benchmarks/bad_input.py`.",
         "",
         "| | input | fault | message |",
