@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-REFITS = 3
+REFITS = 2
 """Rounds of refitting to the points that agree."""
 TYPICAL = 3.0
 """How many times the median distance of the agreeing points one may be off and still agree; of distances with the same
@@ -54,10 +54,11 @@ def consensus(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the rigid transform (4, 4) that most points agree with, and which do, shape (n,) bool.
 
-    Every round fits three points and counts those that come within `tolerance` [m]. The winner is refitted to those
-    that agree with it, and what agreement means is narrowed to `TYPICAL` of what is then found, so that a wide
-    tolerance costs no accuracy where the noise is small. None where there are fewer than three points, or none agree
-    beyond the three drawn.
+    Every round fits three points and adds up the distances of all, each at most `tolerance` [m]; distances, not their
+    squares, lest a motion between two groups of points beat that of the larger group. The winner is refitted to the
+    points that agree with it, where agreement is narrowed to `TYPICAL` of the distances found, so that a wide tolerance
+    costs no accuracy where the noise is small. None where there are fewer than three points, or none agree beyond the
+    three drawn.
 
     Args:
         source: Points [m], shape (n, 3).
@@ -71,13 +72,21 @@ def consensus(
         return None
     triples = np.argsort(rng.random((rounds, count)), axis=1)[:, :3]
     candidates = kabsch(source[triples], target[triples])
-    agrees = np.linalg.norm(moved(candidates, source[None]) - target, axis=2) < tolerance
-    best = agrees[agrees.sum(axis=1).argmax()]
-    transform = candidates[agrees.sum(axis=1).argmax()]
+    distances = np.linalg.norm(moved(candidates, source[None]) - target, axis=2)
+    winner = np.minimum(distances, tolerance).sum(axis=1).argmin()
+    distance, transform = distances[winner], candidates[winner]
     for _ in range(REFITS):
-        if best.sum() < min(count, 4):
+        agrees = narrowed(distance, tolerance)
+        if agrees.sum() < min(count, 4):
             return None
-        transform = kabsch(source[best], target[best])
+        transform = kabsch(source[agrees], target[agrees])
         distance = np.linalg.norm(moved(transform, source) - target, axis=1)
-        best = distance < min(tolerance, TYPICAL * float(np.median(distance[best])) + 1e-12)
-    return transform, best
+    return transform, narrowed(distance, tolerance)
+
+
+def narrowed(distance: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return which points agree, shape (n,) bool: within `tolerance` and not unlike the others that are, [m]."""
+    agrees = distance < tolerance
+    if not agrees.any():
+        return agrees
+    return agrees & (distance <= TYPICAL * np.median(distance[agrees]))

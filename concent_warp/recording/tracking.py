@@ -1,9 +1,9 @@
 """RGB-D video to point tracks, without any trained network.
 
 For each body: corners are found where the depth image shows the body, followed by optical flow (`flow`), lifted to 3D
-by their depth, and held together by the rigid motion that most of them agree with (`rigid`); points that disagree are
-dropped, new ones are found where the body now is. The body's shape and its pose at the start are all that is known
-beforehand, and both come from the recording.
+by their depth, and held together by the rigid motion that most of them agree with (`rigid`); points that keep
+disagreeing are dropped, new ones are found where the body now is. The body's shape and its pose at the start are all
+that is known beforehand, and both come from the recording.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class TrackingCfg:
     """Distance within which a measured depth belongs to a body [m]."""
     margin: int = 2
     """Distance that new points keep from the outline of what is visible [px]."""
+    patience: int = 3
+    """Frames for which a point that does not move with its body is still followed, in case it was mere noise."""
     least: int = 6
     """Points that must agree, or the body counts as lost in this frame."""
     regain: float = 0.5
@@ -65,6 +67,8 @@ class BodyTracker:
         """Where the points were seen last [px], shape (M, 2)."""
         self.alive = np.zeros(0, dtype=bool)
         """Which points are being followed, shape (M,)."""
+        self.astray = np.zeros(0, dtype=int)
+        """For how many frames a point has not moved with the body, shape (M,)."""
         self.history: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         """Of each frame: the pose (4, 4), the points seen (m,) and where depth put them [m], world frame, (m, 3)."""
 
@@ -74,7 +78,7 @@ class BodyTracker:
             self.follow(before, image, depth)
         if self.alive.sum() < self.cfg.refill * self.cfg.count:
             self.refill(image, depth)
-        rows = np.flatnonzero(self.alive)
+        rows = np.flatnonzero(self.alive & (self.astray == 0))
         seen = self.camera.lift(self.pixel[rows], depth_at(depth, self.pixel[rows]))
         self.history.append((self.pose, rows, seen))
 
@@ -104,8 +108,9 @@ class BodyTracker:
             return
         pose, agrees = result
         self.step, self.pose = pose @ inverse(self.pose), pose
-        self.alive[rows[agrees]] = True
-        self.pixel[rows[agrees]] = pixel[agrees]
+        self.pixel[rows] = pixel
+        self.astray[rows] = np.where(agrees, 0, self.astray[rows] + 1)
+        self.alive[rows] = self.astray[rows] <= self.cfg.patience
 
     def refill(self, image: np.ndarray, depth: np.ndarray) -> None:
         """Find new points where the body shows; a body that was lost must show well enough to be followed again."""
@@ -123,6 +128,7 @@ class BodyTracker:
         self.local = np.concatenate([self.local, local])
         self.pixel = np.concatenate([self.pixel, found])
         self.alive = np.concatenate([self.alive, np.ones(len(found), dtype=bool)])
+        self.astray = np.concatenate([self.astray, np.zeros(len(found), dtype=int)])
 
     def track(self, time: np.ndarray) -> PointTrack:
         """Return what was followed, at the times of the frames [s], shape (T,).
