@@ -13,7 +13,7 @@ import numpy as np
 from concent_warp.errors import ModelError
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
-from concent_warp.fit.mask import robot_bodies, spheres_in_reach, touched_spheres, with_neighbours
+from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
 from concent_warp.fit.perturbation import outward
 from concent_warp.fit.target import Segment, observed_states, whole
@@ -21,6 +21,9 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.select import make_engine
+
+GRIP = 5e-4
+"""A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,8 @@ class Search:
         self.evolution = Evolution(model.geometry, normals, cfg.evolution)
         self.rng = np.random.default_rng(cfg.seed)
         self.robot = robot_bodies(model.scene.model)
+        weld = np.array([model.scene.model.body(name).weldid[0] for name in model.geometry.bodies])
+        self.movable = weld[model.geometry.body] != 0
         self.collidable = np.zeros(len(model.geometry), dtype=bool)
         self.frozen = np.zeros(len(model.geometry), dtype=bool)
         self.objective: Objective | None = None
@@ -188,17 +193,18 @@ class Search:
         )
         every = np.unique(np.linspace(0, steps, 1 + min(steps, round(steps * engine.timestep * 30))).astype(int))
         rollout = engine.run(variants, ctrl, record=every, bodies=(), contacts="touched")
-        touched = np.asarray(rollout.touched).any(axis=0)
-        touched, gripped = touched_spheres(touched, engine.sphere_geom, self.robot)
-        if self.cfg.evolution.freeze_gripped:
-            self.frozen |= gripped
-        mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
-        states = [np.asarray(rollout.qpos[s]) for s in range(n)]
-        seen = [
-            observed_states(self.model.scene.model, segment, rollout.time, states[s])
+        touched, gripped = touched_spheres(np.asarray(rollout.touched).any(axis=0), engine.sphere_geom, self.robot)
+        simulated = [np.asarray(rollout.qpos[s]) for s in range(n)]
+        observed = [
+            observed_states(self.model.scene.model, segment, rollout.time, simulated[s])
             for s, segment in enumerate(self.segments)
         ]
-        reachable = spheres_in_reach(current, np.concatenate(states + seen), self.cfg.reach)
+        if self.cfg.evolution.freeze_gripped:
+            # A replay that fails lets the object slip through the gripper; the real grasp is where it was observed.
+            near = spheres_near(current, np.concatenate(observed), GRIP)[:, self.robot].any(axis=1)
+            self.frozen |= near & self.movable
+        mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
+        reachable = spheres_near(current, np.concatenate(simulated + observed), self.cfg.reach).any(axis=1)
         return mask, reachable | touched | gripped
 
     def prepared(self, needed: np.ndarray) -> Objective:

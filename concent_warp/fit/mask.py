@@ -62,13 +62,13 @@ def with_neighbours(geometry: ContactGeometry, spheres: np.ndarray, k: int) -> n
     return result
 
 
-def spheres_in_reach(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
-    """Return the spheres that come within `reach` [m] of a geom of another body in any of the states, shape (S,) bool.
+def spheres_near(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
+    """Return which bodies each sphere comes near, geometrically, in any of the states, shape (S, nbody) bool.
 
     Args:
         model: Model with contact geometry.
         states: Generalised positions, shape (T, nq).
-        reach: Distance between surfaces [m].
+        reach: Distance between the surfaces of the sphere and of a geom of the body [m].
     """
     assert model.geometry is not None
     spec = model.spec()
@@ -79,14 +79,15 @@ def spheres_in_reach(model: Model, states: np.ndarray, reach: float) -> np.ndarr
             geom.margin = reach
             geom.gap = reach
     compiled = spec.compile()
-    row = {compiled.geom(name).id: i for i, name in enumerate(names)}
+    sphere = np.full(compiled.ngeom, -1)
+    sphere[[compiled.geom(name).id for name in names]] = np.arange(len(names))
     data = mujoco.MjData(compiled)
-    result = np.zeros(len(names), dtype=bool)
+    result = np.zeros((len(names), compiled.nbody), dtype=bool)
     for qpos in states:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(compiled, data)
         mujoco.mj_collision(compiled, data)
-        for geom in np.unique(data.contact.geom):
-            if int(geom) in row:
-                result[row[int(geom)]] = True
+        for one, other in (data.contact.geom.T, data.contact.geom.T[::-1]):
+            is_sphere = sphere[one] >= 0
+            result[sphere[one[is_sphere]], compiled.geom_bodyid[other[is_sphere]]] = True
     return result

@@ -7,7 +7,8 @@ points serves as well: points on the body's surface are then carried by the meas
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -56,6 +57,8 @@ class Segment:
     ctrl: np.ndarray
     """Commands, shape (K, nu)."""
     targets: tuple[BodyTarget, ...]
+    joints: Mapping[int, Channel] = field(default_factory=dict)
+    """Measured joint positions by address in qpos, times from the segment's start."""
 
 
 def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
@@ -72,7 +75,8 @@ def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -
             expected=f"points, or position and orientation sensors, of one of {movable}",
             fix="record /points/<body> or the body's pose",
         )
-    return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets))
+    joints = joint_channels(model, demonstration)
+    return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets), joints)
 
 
 def body_target(scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray) -> BodyTarget | None:
@@ -135,15 +139,20 @@ def frame_channel(
 
 
 def observed_states(model: mujoco.MjModel, segment: Segment, time: np.ndarray, qpos: np.ndarray) -> np.ndarray:
-    """Return simulated states with each free body where its points were observed, shape (T, nq).
+    """Return simulated states with what was observed put in its place, shape (T, nq).
+
+    Free bodies stand where their points were seen, and joints where their encoders read; the rest stays simulated.
 
     Args:
         model: Compiled scene.
-        segment: Holds the observed points.
+        segment: Holds the observations.
         time: Times of the states [s], shape (T,).
         qpos: Simulated states, shape (T, nq).
     """
     result = qpos.copy()
+    for address, channel in segment.joints.items():
+        valid = np.isfinite(channel.value[:, 0])
+        result[:, address] = np.interp(time, channel.time[valid], channel.value[valid, 0])
     for target in segment.targets:
         joint = model.body(target.body).jntadr[0]
         if joint < 0 or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
@@ -157,6 +166,16 @@ def observed_states(model: mujoco.MjModel, segment: Segment, time: np.ndarray, q
                 turn, _ = Rotation.align_vectors(observed - observed.mean(axis=0), anchor - anchor.mean(axis=0))
                 position = observed.mean(axis=0) - turn.apply(anchor.mean(axis=0))
                 result[row, address : address + 7] = [*position, *turn.as_quat(scalar_first=True)]
+    return result
+
+
+def joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict[int, Channel]:
+    """Return the measured joint positions of a demonstration by their address in qpos."""
+    result = {}
+    for name, channel in demonstration.measured.items():
+        sensor = model.sensor(name).id
+        if int(model.sensor_type[sensor]) == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
+            result[int(model.jnt_qposadr[model.sensor_objid[sensor]])] = channel
     return result
 
 
