@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.errors import ModelError
+from concent_warp.errors import ModelError, RecordingError
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
 from concent_warp.fit.perturbation import outward
 from concent_warp.fit.target import Segment, observed_states, whole
+from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
-from concent_warp.recording.recording import Recording
+from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.select import make_engine
 
@@ -39,6 +40,11 @@ class FitCfg:
     """Share of the frames that choose the best estimate and do not move it."""
     block: float = 0.2
     """Length of the held-out blocks [s]."""
+    window: float | None = None
+    """Length of windows to simulate on their own [s], each from the measured state at its start; None simulates whole
+    demonstrations. Motion with impacts or tumbling asks for 0.1-0.3 s."""
+    window_stride: float | None = None
+    """Time from the start of one window to that of the next [s]; None takes the length."""
     squared: bool = False
     """Squared form of the Chamfer distance."""
     reach: float = 0.006
@@ -111,7 +117,7 @@ def fit_geometry(
         raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
     if segments is None:
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
-        segments = [whole(model.scene, recording[name], model.geometry.bodies) for name in names]
+        segments = cut(model, [recording[name] for name in names], cfg)
     search = Search(model, list(segments), cfg, engine)
     if resume and checkpoint is not None and checkpoint.is_file():
         search.restore(Checkpoint.load(checkpoint))
@@ -122,6 +128,24 @@ def fit_geometry(
         if progress is not None:
             progress(search.progress())
     return search.result()
+
+
+def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> list[Segment]:
+    """Return whole demonstrations as segments, or windows of them where the settings ask for that.
+
+    Raises:
+        RecordingError: Nothing is observed, or no window shows contact.
+    """
+    assert model.geometry is not None
+    bodies = model.geometry.bodies
+    if cfg.window is None:
+        return [whole(model.scene, d, bodies) for d in demonstrations]
+    groups = [windows(model.scene, d, bodies, cfg.window, cfg.window_stride) for d in demonstrations]
+    if not any(groups):
+        raise RecordingError(
+            "no window shows contact", expected=f"contact within {cfg.window:g} s", fix="fit longer windows, or without"
+        )
+    return hold_out(groups, cfg.held_out)
 
 
 class Search:

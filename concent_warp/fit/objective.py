@@ -94,10 +94,14 @@ class Objective:
         for s, segment in enumerate(self.segments):
             for target in segment.targets:
                 distance, counted = self.distances(rollout, slice(s, None, n), target)
+                if segment.held_out is not None:
+                    (held if segment.held_out else fit).append(distance[:, counted].mean(dim=1))
+                    continue
                 out = torch.as_tensor(target.held_out(self.held_out, self.block), device=distance.device)
                 keep = counted & ~out
                 fit.append(distance[:, keep].mean(dim=1))
                 held.append(distance[:, counted & out].mean(dim=1) if bool((counted & out).any()) else fit[-1])
+        fit, held = fit or held, held or fit
         diverged = torch.as_tensor(rollout.diverged).reshape(count, n).any(dim=1)
         both = torch.stack([torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)])
         both = torch.where(diverged | ~torch.isfinite(both), torch.inf, both).cpu().numpy().astype(float)

@@ -59,6 +59,8 @@ class Segment:
     targets: tuple[BodyTarget, ...]
     joints: Mapping[int, Channel] = field(default_factory=dict)
     """Measured joint positions by address in qpos, times from the segment's start."""
+    held_out: bool | None = None
+    """Whether the whole segment is kept from the fit; None keeps blocks of its frames."""
 
 
 def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
