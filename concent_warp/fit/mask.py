@@ -76,8 +76,7 @@ def spheres_near(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
     spheres = set(names)
     for geom in spec.geoms:
         if geom.name in spheres:
-            geom.margin = reach
-            geom.gap = reach
+            geom.gap = reach  # contacts within margin + gap are found; those beyond the margin carry no force
     compiled = spec.compile()
     sphere = np.full(compiled.ngeom, -1)
     sphere[[compiled.geom(name).id for name in names]] = np.arange(len(names))

@@ -1,0 +1,107 @@
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from concent_warp.errors import ModelError, RecordingError
+from concent_warp.fit.checkpoint import Checkpoint
+from concent_warp.fit.evolution import EvolutionCfg
+from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
+from concent_warp.recording.recording import Recording
+from tests.fit.conftest import HALF, RADIUS, corner_spheres
+
+CFG = FitCfg(evolution=EvolutionCfg(population=12, sigma=1e-3, neighbours=2), generations=14, held_out=0.2, block=0.05)
+
+
+@pytest.fixture(scope="module")
+def fitted(drop, swollen) -> FitResult:
+    return fit_geometry(swollen, drop, CFG, engine="mujoco")
+
+
+def test_a_swollen_block_shrinks_to_the_size_that_explains_its_rest_height(fitted):
+    bottom = fitted.model.geometry.position[:, 2] < 0
+    depth = fitted.model.geometry.position[bottom, 2].mean() - RADIUS
+    assert depth == pytest.approx(-HALF, abs=7e-4)
+    assert fitted.history[-1]["best"] < 0.4 * fitted.history[0]["held_out"]
+
+
+def test_without_neighbours_only_touched_spheres_move(drop, swollen):
+    cfg = replace(CFG, evolution=replace(CFG.evolution, neighbours=0), generations=4)
+    result = fit_geometry(swollen, drop, cfg, engine="mujoco")
+    np.testing.assert_array_equal(result.mask, swollen.geometry.position[:, 2] < 0)
+
+
+def test_an_interrupted_fit_resumes_to_the_same_result(drop, swollen, fitted, tmp_path):
+    def kill(progress: Progress) -> None:
+        if progress.generation == 5:
+            raise KeyboardInterrupt
+
+    file = tmp_path / "checkpoint.npz"
+    with pytest.raises(KeyboardInterrupt):
+        fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, progress=kill)
+    resumed = fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, resume=True)
+    np.testing.assert_array_equal(resumed.model.geometry.position, fitted.model.geometry.position)
+    assert [h["loss"] for h in resumed.history] == [h["loss"] for h in fitted.history]
+
+
+def test_the_seed_decides_the_result(drop, swollen, fitted):
+    again = fit_geometry(swollen, drop, CFG, engine="mujoco")
+    other = fit_geometry(swollen, drop, replace(CFG, seed=1), engine="mujoco")
+    np.testing.assert_array_equal(again.model.geometry.position, fitted.model.geometry.position)
+    assert not np.array_equal(other.model.geometry.position, fitted.model.geometry.position)
+
+
+def test_a_checkpoint_of_other_settings_is_refused(drop, swollen, tmp_path):
+    file = tmp_path / "checkpoint.npz"
+    fit_geometry(swollen, drop, replace(CFG, generations=1), engine="mujoco", checkpoint=file)
+    with pytest.raises(ModelError, match="other settings"):
+        fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, resume=True)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path):
+    file = tmp_path / "checkpoint.npz"
+    file.write_bytes(b"not a zip")
+    with pytest.raises(ModelError, match="not a checkpoint"):
+        Checkpoint.load(file)
+
+
+def test_settings_survive_the_checkpoint_as_json():
+    assert json.loads(json.dumps(asdict(CFG)))["evolution"]["population"] == 12
+
+
+def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
+    cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), patience=2)
+    result = fit_geometry(swollen, drop, cfg, engine="mujoco")
+    assert "no better estimate" in result.stopped
+    assert len(result.history) < CFG.generations
+
+
+def test_radii_move_when_asked(drop, swollen):
+    cfg = replace(CFG, evolution=replace(CFG.evolution, fit_radius=True, radius_sigma=0.2), generations=4)
+    result = fit_geometry(swollen, drop, cfg, engine="mujoco")
+    assert not np.array_equal(result.model.geometry.radius, swollen.geometry.radius)
+    assert np.array_equal(result.model.geometry.friction, swollen.geometry.friction)
+
+
+def test_a_recording_that_observes_nothing_is_refused(drop, swollen):
+    blind = Recording(drop.scene, (replace(drop[0], points={}),))
+    with pytest.raises(RecordingError, match="nothing to fit to"):
+        fit_geometry(swollen, blind, CFG)
+
+
+def test_a_model_without_spheres_is_refused(drop, swollen):
+    with pytest.raises(ModelError, match="no contact geometry"):
+        fit_geometry(swollen.with_geometry(None), drop, CFG)
+
+
+def test_the_true_geometry_scores_best(drop, swollen):
+    from concent_warp.fit.objective import Candidates, Objective
+    from concent_warp.fit.target import whole
+    from concent_warp.simulate.mujoco_engine import MujocoEngine
+
+    halves = HALF + np.array([-0.002, 0.0, 0.002])
+    segments = [whole(swollen.scene, drop[0], ("block",))]
+    objective = Objective(MujocoEngine(swollen), segments, held_out=0.0, block=0.2)
+    losses = objective(Candidates(np.stack([corner_spheres(h).position for h in halves])))
+    assert losses.fit[1] < 0.2 * min(losses.fit[0], losses.fit[2])
