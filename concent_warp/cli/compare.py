@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from rich.markup import escape
 
-from concent_warp.cli.run_folder import claim_file, command_line, plain, versions
+from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.summary import say_diverged
-from concent_warp.cli.terminal import say
+from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.comparison_table import markdown_table, rich_table
@@ -63,7 +64,7 @@ def run(arguments: Arguments) -> Comparison:
         try:
             events = extract_all(models["model"], recording, arguments.engine)
         except EventsError as error:
-            say(f"No contact phases: {error}")
+            say(escape(f"No contact phases: {error}"))
     stages = {name: sequence.stages for name, sequence in events.items()}
     found = compare(models, recording, arguments.engine, phases=stages or None)
     if arguments.json:
@@ -77,7 +78,8 @@ def run(arguments: Arguments) -> Comparison:
         from concent_warp.report.report import write_report
 
         settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+        make_folder(arguments.html.parent)
         write_report(arguments.html, recording, models, found, events=events, settings=settings)
         if not arguments.json:
-            say(f"wrote [bold]{arguments.html}[/]")
+            say_written(arguments.html)
     return found

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_folder, write_settings
+from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.cli.terminal import progress_bar, say
 from concent_warp.fit.geometry import FitCfg
@@ -47,19 +47,19 @@ class Arguments:
 def run(arguments: Arguments) -> Grounded:
     """Run the demonstration and write the run folder."""
     folder = arguments.out
-    claim_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
-    settings = write_settings(folder, arguments)
-    with progress_bar("recording") as progress:
-        seeds = [*arguments.seeds, *arguments.unseen_seeds]
-        recording, truths = record(arguments.reality, seeds, progress=progress)
-    write_hdf5(recording, folder / "demo.h5")
-    names = tuple(d.name for d in recording.demonstrations)
-    say(f"recorded {len(names)} demonstrations to [bold]{folder / 'demo.h5'}[/]")
-    truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
-    cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, names[: len(arguments.seeds)])
-    with fit_progress(f"concent demo --out {folder} --resume") as progress:
-        found = ground(
-            recording, folder, cfg, truth=truth, settings=settings, resume=arguments.resume, progress=progress
-        )
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
+        settings = write_settings(folder, arguments)
+        with progress_bar("recording") as progress:
+            seeds = [*arguments.seeds, *arguments.unseen_seeds]
+            recording, truths = record(arguments.reality, seeds, progress=progress)
+        write_hdf5(recording, folder / "demo.h5")
+        names = tuple(d.name for d in recording.demonstrations)
+        say(f"recorded {len(names)} demonstrations")
+        truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
+        cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, names[: len(arguments.seeds)])
+        with fit_progress(f"concent demo --out {folder} --resume") as progress:
+            found = ground(
+                recording, folder, cfg, truth=truth, settings=settings, resume=arguments.resume, progress=progress
+            )
     say_grounded(found, folder)
     return found

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file
+from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.summary import say_events
-from concent_warp.cli.terminal import say
+from concent_warp.cli.terminal import say_written
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.ground import event_paths, extract_all, save_events
@@ -45,7 +45,8 @@ def run(arguments: Arguments) -> dict[str, ContactEventSequence]:
         for path in paths:
             claim_file(path, overwrite=arguments.overwrite)
     found = extract_all(model, recording, arguments.engine, arguments.staging)
+    make_folder(arguments.out)
     written = save_events(found, arguments.out)
     say_events(found)
-    say(f"wrote [bold]{', '.join(map(str, written))}[/]")
+    say_written(*written)
     return found

@@ -8,13 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_folder, write_settings
+from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.fit.geometry import FitCfg
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
+from concent_warp.recording.recording import Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import EngineName
 
 
@@ -31,6 +33,8 @@ class Arguments:
     """Run folder; by default runs/<name of the recording>."""
     model: Path | None = None
     """Model to start from (.toml); by default spheres are laid on the objects of the recording's scene."""
+    scene: Path | None = None
+    """MJCF scene in place of the recording's own; its actuators and sensors must have the same names."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to fit; all by default. The comparison is about all in any case."""
     engine: EngineName = "auto"
@@ -46,14 +50,25 @@ class Arguments:
 def run(arguments: Arguments) -> Grounded:
     """Fit and write the run folder."""
     recording = load_recording(arguments.recording)
-    start = None if arguments.model is None else Model.load(arguments.model)
+    recording.only(arguments.demonstrations)
+    start = starting_model(arguments, recording)
     folder = arguments.out or Path("runs") / arguments.recording.stem
-    claim_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
-    settings = write_settings(folder, arguments)
     cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, arguments.demonstrations)
-    with fit_progress(f"concent fit {arguments.recording} --out {folder} --resume") as progress:
-        found = ground(
-            recording, folder, cfg, start=start, settings=settings, resume=arguments.resume, progress=progress
-        )
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
+        settings = write_settings(folder, arguments)
+        with fit_progress(f"concent fit {arguments.recording} --out {folder} --resume") as progress:
+            found = ground(
+                recording, folder, cfg, start=start, settings=settings, resume=arguments.resume, progress=progress
+            )
     say_grounded(found, folder)
     return found
+
+
+def starting_model(arguments: Arguments, recording: Recording) -> Model:
+    """Return the model to start from."""
+    if arguments.model is not None:
+        return Model.load(arguments.model)
+    scene = Scene(recording.scene, str(arguments.recording))
+    if arguments.scene is not None:
+        scene = Scene.from_mjcf(arguments.scene)
+    return Model(scene, arguments.geometry.build(scene))

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file
-from concent_warp.cli.terminal import say
+from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
 from concent_warp.model import Model
 from concent_warp.scene.build_geometry import ContactGeometryCfg
@@ -49,11 +49,13 @@ def run(arguments: Arguments) -> Model:
             claim_file(path, overwrite=arguments.overwrite)
     model = build(arguments)
     if arguments.out is not None:
+        make_folder(arguments.out.parent)
         model.save(arguments.out)
-        say(f"wrote [bold]{arguments.out}[/]")
+        say_written(arguments.out)
     if arguments.export is not None:
+        make_folder(arguments.export.parent)
         save_mjcf(model, arguments.export)
-        say(f"wrote [bold]{arguments.export}[/]")
+        say_written(arguments.export)
     if (geometry := model.geometry) is None:
         return model
     for body in geometry.bodies:

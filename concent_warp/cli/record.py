@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file
-from concent_warp.cli.terminal import progress_bar, say
+from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
@@ -49,9 +49,10 @@ def run(arguments: Arguments) -> Recording:
     claim_file(arguments.out, overwrite=arguments.overwrite)
     with progress_bar("recording") as progress:
         recording, _ = record(arguments.reality_with_robot(), list(arguments.seeds), progress=progress)
+    make_folder(arguments.out.parent)
     write_hdf5(recording, arguments.out)
     for demonstration in recording.demonstrations:
         end = "the block is in the hole" if demonstration.success else "the block missed the hole"
         say(f"{demonstration.name}: {demonstration.duration:.1f} s, {end}")
-    say(f"wrote [bold]{arguments.out}[/]")
+    say_written(arguments.out)
     return recording

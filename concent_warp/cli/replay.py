@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file
-from concent_warp.cli.terminal import say
+from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import say, say_written
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.simulate.replay import replay
@@ -46,11 +46,12 @@ def run(arguments: Arguments) -> list[Path]:
     for path in paths.values():
         claim_file(path, overwrite=arguments.overwrite)
     engine = make_engine(arguments.engine, model)
+    make_folder(out.parent)
     for d in recording.demonstrations:
         rollout = replay(model, d, engine, contacts="all").numpy()
         save_rollout(rollout, engine.compiled, paths[d.name])
         contacts = 0 if rollout.contacts is None else len(rollout.contacts.step)
-        end = ", [bold]diverged[/]" if rollout.diverged[0] else ""
+        end = ", diverged" if rollout.diverged[0] else ""
         say(f"{d.name}: {rollout.time[-1]:.2f} s, {len(rollout.time)} states, {contacts} contacts{end}")
-        say(f"wrote [bold]{paths[d.name]}[/]")
+        say_written(paths[d.name])
     return list(paths.values())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,28 +18,44 @@ from concent_warp.model import write_text
 
 SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""
+CHECKPOINT = "checkpoint.npz"
+"""File of the state of a fit."""
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
 
 
 def claim_file(path: Path, *, overwrite: bool) -> None:
-    """Check that a file may be written, and make its folder.
+    """Check that a file may be written.
 
     Raises:
-        ConcentError: It exists and `overwrite` was not asked for, or its folder cannot be made.
+        ConcentError: It exists and `overwrite` was not asked for.
     """
     if path.is_dir():
         raise ConcentError("this is a folder", where=path, expected="the name of a file to write")
     if path.exists() and not overwrite:
         raise ConcentError("the file exists", where=path, fix="choose another name or pass --overwrite")
-    make_folder(path.parent)
 
 
-def claim_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> None:
-    """Check that a run may write to a folder, make it, and empty it of an earlier run's results where that was asked.
+@contextmanager
+def run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> Iterator[None]:
+    """Make the folder of a run and empty it of an earlier run's results where that was asked.
+
+    A folder made here is taken away again when the run ends with a `ConcentError` before its first checkpoint.
 
     Raises:
         ConcentError: It holds a run and neither `overwrite` nor `resume` was asked for, or holds other things.
     """
+    new = not folder.exists()
+    claim_folder(folder, overwrite=overwrite, resume=resume)
+    try:
+        yield
+    except ConcentError:
+        if new and not (folder / CHECKPOINT).exists():
+            shutil.rmtree(folder)
+        raise
+
+
+def claim_folder(folder: Path, *, overwrite: bool, resume: bool) -> None:
+    """Check that a run may write to a folder, make it, and empty it where that was asked, see `run_folder`."""
     if folder.exists() and not folder.is_dir():
         raise ConcentError("this is a file", where=folder, expected="a folder for the results")
     if folder.is_dir() and any(folder.iterdir()):
@@ -49,7 +67,7 @@ def claim_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> None
             raise ConcentError(
                 "the folder holds a run", where=folder, fix="choose another folder, or pass --overwrite or --resume"
             )
-        if overwrite and not resume:
+        if not resume:
             for path in folder.iterdir():
                 if path.is_file():
                     path.unlink()
@@ -57,7 +75,7 @@ def claim_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> None
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it."""
+    """Make a folder and those above it, if they are not there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.markup import escape
 
-from concent_warp.cli.terminal import say, status_bar
+from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.comparison_table import mean_and_interval, percent, unit_shown
 from concent_warp.events.sequence import ContactEventSequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 @contextmanager
 def fit_progress(resume: str) -> Iterator[Callable[[Progress], None]]:
     """Show the progress of a fit; an interruption says with which command to go on."""
+    quiet_warp()
     try:
         with status_bar("fitting") as update:
 
@@ -37,12 +39,14 @@ def fit_progress(resume: str) -> Iterator[Callable[[Progress], None]]:
 def say_grounded(found: Grounded, folder: Path) -> None:
     """Write the summary of the main job: errors, overlap, stages, and where the results are."""
     from rich.table import Table
+    from rich.text import Text
 
     comparison = found.comparison
     channel, phases = comparison.main_channel(), comparison.contact_phases()
     unseen = tuple(d for d in comparison.demonstrations if d not in found.fitted)
     unit = unit_shown(comparison.summarise(comparison.after, channel, phases).unit)
-    table = Table(title=f"mean error of {channel} [{unit}], {' + '.join(phases) or 'all times'}", title_justify="left")
+    title = Text(f"mean error of {channel} [{unit}], {' + '.join(phases) or 'all times'}")
+    table = Table(title=title, title_justify="left")
     for name in ("demonstrations", *comparison.models, "change"):
         table.add_column(name, justify="left" if name == "demonstrations" else "right")
     if found.overlap:
@@ -60,17 +64,17 @@ def say_grounded(found: Grounded, folder: Path) -> None:
     say(table)
     say(f"fit: {found.fit.stopped}; {int(found.fit.mask.sum())} of {len(found.fit.mask)} spheres moved")
     say_events(found.events)
-    say(f"model [bold]{folder / 'model.toml'}[/], report [bold]{folder / 'report.html'}[/]")
+    say_written(folder / "model.toml", folder / "report.html")
 
 
 def say_events(events: Mapping[str, ContactEventSequence]) -> None:
     """Write the stages of contact event sequences."""
     for name, sequence in events.items():
         stages = ", ".join(f"{s.name} {s.start:.2f}-{s.end:.2f} s" for s in sequence.stages)
-        say(f"{name}: {stages or 'no contact stages'}; {len(sequence.contacts)} contacts")
+        say(escape(f"{name}: {stages or 'no contact stages'}; {len(sequence.contacts)} contacts"))
 
 
 def say_diverged(comparison: Comparison) -> None:
     """Write which replays have not stayed finite."""
     for (model, demonstration), time in comparison.diverged.items():
-        say(f"[bold]{model}[/] diverged in {demonstration} at {time:.2f} s")
+        say(escape(f"{model} diverged in {demonstration} at {time:.2f} s"))

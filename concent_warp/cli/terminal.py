@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +23,20 @@ def console(*, stderr: bool = False) -> Console:
 def say(message: RenderableType) -> None:
     """Write a remark or a table to standard output; text may carry rich's markup."""
     console().print(message)
+
+
+def say_written(*paths: Path) -> None:
+    """Write which files are new."""
+    from rich.text import Text
+
+    say(Text("wrote ") + Text(", ".join(map(str, paths)), style="bold"))
+
+
+def quiet_warp() -> None:
+    """Keep Warp from writing about the modules that it loads."""
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
 
 
 @contextmanager

@@ -1,0 +1,91 @@
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from concent_warp.cli import main
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+
+
+def test_record_writes_a_recording_of_every_seed(tmp_path):
+    path = tmp_path / "made" / "demo.h5"
+    assert main(["record", "--out", str(path), "--seeds", "3", "--reality.expert.speed", "2"]) == 0
+    recording = load_recording(path)
+    assert [d.name for d in recording.demonstrations] == ["demo_0"]
+    assert recording[0].duration < 6
+
+
+def test_geometry_exports_a_scene_that_plain_mujoco_loads(bench, tmp_path):
+    assert main(["geometry", str(bench / "inset.toml"), "--export", str(tmp_path / "m.xml")]) == 0
+    exported = mujoco.MjModel.from_xml_path(str(tmp_path / "m.xml"))
+    model = Model.load(bench / "inset.toml")
+    assert model.geometry is not None
+    assert exported.ngeom == model.scene.model.ngeom + len(model.geometry)
+
+
+def test_geometry_adds_an_object_from_a_mesh(bench, tmp_path):
+    import trimesh
+
+    trimesh.creation.box(extents=(40, 40, 60)).export(tmp_path / "peg.stl")
+    out = tmp_path / "peg.toml"
+    arguments = ["--add", "peg", str(tmp_path / "peg.stl"), "--scale", "0.001", "--objects", "peg", "--count", "30"]
+    assert main(["geometry", str(bench / "demo.h5"), *arguments, "--out", str(out)]) == 0
+    model = Model.load(out)
+    assert model.geometry is not None
+    assert model.geometry.bodies == ("peg",)
+    assert len(model.geometry) == 30
+
+
+def test_replay_writes_a_file_for_each_demonstration(bench, tmp_path):
+    arguments = ["replay", str(bench / "demo.h5"), "--model", str(bench / "inset.toml"), "--out"]
+    assert main([*arguments, str(tmp_path / "r.npz")]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["r_demo_0.npz", "r_demo_1.npz"]
+    assert main([*arguments, str(tmp_path / "one.npz"), "--demonstrations", "demo_1"]) == 0
+    with np.load(tmp_path / "one.npz", allow_pickle=False) as one, np.load(tmp_path / "r_demo_1.npz") as two:
+        assert np.array_equal(one["qpos"], two["qpos"])
+        assert "sensor/block_position" in one
+
+
+def test_events_writes_the_sequence_and_its_picture(bench, tmp_path, capsys):
+    arguments = ["--model", str(bench / "inset.toml"), "--out", str(tmp_path), "--demonstrations", "demo_0"]
+    assert main(["events", str(bench / "demo.h5"), *arguments]) == 0
+    sequence = ContactEventSequence.load(tmp_path / "events.json")
+    assert (tmp_path / "schedule.png").stat().st_size > 5000
+    assert sequence.stages[0].name in capsys.readouterr().out
+
+
+def test_compare_prints_one_json_object_and_nothing_else(bench, capsys):
+    models = ["--model", str(bench / "inset.toml"), "--baseline", str(bench / "surface.toml")]
+    assert main(["compare", str(bench / "demo.h5"), *models, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["models"] == ["baseline", "model"]
+    assert document["headline"]["channel"] == "block_position"
+    assert document["headline"]["difference"]["verdict"] in ("fallen", "risen", "unclear")
+    assert document["phases"]["demo_0"][0]["name"] == "free"
+
+
+def test_compare_shows_a_table_and_writes_a_report(bench, tmp_path, capsys):
+    html = tmp_path / "r.html"
+    arguments = ["compare", str(bench / "demo.h5"), "--model", str(bench / "inset.toml"), "--html", str(html)]
+    assert main([*arguments, "--markdown", "--no-phases"]) == 0
+    out = capsys.readouterr().out
+    assert "| block_position | all |" in out
+    assert "mean baseline" not in out
+    assert "block_position" in html.read_text()
+    assert main(arguments) == 2
+    assert "the file exists" in capsys.readouterr().err
+    assert main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize("command", ["replay", "events"])
+def test_files_are_not_overwritten_unasked(command, bench, tmp_path, capsys):
+    out = tmp_path / "r.npz" if command == "replay" else tmp_path
+    arguments = [command, str(bench / "demo.h5"), "--model", str(bench / "inset.toml"), "--out", str(out)]
+    assert main(arguments) == 0
+    capsys.readouterr()
+    assert main(arguments) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*arguments, "--overwrite"]) == 0

@@ -1,0 +1,90 @@
+import subprocess
+import sys
+import time
+
+import pytest
+
+from concent_warp.cli import main
+from concent_warp.cli.entry import COMMANDS
+
+HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "open3d", "trimesh", "scipy")
+
+
+def python(*arguments):
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+
+
+def test_help_lists_every_command_in_under_a_second():
+    start = time.perf_counter()
+    done = python("-m", "concent_warp", "--help")
+    assert time.perf_counter() - start < 1.0
+    assert done.returncode == 0
+    assert all(f"  {name} " in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("code", ["import concent_warp", "from concent_warp.cli import main; main(['--help'])"])
+def test_nothing_heavy_is_imported_before_it_is_needed(code):
+    done = python("-c", f"import sys; {code}; print(*[n for n in {HEAVY} if n in sys.modules], file=sys.stderr)")
+    assert done.stderr.split() == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_its_options(command, capsys):
+    assert main([command, "--help"]) == 0
+    assert f"usage: concent {command}" in capsys.readouterr().out
+
+
+def test_no_arguments_show_the_help_and_version_the_version(capsys):
+    assert main([]) == 0
+    assert "usage: concent" in capsys.readouterr().out
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("concent 0.")
+
+
+def test_an_unknown_command_is_named_with_the_known_ones(capsys):
+    assert main(["graund"]) == 2
+    error = capsys.readouterr().err
+    assert "'graund'" in error
+    assert "demo" in error
+
+
+def test_an_unknown_option_ends_with_code_2(bench, capsys):
+    assert main(["compare", str(bench / "demo.h5"), "--modle", "x"]) == 2
+    assert "--model" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["compare", "nowhere.h5", "--model", "m.toml"], "no such recording"),
+        (["fit", "demo.h5", "--model", "nowhere.toml", "--out", "run"], "no such model"),
+        (["fit", "demo.h5", "--demonstrations", "demo_9", "--out", "run"], "no such demonstration"),
+        (["fit", "demo.h5", "--scene", "nowhere.xml", "--out", "run"], "no such MJCF"),
+        (["replay", "demo.h5", "--model", "demo.h5"], "not a TOML"),
+        (["events", "demo.h5", "--model", "inset.toml", "--staging.share", "3"], "share"),
+        (["geometry", "demo.h5"], "nothing to write"),
+        (["geometry", "demo.h5", "--out", "x.toml", "--count", "1"], "too few spheres"),
+        (["record", "--out", "new/r.h5", "--robot", "nowhere.xml"], "no such robot"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence_and_nothing_is_left_behind(
+    arguments, words, bench, tmp_path, monkeypatch, capsys
+):
+    for path in bench.iterdir():
+        if path.is_file():
+            (tmp_path / path.name).symlink_to(path)
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert words in err
+    assert "Traceback" not in out + err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_errors_of_the_library_are_one_line(bench, capsys):
+    main(["compare", "nowhere.h5", "--model", str(bench / "inset.toml")])
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("concent compare: nowhere.h5: ")
+    assert lines[0].endswith(".")
