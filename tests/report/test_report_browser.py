@@ -1,0 +1,80 @@
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+BROWSER = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the report with")
+FLAGS = [
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update", "--hide-scrollbars"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--enable-logging=stderr", "--virtual-time-budget=3000"),
+]
+
+
+def browse(page, folder, *flags):
+    """Open a page; return standard output and the messages of its console."""
+    command = [BROWSER, *FLAGS, f"--user-data-dir={folder / 'profile'}", *flags, f"file://{page}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env={**os.environ, "HOME": str(folder)})
+    messages = [line for line in done.stderr.splitlines() if ":CONSOLE:" in line and "GL Driver Message" not in line]
+    return done.stdout, messages
+
+
+@pytest.fixture(scope="module")
+def opened(case, tmp_path_factory):
+    return browse(case.path, tmp_path_factory.mktemp("dom"), "--window-size=1200,2600", "--dump-dom")
+
+
+def test_the_console_is_silent_and_the_scripts_come_to_their_end(opened):
+    dom, messages = opened
+    assert messages == []
+    assert 'data-ready="yes"' in dom
+
+
+def test_charts_are_drawn_with_phases_noise_floor_and_every_model(opened, case):
+    dom, _ = opened
+    chart = re.search(r'id="errors".*?</svg>', dom, re.S)[0]
+    assert [chart.count(f'class="line {kind}"') for kind in ("before", "null", "after")] == [1, 1, 1]
+    assert 'class="noise"' in chart
+    bands = re.findall(r'class="band band\d"', chart)
+    assert len(bands) == len(case.comparison.phases["demo_0"])
+    for path in re.findall(r'class="line \w+" d="([^"]*)"', chart):
+        assert path.count("L") > 50
+        assert "NaN" not in path
+    schedule = re.search(r'id="schedule".*?</svg>', dom, re.S)[0]
+    assert "block · stop" in schedule
+    assert 'class="target"' in schedule
+    assert 'class="line held"' in re.search(r'id="fit-chart".*?</svg>', dom, re.S)[0]
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_3d_views_show_robot_block_and_moved_spheres(case, tmp_path, dark):
+    import cv2
+
+    picture = tmp_path / "page.png"
+    scheme = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    _, messages = browse(case.path, tmp_path, "--window-size=1200,3200", f"--screenshot={picture}", *scheme)
+    assert messages == []
+    image = cv2.imread(str(picture)).astype(int)
+    blue, green, red = np.moveaxis(image, -1, 0)
+    orange = (red > 120) & (red > 1.4 * green) & (green > 1.4 * blue)
+    moved = (red > 150) & (red > 2.2 * green) & (red > 3.5 * blue)
+    assert orange.sum() > 3000
+    assert moved.sum() > 3000
+    paper = image[5, 5].sum()
+    assert (paper < 150) == dark
+
+
+def test_the_page_fits_a_telephone(case, tmp_path):
+    wrapper = tmp_path / "phone.html"
+    probe = 'onload="document.title=this.contentDocument.documentElement.scrollWidth"'
+    shutil.copy(case.path, tmp_path / "report.html")
+    wrapper.write_text(f'<title>-</title><iframe src="report.html" style="width:390px;height:800px" {probe}></iframe>')
+    dom, _ = browse(wrapper, tmp_path, "--dump-dom", "--allow-file-access-from-files")
+    assert int(re.search(r"<title>(\d+)</title>", dom)[1]) <= 390

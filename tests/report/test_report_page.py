@@ -1,0 +1,169 @@
+import base64
+import json
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnose.compare import compare
+from concent_warp.diagnose.comparison_table import shown
+from concent_warp.model import Model
+from concent_warp.report.report import filled, write_report
+from concent_warp.report.scene_data import scene_bodies
+from concent_warp.scene.scene import Scene
+
+
+def embedded(path):
+    """The data that the page's scripts read."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(), re.S)
+    return json.loads(found[1])
+
+
+def unpacked(packed):
+    return np.frombuffer(base64.b64decode(packed["data"]), dtype="<i4" if packed["type"] == "i" else "<f4")
+
+
+@pytest.fixture(scope="module")
+def text(case):
+    return case.path.read_text()
+
+
+@pytest.fixture(scope="module")
+def data(case):
+    return embedded(case.path)
+
+
+def test_the_page_stands_alone(text):
+    assert not re.search(r"(src|href)\s*=", text)
+    assert not re.search(r"https?://|url\(|@import", text)
+    assert "default-src 'none'" in text
+    assert "[[" not in re.sub(r"<script.*?</script>", "", text, flags=re.S)
+
+
+def test_names_from_the_recording_cannot_become_markup(text):
+    assert "push the &lt;block&gt; &amp; stop" in text
+    assert "push the <block>" not in text
+    assert "concent fit &lt;demo.h5&gt;" in text
+
+
+def test_data_cannot_end_the_script_that_it_stands_in(case, tmp_path):
+    renamed = case.recording.scene.replace('name="table"', 'name="&lt;/script&gt;&lt;b&gt;"')
+    assert renamed != case.recording.scene
+    models = {"m</script>": Model(Scene(renamed))}
+    path = tmp_path / "r.html"
+    write_report(path, case.recording, models, compare(models, case.recording, "mujoco"))
+    assert "m</script>" not in path.read_text()
+    assert embedded(path)["models"][0]["name"] == "m</script>"
+
+
+def test_the_cards_show_the_errors_of_fitted_and_unseen_demonstrations(case, text):
+    c = case.comparison
+    channel, phases = c.main_channel(), c.contact_phases()
+    assert channel == "block_position"
+    for chosen in (("demo_0",), ("demo_1",)):
+        for model in ("before", "after"):
+            assert f">{shown(c.summarise(model, channel, phases, chosen).mean, 'm')}</span>" in text
+    assert "0.41" in text
+    assert "0.93" in text
+    assert shown(c.summarise("no contact", channel, phases).mean, "m") in text
+
+
+def test_lines_carry_the_errors_of_every_channel_and_model(case, data):
+    for d in data["demonstrations"]:
+        assert d["channels"][0]["name"] == "block_position"
+        assert {c["name"] for c in d["channels"]} == set(case.comparison.channels)
+        for channel in d["channels"]:
+            for model, packed in channel["errors"].items():
+                expected = case.comparison.residual(model, d["name"], channel["name"]).error
+                assert unpacked(packed) == pytest.approx(expected, abs=1e-6)
+
+
+def test_phases_cover_the_demonstration_without_gaps(data):
+    for d in data["demonstrations"]:
+        edges = [(p["start"], p["end"]) for p in d["phases"]]
+        assert edges[0][0] == 0
+        assert edges[-1][1] == pytest.approx(d["duration"], abs=1e-5)
+        assert all(a[1] == b[0] for a, b in pairwise(edges))
+
+
+def test_the_schedule_is_that_of_the_events(case, data):
+    for d in data["demonstrations"]:
+        sequence = case.events[d["name"]]
+        assert [s["name"] for s in d["schedule"]["stages"]] == [s.name for s in sequence.stages]
+        labels = [row["label"] for row in d["schedule"]["rows"]]
+        assert "block · stop" in labels
+        bars = d["schedule"]["rows"][labels.index("block · stop")]["bars"]
+        expected = [[c.start, c.end] for c in sequence.body_contacts if {c.a, c.b} == {"block", "stop"}]
+        assert bars == expected
+
+
+def test_the_replay_holds_simulated_and_measured_poses_at_the_same_times(case, data):
+    d = data["demonstrations"][0]
+    names = [body["name"] for body in data["bodies"]]
+    time = unpacked(d["motion"]["time"])
+    poses = unpacked(d["motion"]["poses"]["after"]).reshape(len(time), len(names), 7)
+    measured = unpacked(d["motion"]["measured"]["block"]).reshape(len(time), 7)
+    truth = case.recording["demo_0"].measured["block_position"]
+    expected = np.stack([np.interp(time, truth.time, truth.value[:, i]) for i in range(3)], axis=1)
+    assert measured[:, :3] == pytest.approx(expected, abs=1e-5)
+    assert np.abs(poses[:, names.index("block"), :3] - measured[:, :3]).max() < 0.01
+    assert poses[0, names.index("block"), :3] == pytest.approx([0, 0, 0.03], abs=1e-3)
+    assert "stop" not in d["motion"]["measured"]
+    assert d["motion"]["points"] == {}
+
+
+def test_tracked_points_stand_in_for_a_pose_that_was_not_measured(case, tmp_path):
+    from dataclasses import replace
+
+    d = case.recording["demo_0"]
+    blind = replace(case.recording, demonstrations=(replace(d, measured={"rail": d.measured["rail"]}),))
+    models = {"model": case.after}
+    path = tmp_path / "r.html"
+    write_report(path, blind, models, compare(models, blind, "mujoco"))
+    motion = embedded(path)["demonstrations"][0]["motion"]
+    assert motion["measured"] == {}
+    assert motion["points"]["block"]["count"] == 8
+
+
+def test_spheres_are_told_apart_by_what_became_of_them(case, data):
+    geometry = data["geometry"]
+    state = np.array(geometry["state"])
+    assert (state == "moved").sum() == case.moved
+    assert set(state) <= {"moved", "touched", "gripped", "other"}
+    assert (state == "gripped").any()
+    assert geometry["bodies"][0] == "block"
+    assert f"{case.moved} moved by 6.0 mm on average" in geometry["facts"]["block"]
+    shift = unpacked(geometry["before"]["position"]) - unpacked(geometry["after"]["position"])
+    assert (np.abs(shift.reshape(-1, 3)[:, 0]) > 1e-3).sum() == case.moved
+
+
+def test_a_comparison_of_one_model_without_events_makes_a_report_too(case, tmp_path):
+    models = {"model": Model(Scene(case.recording.scene))}
+    path = tmp_path / "plain.html"
+    write_report(path, case.recording, models, compare(models, case.recording, "mujoco"))
+    page = path.read_text()
+    assert 'id="schedule"' not in page
+    assert 'id="geometry-0"' not in page
+    assert "is off by" in page
+    assert [p.name for p in tmp_path.iterdir()] == ["plain.html"]
+
+
+def test_meshes_of_any_size_stay_small(tmp_path):
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    sphere.export(tmp_path / "ball.obj")
+    body = '<body name="b"><freejoint/><geom type="mesh" mesh="ball" mass="1"/></body>'
+    asset = '<asset><mesh name="ball" file="ball.obj"/></asset>'
+    (tmp_path / "s.xml").write_text(f"<mujoco>{asset}<worldbody>{body}</worldbody></mujoco>")
+    bodies, meshes = scene_bodies(Scene.from_mjcf(tmp_path / "s.xml").model)
+    assert bodies[0]["geoms"][0]["shape"] == "mesh"
+    mesh = meshes[bodies[0]["geoms"][0]["mesh"]]
+    vertices = unpacked(mesh["vertices"]).reshape(-1, 3)
+    assert len(unpacked(mesh["faces"])) // 3 < len(sphere.faces) / 2
+    assert np.linalg.norm(vertices, axis=1) == pytest.approx(0.1, rel=1e-3)
+
+
+def test_what_is_put_into_a_template_is_not_looked_at_again():
+    assert filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"
