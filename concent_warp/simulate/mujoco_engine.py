@@ -148,6 +148,7 @@ class MujocoEngine:
                 workshop = Workshop(self.model, self._collidable, self._memory)
             m = workshop.compile(variants, n)
             self._workshops.put(workshop)
+            m = copy.copy(m) if variants.fields else m
         elif variants.fields:
             m = copy.copy(self._compiled)
         else:
@@ -191,20 +192,30 @@ class Workshop:
             "sphere_radius": geometry.radius,
             "sphere_friction": geometry.friction,
         }
+        self._last: tuple[tuple[np.ndarray, ...], mujoco.MjModel] | None = None
         geoms = {geom.name: geom for geom in self._spec.geoms}
         self._geoms = [(i, geoms[name]) for i, name in enumerate(geometry.names()) if name in geoms]
 
     def compile(self, variants: Variants, n: int) -> mujoco.MjModel:
-        """Return the compiled model of variant n, spheres only; what does not vary goes back to the model's own."""
-        position, radius, friction = (
-            nominal if (value := getattr(variants, name)) is None else value[n]
+        """Return the compiled model of variant n, spheres only; what does not vary goes back to the model's own.
+
+        Compiling takes about as long as a short simulation, and a search runs each geometry on many segments in turn:
+        variants alike share a model, which is not to be edited.
+        """
+        values = tuple(
+            np.asarray(nominal if (value := getattr(variants, name)) is None else value[n])
             for name, nominal in self._nominal.items()
         )
+        if self._last is not None and all(map(np.array_equal, values, self._last[0])):
+            return self._last[1]
+        position, radius, friction = values
         for i, geom in self._geoms:
             geom.pos = position[i]
             geom.size[0] = radius[i]
             geom.friction[0] = friction[i]
-        return self._spec.compile()
+        compiled = self._spec.compile()
+        self._last = tuple(value.copy() for value in values), compiled
+        return compiled
 
 
 @dataclass
