@@ -54,7 +54,8 @@ def compare(
         models: One or more models by name, the baseline first.
         recording: What was commanded and measured.
         engine: Which engine simulates, see `make_engine`.
-        phases: Contact stages by demonstration, as a contact event sequence has them; the same for every model.
+        phases: Contact stages by demonstration, as a contact event sequence has them; the same for every model. Where
+            there is none in any demonstration, times are not told apart.
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
 
@@ -76,7 +77,8 @@ def compare(
             if rollout.diverged[0]:
                 bad = ~np.isfinite(rollout.qpos[0]).all(axis=1)
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
-    spans = {d.name: spans_of(d, phases[d.name]) for d in chosen if phases is not None and d.name in phases}
+    staged = phases or {}
+    spans = {d.name: spans_of(d, staged[d.name]) for d in chosen if d.name in staged and any(map(len, staged.values()))}
     return Comparison(tuple(models), tuple(d.name for d in chosen), found, spans, diverged, seed)
 
 

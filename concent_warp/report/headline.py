@@ -57,9 +57,9 @@ def cards(
         if ends:
             figure = arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
             found.append(Card("Overlap (IoU) of object contact with the truth; 1 is perfect", figure))
-    if events:
+    if any(sequence.stages for sequence in events.values()):
         counts = sorted({len(sequence.stages) for sequence in events.values()})
-        names = " · ".join(stage.name for stage in next(iter(events.values())).stages)
+        names = " · ".join(dict.fromkeys(stage.name for s in events.values() for stage in s.stages))
         figure = " or ".join(map(str, counts)) + " <small>stages</small>"
         found.append(Card("Contact stages found in the replay", figure, escape(names)))
     last = comparison.summarise(comparison.after, channel, phases)

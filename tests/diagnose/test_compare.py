@@ -184,3 +184,9 @@ def test_a_summary_can_be_of_some_demonstrations(comparison):
     assert one.count == len(TIME)
     assert one.mean == pytest.approx(comparison.errors("wrong", "rail")[1].mean())
     assert comparison.difference("rail", (), ("demo_1",)).mean < comparison.difference("rail", (), ("demo_0",)).mean < 0
+
+
+def test_without_any_stage_times_are_not_told_apart():
+    found = compare({"m": model(2)}, recorded(model(2)), "mujoco", phases={"demo_0": ()})
+    assert found.phase_names == ()
+    assert found.to_json()["headline"]["phases"] == []

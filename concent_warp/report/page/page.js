@@ -36,6 +36,7 @@ function drawSchedule() {
   if (!schedule) return;
   const d = state.demonstration, s = d.schedule;
   schedule.show({ x: [0, d.duration], rows: s?.rows || [], targets: s?.targets || [], phases: d.phases, left: leftMargin(), narrow: narrow() });
+  $("stages").closest(".scroll").hidden = !s?.stages.length;
   $("stages").innerHTML = (s?.stages || []).map((stage) => `<tr><th>${Chart.escape(stage.name)}</th><td>${stage.start.toFixed(2)} – ${stage.end.toFixed(2)}</td><td>${Chart.escape(stage.bodies.join(" · "))}</td><td>${Chart.escape(stage.links.join(", ") || "–")}</td><td class="number">${stage.primitives}</td><td class="number">${stage.pairs}</td></tr>`).join("");
 }
 
