@@ -1,0 +1,64 @@
+# ConCent-Warp: `make demo` shows it, `make test` checks it. Both set up .venv first, where it is not there yet.
+
+PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(shell command -v $(name))))
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+LAYOUT := build/layout/concent_warp
+BROWSERS := chromium chromium-browser google-chrome
+
+.PHONY: help demo test check format layout system clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    record, fit, events, compare, report: the whole of it on a simulated stand-in, in runs/demo"
+	@echo "make test    set up for development and run all checks"
+	@echo "make check   run all checks: format, lint, types, imports, tests"
+	@echo "make format  format the code"
+	@echo "make system  install Debian packages that some tests want (root only)"
+	@echo "make clean   remove .venv and what was built"
+
+demo: .venv/installed
+	$(BIN)/concent demo --out runs/demo --overwrite
+
+test: system .venv/installed-dev
+	@$(MAKE) --no-print-directory check
+
+# The checks run one after the other, so that the tests come last and their summary ends the output.
+check: .venv/installed-dev layout
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	cd $(dir $(LAYOUT)) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-cache
+	$(BIN)/python -m pytest
+
+format: .venv/installed-dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+# The top-level folders, linked together as they are installed: for tools that read files and import nothing.
+layout:
+	@rm -rf $(LAYOUT) && mkdir -p $(LAYOUT)
+	@ln -s $(addprefix $(CURDIR)/,$(filter-out %/__pycache__,$(wildcard concent_warp/*)) kernels train render) $(LAYOUT)
+
+system:
+	@if [ -n "$(foreach name,$(BROWSERS),$(shell command -v $(name)))" ]; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		{ timeout 60 apt-get update -qq && DEBIAN_FRONTEND=noninteractive timeout 120 \
+			apt-get install -qq --no-install-recommends chromium; } </dev/null >/dev/null 2>&1 \
+		|| echo "Chromium could not be installed: the tests that open a report in it are skipped."; \
+	else echo "There is no Chromium: the tests that open a report in it are skipped."; fi
+
+.venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "No Python found: install Python 3.11, or say make PYTHON=..."; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/installed: pyproject.toml | .venv/bin/python
+	$(PIP) install --editable .
+	@touch $@
+
+.venv/installed-dev: .venv/installed
+	$(PIP) install --editable ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf .venv build dist *.egg-info
