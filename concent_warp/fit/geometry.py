@@ -45,6 +45,9 @@ class FitCfg:
     demonstrations. Motion with impacts or tumbling asks for 0.1-0.3 s."""
     window_stride: float | None = None
     """Time from the start of one window to that of the next [s]; None takes the length."""
+    batch: int | None = None
+    """Segments that a generation tries its candidates on, drawn anew each time; None takes all. With hundreds of
+    windows a draw of 40-80 serves as well and costs less."""
     squared: bool = False
     """Squared form of the Chamfer distance."""
     reach: float = 0.006
@@ -161,9 +164,11 @@ class Search:
         self.robot = robot_bodies(model.scene.model)
         weld = np.array([model.scene.model.body(name).weldid[0] for name in model.geometry.bodies])
         self.movable = weld[model.geometry.body] != 0
+        self.held_out = [s for s in segments if s.held_out]
+        self.used = [s for s in segments if not s.held_out] or segments
         self.collidable = np.zeros(len(model.geometry), dtype=bool)
         self.frozen = np.zeros(len(model.geometry), dtype=bool)
-        self.objective: Objective | None = None
+        self.engine: Engine | None = None
         self.best, self.best_mean, self.best_generation = np.inf, self.evolution.mean.copy(), 0
         self.history: list[dict[str, Any]] = []
         self.simulations = 0
@@ -174,12 +179,15 @@ class Search:
         """Run one generation."""
         start = time.perf_counter()
         cfg, evolution = self.cfg, self.evolution
-        mask, reachable = self.survey()
-        objective = self.prepared(reachable | mask)
+        segments = self.draw()
+        mask, reachable = self.survey([*segments, *self.held_out])
+        engine = self.prepared(reachable | mask)
         values = evolution.ask(mask, self.rng)
-        losses = objective(evolution.candidates(np.concatenate([evolution.mean[None], values])))
+        losses = self.objective(engine, segments)(evolution.candidates(np.concatenate([evolution.mean[None], values])))
         loss, held_out = float(losses.fit[0]), float(losses.held_out[0])
-        self.simulations += (1 + len(losses.fit)) * len(self.segments)
+        if self.held_out:
+            held_out = float(self.objective(engine, self.held_out)(evolution.candidates(evolution.mean[None])).fit[0])
+        self.simulations += (1 + len(losses.fit)) * len(segments) + 2 * len(self.held_out)
         if held_out < self.best:
             self.best, self.best_mean, self.best_generation = held_out, evolution.mean.copy(), evolution.generation
         sigma = cfg.evolution.sigma * evolution.shrink
@@ -204,24 +212,28 @@ class Search:
         elif evolution.generation - self.best_generation > cfg.patience:
             self.stopped = f"no better estimate for {cfg.patience} generations"
 
-    def survey(self) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self) -> list[Segment]:
+        """Return the segments that the candidates of this generation are tried on."""
+        if self.cfg.batch is None or self.cfg.batch >= len(self.used):
+            return self.used
+        return [self.used[i] for i in np.sort(self.rng.choice(len(self.used), self.cfg.batch, replace=False))]
+
+    def survey(self, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
         """Replay the estimate with all spheres; return those that may move and those that may come into contact."""
         geometry = self.evolution.geometry(self.evolution.mean)
         current = self.model.with_geometry(geometry)
         engine = make_engine("mujoco", current)
-        n = len(self.segments)
-        steps = max(len(s.ctrl) for s in self.segments)
-        ctrl = np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in self.segments])
-        variants = Variants(
-            n, qpos=np.stack([s.qpos for s in self.segments]), qvel=np.stack([s.qvel for s in self.segments])
-        )
+        n = len(segments)
+        steps = max(len(s.ctrl) for s in segments)
+        ctrl = np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in segments])
+        variants = Variants(n, qpos=np.stack([s.qpos for s in segments]), qvel=np.stack([s.qvel for s in segments]))
         every = np.unique(np.linspace(0, steps, 1 + min(steps, round(steps * engine.timestep * 30))).astype(int))
         rollout = engine.run(variants, ctrl, record=every, bodies=(), contacts="touched")
         touched, gripped = touched_spheres(np.asarray(rollout.touched).any(axis=0), engine.sphere_geom, self.robot)
         simulated = [np.asarray(rollout.qpos[s]) for s in range(n)]
         observed = [
             observed_states(self.model.scene.model, segment, rollout.time, simulated[s])
-            for s, segment in enumerate(self.segments)
+            for s, segment in enumerate(segments)
         ]
         if self.cfg.evolution.freeze_gripped:
             # A replay that fails lets the object slip through the gripper; the real grasp is where it was observed.
@@ -231,19 +243,17 @@ class Search:
         reachable = spheres_near(current, np.concatenate(simulated + observed), self.cfg.reach).any(axis=1)
         return mask, reachable | touched | gripped
 
-    def prepared(self, needed: np.ndarray) -> Objective:
-        """Return the objective with at least the needed spheres collidable."""
-        if self.objective is None or (needed & ~self.collidable).any():
+    def prepared(self, needed: np.ndarray) -> Engine:
+        """Return an engine with at least the needed spheres collidable."""
+        if self.engine is None or (needed & ~self.collidable).any():
             self.collidable |= needed
-            engine: Engine = make_engine(self.engine_name, self.model, collidable=self.collidable)
-            self.objective = Objective(
-                engine,
-                self.segments,
-                held_out=self.cfg.held_out,
-                block=self.cfg.block,
-                squared=self.cfg.squared,
-            )
-        return self.objective
+            self.engine = make_engine(self.engine_name, self.model, collidable=self.collidable)
+        return self.engine
+
+    def objective(self, engine: Engine, segments: list[Segment]) -> Objective:
+        """Return the objective on some segments."""
+        cfg = self.cfg
+        return Objective(engine, segments, held_out=cfg.held_out, block=cfg.block, squared=cfg.squared)
 
     def progress(self) -> Progress:
         """Return where the fit stands."""

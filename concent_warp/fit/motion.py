@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.fit.target import BodyTarget, body_target, frame_channel, measured_pose
+from concent_warp.fit.target import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 
@@ -195,17 +195,9 @@ def body_motion(scene: Scene, demonstration: Demonstration, body: str, qpos: np.
 
 def tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, Rotation]:
     """Return times [s], positions [m] and rotations of a body's frame from its observed points (Kabsch)."""
-    times, positions, turns = [], [], []
-    for now, points in zip(target.time, target.points, strict=True):
-        seen = np.isfinite(points).all(axis=1)
-        if seen.sum() < 3:
-            continue
-        observed, anchor = points[seen], target.anchor[seen]
-        turn = Rotation.align_vectors(observed - observed.mean(axis=0), anchor - anchor.mean(axis=0))[0]
-        times.append(now)
-        positions.append(observed.mean(axis=0) - turn.apply(anchor.mean(axis=0)))
-        turns.append(turn.as_quat())
-    return np.array(times), np.array(positions).reshape(-1, 3), Rotation.from_quat(np.reshape(turns, (-1, 4)))
+    pose = observed_poses(target, np.arange(len(target.time)))
+    seen = np.isfinite(pose).all(axis=1)
+    return target.time[seen], pose[seen, :3], Rotation.from_quat(pose[seen, 3:], scalar_first=True)
 
 
 def velocity_sensors(

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.recording import Channel, Demonstration
+from concent_warp.recording.rigid import kabsch
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.replay import commands, initial_state, step_count
 
@@ -160,14 +161,28 @@ def observed_states(model: mujoco.MjModel, segment: Segment, time: np.ndarray, q
         if joint < 0 or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_FREE):
             continue
         address = model.jnt_qposadr[joint]
-        for row, now in enumerate(time):
-            frame = int(np.abs(target.time - now).argmin())
-            seen = np.isfinite(target.points[frame]).all(axis=1)
-            if seen.sum() >= 3:
-                observed, anchor = target.points[frame, seen], target.anchor[seen]
-                turn, _ = Rotation.align_vectors(observed - observed.mean(axis=0), anchor - anchor.mean(axis=0))
-                position = observed.mean(axis=0) - turn.apply(anchor.mean(axis=0))
-                result[row, address : address + 7] = [*position, *turn.as_quat(scalar_first=True)]
+        frame = np.abs(target.time[None] - time[:, None]).argmin(axis=1)
+        pose = observed_poses(target, frame)
+        seen = np.isfinite(pose).all(axis=1)
+        result[seen, address : address + 7] = pose[seen]
+    return result
+
+
+def observed_poses(target: BodyTarget, frames: np.ndarray) -> np.ndarray:
+    """Return position [m] and quaternion wxyz of a body in some frames (F,), from its points; NaN where fewer than 3.
+
+    Frames in which the same points were seen are solved at once.
+    """
+    result = np.full((len(frames), 7), np.nan)
+    seen = np.isfinite(target.points[frames]).all(axis=2)
+    patterns, which = np.unique(seen, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        rows = np.flatnonzero(which.ravel() == k)
+        if pattern.sum() >= 3:
+            observed = target.points[frames[rows]][:, pattern]
+            transform = kabsch(np.broadcast_to(target.anchor[pattern], observed.shape), observed)
+            result[rows, :3] = transform[:, :3, 3]
+            result[rows, 3:] = Rotation.from_matrix(transform[:, :3, :3]).as_quat(scalar_first=True)
     return result
 
 
