@@ -57,7 +57,7 @@ def run(arguments: Arguments) -> Grounded:
         say(f"recorded {len(names)} demonstrations")
         truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
         cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, names[: len(arguments.seeds)])
-        with fit_progress(f"concent demo --out {folder} --resume") as progress:
+        with fit_progress() as progress:
             found = ground(
                 recording, folder, cfg, truth=truth, settings=settings, resume=arguments.resume, progress=progress
             )

@@ -65,6 +65,9 @@ def run(command: str, arguments: Sequence[str]) -> int:
     try:
         import tyro
 
+        from concent_warp.cli.run_folder import INVOCATION
+
+        INVOCATION.set((command, *arguments))
         module = import_module(f"concent_warp.cli.{command}")
         settings = tyro.cli(
             module.Arguments,

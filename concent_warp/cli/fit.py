@@ -56,7 +56,7 @@ def run(arguments: Arguments) -> Grounded:
     cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, arguments.demonstrations)
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
         settings = write_settings(folder, arguments)
-        with fit_progress(f"concent fit {arguments.recording} --out {folder} --resume") as progress:
+        with fit_progress() as progress:
             found = ground(
                 recording, folder, cfg, start=start, settings=settings, resume=arguments.resume, progress=progress
             )

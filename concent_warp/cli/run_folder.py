@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,6 +21,8 @@ SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""
 CHECKPOINT = "checkpoint.npz"
 """File of the state of a fit."""
+INVOCATION: ContextVar[tuple[str, ...]] = ContextVar("INVOCATION", default=())
+"""The command that is running and its arguments."""
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
 
 
@@ -93,7 +96,13 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
 
 def command_line() -> str:
     """Return the command that is running, as one would type it."""
-    return shlex.join(["concent", *sys.argv[1:]])
+    return shlex.join(["concent", *INVOCATION.get()])
+
+
+def resuming_command() -> str:
+    """Return the command that goes on with the run that is running."""
+    kept = [argument for argument in INVOCATION.get() if argument not in ("--overwrite", "--resume")]
+    return shlex.join(["concent", *kept, "--resume"])
 
 
 def versions() -> dict[str, str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.markup import escape
 
+from concent_warp.cli.run_folder import resuming_command
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.comparison_table import mean_and_interval, percent, unit_shown
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def fit_progress(resume: str) -> Iterator[Callable[[Progress], None]]:
+def fit_progress() -> Iterator[Callable[[Progress], None]]:
     """Show the progress of a fit; an interruption says with which command to go on."""
     quiet_warp()
     try:
@@ -33,7 +34,7 @@ def fit_progress(resume: str) -> Iterator[Callable[[Progress], None]]:
 
             yield show
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"The state is saved; go on with: {resume}") from None
+        raise KeyboardInterrupt(f"The state is saved; go on with: {resuming_command()}") from None
 
 
 def say_grounded(found: Grounded, folder: Path) -> None:

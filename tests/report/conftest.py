@@ -91,7 +91,7 @@ class Case:
             {"generation": k + 1, **dict.fromkeys(keys, 0.005 / (k + 1)), "simulations": 8 * k, "seconds": 0.1 * k}
             for k in range(5)
         ]
-        self.fit = FitResult(self.after, self.before, history, shift.any(axis=1), "all 5 generations done")
+        self.fit = FitResult(self.after, self.before, history, np.asarray(shift.any(axis=1)), "all 5 generations done")
         write_report(
             path,
             self.recording,
