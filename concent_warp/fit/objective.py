@@ -67,6 +67,10 @@ class Objective:
 
     def __call__(self, candidates: Candidates) -> Losses:
         """Return the losses of P candidates."""
+        return self.losses(self.simulate(candidates), len(candidates.position))
+
+    def simulate(self, candidates: Candidates) -> Rollout:
+        """Return a rollout of P candidates on each of n segments; variant p * n + s is candidate p on segment s."""
         count, n = len(candidates.position), len(self.segments)
 
         def repeated(value: np.ndarray | None) -> np.ndarray | None:
@@ -81,9 +85,8 @@ class Objective:
             qvel=np.tile(np.stack([s.qvel for s in self.segments]), (count, 1)),
         )
         ctrl = self.ctrl[0] if n == 1 else np.tile(self.ctrl, (count, 1, 1))
-        rollout = self.engine.run(variants, ctrl, record=self.record, bodies=self.bodies)
         self.simulations += count * n
-        return self.losses(rollout, count)
+        return self.engine.run(variants, ctrl, record=self.record, bodies=self.bodies)
 
     def losses(self, rollout: Rollout, count: int) -> Losses:
         """Return the losses of `count` candidates from a rollout of candidates times segments."""
