@@ -30,7 +30,7 @@ class Checkpoint:
     random_state: dict[str, Any]
     """State of the random generator."""
     numbers: dict[str, float]
-    """Counters: generation, best, best_generation, simulations, seconds."""
+    """Counters: generation, best, best_generation, simulations, seconds, sigma."""
     history: list[dict[str, Any]]
     stopped: str | None
 

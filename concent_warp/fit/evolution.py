@@ -15,19 +15,22 @@ from concent_warp.scene.contact_geometry import ContactGeometry
 class EvolutionCfg:
     """Settings of the strategy."""
 
-    population: int = 32
+    population: int = 40
     """Candidates a generation."""
-    sigma: float = 1.5e-3
-    """Standard deviation of a sphere's displacement in the first generation [m]."""
+    sigma: float | None = None
+    """Standard deviation of a sphere's displacement in the first generation [m]. None takes a sixth of the starting
+    Chamfer distance (both directions together), at most `max_sigma`: far from the goal large steps, near it small."""
+    max_sigma: float = 3e-3
+    """Largest standard deviation that is chosen by itself [m]."""
     sigma_decay: float = 0.97
     """Factor on sigma from one generation to the next."""
-    length: float = 0.015
+    length: float = 0.03
     """Length scale of the RBF kernel [m]: how far a dent reaches."""
     noise: Noise = "gaussian_process"
     """Gaussian-process samples; "centroid" is the paper's wording taken literally; "independent" for comparison."""
     swelling: float = 1.0
     """Displacement along the outward normals, common to a region, relative to sigma; 0 for none."""
-    swelling_length: float = 0.05
+    swelling_length: float = 0.1
     """Length over which the swelling varies [m]."""
     antithetic: bool = True
     """Draw candidates in pairs of opposite displacement."""
@@ -52,11 +55,15 @@ class EvolutionCfg:
     friction_sigma: float = 0.1
     """Standard deviation of the logarithm of a friction coefficient."""
 
-    def scales(self) -> np.ndarray:
-        """Return the standard deviation of each channel in the first generation, shape (C,)."""
+    def scales(self, sigma: float) -> np.ndarray:
+        """Return the standard deviation of each channel in the first generation, shape (C,); `sigma` is in m."""
         radius = [self.radius_sigma] if self.fit_radius else []
         friction = [self.friction_sigma] if self.fit_friction else []
-        return np.array([self.sigma] * 3 + radius + friction)
+        return np.array([sigma] * 3 + radius + friction)
+
+
+SIGMA_SHARE = 1 / 6
+"""Of the Chamfer distance, for the standard deviation of the first displacements."""
 
 
 class Evolution:
@@ -68,8 +75,14 @@ class Evolution:
     def __init__(self, start: ContactGeometry, normals: np.ndarray, cfg: EvolutionCfg) -> None:
         """Start at the given geometry, whose spheres' outward unit vectors are `normals` (S, 3)."""
         self.start, self.normals, self.cfg = start, normals, cfg
-        self.mean = np.zeros((len(start), len(cfg.scales())))
+        self.sigma = cfg.max_sigma if cfg.sigma is None else cfg.sigma
+        self.mean = np.zeros((len(start), len(cfg.scales(self.sigma))))
         self.generation = 0
+
+    def scale_to(self, distance: float) -> None:
+        """Choose sigma by the Chamfer distance of the start [m], unless the settings give it."""
+        if self.cfg.sigma is None and np.isfinite(distance):
+            self.sigma = min(SIGMA_SHARE * distance, self.cfg.max_sigma)
 
     @property
     def shrink(self) -> float:
@@ -89,7 +102,7 @@ class Evolution:
             swelling_length=cfg.swelling_length,
         )
         pairs = (cfg.population + 1) // 2 if cfg.antithetic else cfg.population
-        noise = perturbation.draw(pairs, self.mean.shape[1], rng) * cfg.scales() * self.shrink
+        noise = perturbation.draw(pairs, self.mean.shape[1], rng) * cfg.scales(self.sigma) * self.shrink
         if cfg.antithetic:
             noise = np.stack([noise, -noise], axis=1).reshape(-1, *self.mean.shape)[: cfg.population]
         return self.bounded(self.mean + noise)

@@ -32,7 +32,7 @@ class FitCfg:
     """Settings of a fit."""
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
-    generations: int = 40
+    generations: int = 60
     """Generations at most."""
     patience: int = 15
     """Generations without a better estimate after which the fit ends."""
@@ -182,6 +182,9 @@ class Search:
         segments = self.draw()
         mask, reachable = self.survey([*segments, *self.held_out])
         engine = self.prepared(reachable | mask)
+        if evolution.generation == 0:
+            distance = float(self.objective(engine, segments)(evolution.candidates(evolution.mean[None])).fit[0])
+            evolution.scale_to(np.sqrt(distance) if cfg.squared else distance)
         values = evolution.ask(mask, self.rng)
         losses = self.objective(engine, segments)(evolution.candidates(np.concatenate([evolution.mean[None], values])))
         loss, held_out = float(losses.fit[0]), float(losses.held_out[0])
@@ -190,7 +193,7 @@ class Search:
         self.simulations += (1 + len(losses.fit)) * len(segments) + 2 * len(self.held_out)
         if held_out < self.best:
             self.best, self.best_mean, self.best_generation = held_out, evolution.mean.copy(), evolution.generation
-        sigma = cfg.evolution.sigma * evolution.shrink
+        sigma = evolution.sigma * evolution.shrink
         evolution.tell(values, losses.fit[1:], mask)
         self.seconds += time.perf_counter() - start
         self.history.append(
@@ -283,6 +286,7 @@ class Search:
                 "best_generation": self.best_generation,
                 "simulations": self.simulations,
                 "seconds": self.seconds,
+                "sigma": self.evolution.sigma,
             },
             history=self.history,
             stopped=self.stopped,
@@ -294,6 +298,7 @@ class Search:
         self.evolution.mean, self.best_mean = saved.mean, saved.best_mean
         self.collidable, self.frozen = saved.collidable, saved.frozen
         self.rng.bit_generator.state = saved.random_state
+        self.evolution.sigma = saved.numbers["sigma"]
         self.evolution.generation = int(saved.numbers["generation"])
         self.best, self.best_generation = saved.numbers["best"], int(saved.numbers["best_generation"])
         self.simulations, self.seconds = int(saved.numbers["simulations"]), saved.numbers["seconds"]
