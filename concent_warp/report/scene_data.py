@@ -29,7 +29,7 @@ MOST_FACES = 4000
 """A mesh with more faces is drawn as its convex hull, so that the page stays small."""
 PLANE_HALF_SIZE = 1.0
 """Half size at which an infinite plane is drawn [m]."""
-MOVED = 1e-5
+MOVED = 1e-4
 """A sphere is called moved when it ends farther than this from where it started [m]."""
 
 

@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import shutil
@@ -78,3 +79,42 @@ def test_the_page_fits_a_telephone(case, tmp_path):
     wrapper.write_text(f'<title>-</title><iframe src="report.html" style="width:390px;height:800px" {probe}></iframe>')
     dom, _ = browse(wrapper, tmp_path, "--dump-dom", "--allow-file-access-from-files")
     assert int(re.search(r"<title>(\d+)</title>", dom)[1]) <= 390
+
+
+USE = """<script>{
+const made = (type, init) => new (type.startsWith("pointer") ? PointerEvent : Event)(type, { bubbles: true, ...init });
+const fire = (node, type, init = {}) => node.dispatchEvent(made(type, init));
+const choose = (id, value) => { const node = document.getElementById(id); node.value = value; fire(node, "change"); };
+const tick = (id) => { const node = document.getElementById(id); node.checked = !node.checked; fire(node, "change"); };
+const canvas = document.getElementById("replay-0");
+HTMLElement.prototype.setPointerCapture = () => {};
+const azimuth = replayCamera.azimuth, distance = replayCamera.distance;
+fire(canvas, "pointerdown", { pointerId: 1, clientX: 100, clientY: 100, buttons: 1 });
+fire(canvas, "pointermove", { pointerId: 1, clientX: 160, clientY: 120, buttons: 1 });
+const turned = replayCamera.azimuth !== azimuth;
+fire(canvas, "pointerdown", { pointerId: 2, clientX: 260, clientY: 120 });
+fire(canvas, "pointermove", { pointerId: 2, clientX: 360, clientY: 120 });
+const zoomed = replayCamera.distance < distance;
+fire(canvas, "pointerup", { pointerId: 1 }); fire(canvas, "pointerup", { pointerId: 2 });
+choose("demonstration", "demo_1"); choose("channel", "rail"); choose("follow", ""); choose("body", "stop");
+["log", "ghost", "spheres", "arrows", "hull"].forEach(tick);
+const slider = document.getElementById("time"); slider.value = 0.3; fire(slider, "input");
+const [clock, title] = ["clock", "errors-title"].map((id) => document.getElementById(id).textContent);
+const chart = document.getElementById("errors"), left = chart.getBoundingClientRect().left;
+fire(chart, "pointermove", { clientX: left + 300 });
+const tip = !document.querySelector("#errors .tip").hidden;
+document.getElementById("play").click();
+const tell = () => JSON.stringify({ turned, zoomed, clock, title, tip, later: state.time > 0.3 });
+setTimeout(() => { document.title = tell(); }, 500);
+}</script>"""
+
+
+def test_controls_turn_zoom_choose_and_play(case, tmp_path):
+    page = tmp_path / "used.html"
+    page.write_text(case.path.read_text().replace("</body>", USE + "</body>"))
+    dom, messages = browse(page, tmp_path, "--window-size=1200,2600", "--dump-dom")
+    assert messages == []
+    found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
+    assert found.pop("clock").startswith("0.30 s")
+    assert found.pop("title") == "Error of rail [mm]"
+    assert found == {"turned": True, "zoomed": True, "tip": True, "later": True}

@@ -157,15 +157,17 @@ let geometryViews = [];
 function geometryItems(model) {
   const body = $("body").value, spheres = sphereRows(model, body), items = [], start = sphereRows(shown[0], body);
   const after = model === shown[shown.length - 1] && shown.length > 1;
+  const end = sphereRows(shown[shown.length - 1], body), place = (g, i) => Array.from(g.position.subarray(3 * i, 3 * i + 3));
+  const way = new Map(spheres.rows.map((i) => [i, Vec.length(Vec.minus(place(end, i), place(start, i)))])), farthest = Math.max(...way.values(), 1e-9);
   for (const i of spheres.rows) {
-    const at = Array.from(spheres.position.subarray(3 * i, 3 * i + 3)), kind = data.geometry.state[i];
-    items.push(ball(at, spheres.radius[i], [...COLOURS[kind], 1]));
+    const at = place(spheres, i), kind = data.geometry.state[i], share = kind === "moved" ? 0.2 + 0.8 * way.get(i) / farthest : 1;
+    items.push(ball(at, spheres.radius[i], [...COLOURS[kind].map((c, k) => share * c + (1 - share) * COLOURS.other[k]), 1]));
     if (!after || kind !== "moved" || !$("arrows").checked) continue;
-    const from = Array.from(start.position.subarray(3 * i, 3 * i + 3)), shift = Vec.minus(at, from), length = Vec.length(shift);
-    if (length < 2e-4) continue;
-    const q = alongZ(shift), u = Vec.unit(shift), r = spheres.radius[i] + 0.0002, tail = Vec.plus(at, u, r), reach = 3 * length;
-    items.push({ shape: "cylinder", position: Vec.plus(tail, u, reach / 2), quaternion: q, scale: [0.00035, 0.00035, reach / 2], colour: ARROW });
-    items.push({ shape: "cone", position: Vec.plus(tail, u, reach + 0.0008), quaternion: q, scale: [0.0009, 0.0009, 0.0012], colour: ARROW });
+    const shift = Vec.minus(at, place(start, i)), length = Vec.length(shift);
+    if (length < 3e-4) continue;
+    const q = alongZ(shift), u = Vec.unit(shift), reach = length;
+    items.push({ shape: "cylinder", position: Vec.plus(at, u, -reach / 2), quaternion: q, scale: [0.0003, 0.0003, reach / 2], colour: ARROW, above: true });
+    items.push({ shape: "cone", position: Vec.plus(at, u, -0.0006), quaternion: q, scale: [0.0007, 0.0007, 0.001], colour: ARROW, above: true });
   }
   const owner = data.bodies.find((b) => b.name === body);
   if (owner && $("hull").checked) for (const geom of owner.geoms) items.push(...geomItems(geom, [0, 0, 0], IDENTITY, [0.35, 0.45, 0.55, 0.22]));

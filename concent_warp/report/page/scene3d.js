@@ -138,7 +138,7 @@ class Camera {
   }
 }
 
-/** One canvas. `draw` gives what is seen: a list of {shape, position, quaternion, scale, colour: [r, g, b, a]}. */
+/** One canvas. `draw` gives what is seen: a list of {shape, position, quaternion, scale, colour: [r, g, b, a], above: whether nothing hides it}. */
 class View {
   constructor(canvas, camera, meshes, draw) {
     this.canvas = canvas; this.camera = camera; this.draw = draw; this.dirty = false; this.buffers = {};
@@ -172,10 +172,12 @@ class View {
     gl.uniformMatrix4fv(this.uniform.view, false, Mat.look(this.camera.eye(), this.camera.target));
     gl.uniformMatrix4fv(this.uniform.projection, false, Mat.perspective(0.6, width / height, far * 0.02, far * 60));
     const items = this.draw();
-    this.pass(items.filter((item) => item.colour[3] >= 1));
+    this.pass(items.filter((item) => item.colour[3] >= 1 && !item.above));
     gl.enable(gl.BLEND); gl.depthMask(false);
     this.pass(items.filter((item) => item.colour[3] < 1));
     gl.disable(gl.BLEND); gl.depthMask(true);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    this.pass(items.filter((item) => item.above));
   }
   pass(items) {
     const gl = this.gl, groups = new Map();
