@@ -1,0 +1,112 @@
+"""What the documentation shows can be done as it is written there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import tyro
+
+from concent_warp.cli.entry import COMMANDS
+from concent_warp.reality.record import RealityCfg, record
+from concent_warp.recording.hdf5 import write_hdf5
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+GIVEN = {
+    "events.md": """
+from pathlib import Path
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.select import make_engine
+recording = load_recording("demo.h5")
+scene = Scene(recording.scene)
+model = Model(scene, ContactGeometryCfg(count=96).build(scene))
+engine = make_engine("mujoco", model)
+"""
+}
+"""What a page takes as given."""
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """Return the blocks of some languages in a page."""
+    return [text for language, text in BLOCK.findall(page.read_text()) if language in languages]
+
+
+def commands() -> list[str]:
+    """Return every line of the pages that calls the command."""
+    lines = [line.strip() for page in PAGES for text in blocks(page, "console") for line in text.splitlines()]
+    lines += [code for page in PAGES for code in re.findall(r"`(concent [^`]+)`", page.read_text())]
+    return sorted({line for line in lines if line.startswith("concent ")})
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of the stand-in world."""
+    path = tmp_path_factory.mktemp("docs") / "demo.h5"
+    write_hdf5(record(RealityCfg(), [0])[0], path)
+    return path
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+def test_python_of_a_page_runs_from_top_to_bottom(page, recorded, tmp_path):
+    (tmp_path / "demo.h5").symlink_to(recorded)
+    (tmp_path / "page.py").write_text("\n".join([GIVEN.get(page.name, ""), *blocks(page, "python")]))
+    done = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("line", commands())
+def test_command_in_the_pages_is_understood(line):
+    _, command, *arguments = shlex.split(line, comments=True)
+    if command.startswith("--"):
+        assert command in ("--help", "--version")
+        return
+    assert command in COMMANDS
+    if arguments:
+        module = import_module(f"concent_warp.cli.{command}")
+        tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def test_readme_has_every_command():
+    text = (ROOT / "README.md").read_text()
+    assert all(f"`concent {command}`" in text for command in COMMANDS)
+
+
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs" / "benchmarks").glob("*.md"))], ids=lambda p: p.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_code_named_in_the_method_exists():
+    text = (ROOT / "docs" / "method.md").read_text()
+    rooms = [path.name for path in (ROOT / "concent_warp").iterdir() if path.is_dir()] + ["kernels"]
+    names = re.findall(rf"`((?:{'|'.join(rooms)})(?:\.\w+)+)`", text)
+    assert len(names) > 20
+    for name in names:
+        assert resolved(f"concent_warp.{name}"), name
+
+
+def resolved(name: str) -> object:
+    """Return the module, class, function or method of a dotted name."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found: object = import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            found = getattr(found, part)
+        return found
+    raise ModuleNotFoundError(name)
