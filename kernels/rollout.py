@@ -37,7 +37,7 @@ def command_kernel(
 
     Args:
         steps: K.
-        commands: Shape (1 or N, K, nu).
+        commands: Shape (n, K, nu); world i follows row i % n.
         clock: Shape (2,).
         ctrl: Shape (N, nu), written.
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
 
 Contacts = Literal["none", "touched", "all"]
-"""What a rollout keeps of the contacts: nothing, which geoms ever touched which bodies, or every contact of every step."""
+"""What a rollout keeps of the contacts: nothing, which geoms ever touched which bodies, or all of every step."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Rollout:
     body_quaternion: Any
     """Body orientations, wxyz, shape (N, R, B, 4)."""
     touched: Any
-    """Whether geom g was in contact with a geom of body b at any step, shape (N, ngeom, nbody) bool; None if not asked."""
+    """Whether geom g was ever in contact with a geom of body b, shape (N, ngeom, nbody) bool; None if not asked."""
     contacts: ContactLog | None
     """Every contact, if asked."""
     diverged: Any
@@ -133,7 +133,8 @@ class Engine(Protocol):
 
         Args:
             variants: N variants.
-            ctrl: Commands, shape (K, nu) for all variants alike or (N, K, nu); K is the number of steps.
+            ctrl: Commands, shape (K, nu) for all variants alike, or (n, K, nu) where n divides N: variant i follows
+                those of row i % n. K is the number of steps.
             record: Steps to record, each in 0..K, increasing; None records all, 0..K.
             bodies: Bodies whose poses are recorded; None records all.
             contacts: What to keep of the contacts, over the steps 0..K-1.

@@ -39,7 +39,7 @@ class Run:
     variants: Variants
     """Arrays have the right shapes and are finite."""
     ctrl: np.ndarray
-    """Commands, shape (K, nu) or (N, K, nu), float64."""
+    """Commands, shape (n, K, nu), float64; variant i follows row i % n."""
     steps: int
     """K."""
     record: np.ndarray
@@ -49,11 +49,6 @@ class Run:
     body_ids: np.ndarray
     """Their ids, shape (B,), int."""
     contacts: Contacts
-
-    @property
-    def shared_ctrl(self) -> bool:
-        """Whether all variants follow the same commands."""
-        return self.ctrl.ndim == 2
 
 
 def compile_model(model: Model, collidable: np.ndarray | None) -> tuple[mujoco.MjModel, np.ndarray]:
@@ -102,15 +97,17 @@ def check_run(
         raise EngineError("unknown `contacts`", expected=f"one of {list(get_args(Contacts))}", found=repr(contacts))
     check_variants(compiled, sphere_count, variants)
     values = np.asarray(host(ctrl), dtype=float)
-    if values.ndim not in (2, 3) or values.shape[-1] != compiled.nu or values.shape[:-2] not in ((), (variants.count,)):
+    found = values.shape
+    values = values[None] if values.ndim == 2 else values
+    if values.ndim != 3 or values.shape[2] != compiled.nu or not len(values) or variants.count % len(values):
         raise EngineError(
             "wrong shape of the commands",
-            expected=f"(steps, {compiled.nu}) or ({variants.count}, steps, {compiled.nu})",
-            found=values.shape,
+            expected=f"(steps, {compiled.nu}), or (n, steps, {compiled.nu}) where n divides {variants.count}",
+            found=found,
         )
     if not np.isfinite(values).all():
         raise EngineError("the commands hold values that are not finite", fix="fill or cut the gaps first")
-    steps = values.shape[-2]
+    steps = values.shape[1]
     return Run(variants, values, steps, check_record(record, steps), *check_bodies(compiled, bodies), contacts)
 
 

@@ -132,7 +132,7 @@ class MujocoEngine:
             d.qvel[:] = run.variants.qvel[n]
         result = VariantResult.empty(m, run)
         try:
-            result.diverged = not simulate(m, d, run, run.ctrl if run.shared_ctrl else run.ctrl[n], result)
+            result.diverged = not simulate(m, d, run, run.ctrl[n % len(run.ctrl)], result)
         except mujoco.FatalError as error:
             if "stack" in str(error) or "arena" in str(error):
                 return None

@@ -152,7 +152,7 @@ class WarpEngine:
         program = self._program(run, len(rows))
         spheres = {name: pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
         fields = {name: pick(value, rows) for name, value in run.variants.fields.items()}
-        ctrl = run.ctrl if run.shared_ctrl else run.ctrl[rows]
+        ctrl = run.ctrl[rows[: program.plan.commands] % len(run.ctrl)]
         qpos, qvel = pick(run.variants.qpos, rows), pick(run.variants.qvel, rows)
         program.load(spheres, fields, qpos, qvel, ctrl, run.record)
         demand = program.run()
@@ -181,7 +181,7 @@ class WarpEngine:
         plan = Plan(
             worlds=worlds,
             steps=run.steps,
-            shared_ctrl=run.shared_ctrl,
+            commands=min(len(run.ctrl), worlds),
             records=len(run.record),
             bodies=tuple(run.body_ids.tolist()),
             contacts=run.contacts,
@@ -297,7 +297,7 @@ def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
     for name in ("qpos", "qvel"):
         if (value := pick(getattr(run.variants, name), np.zeros(1, dtype=int))) is not None:
             getattr(d, name)[:] = value[0].detach().cpu().numpy() if hasattr(value, "detach") else value[0]
-    ctrl = run.ctrl if run.shared_ctrl else run.ctrl[0]
+    ctrl = run.ctrl[0]
     contacts = constraints = total = 0
     with quiet_warnings():
         for k in range(max(run.steps, 1)):

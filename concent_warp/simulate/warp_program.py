@@ -38,7 +38,8 @@ class Plan:
     """N."""
     steps: int
     """K."""
-    shared_ctrl: bool
+    commands: int
+    """n; world i follows row i % n of the commands."""
     records: int
     """R."""
     bodies: tuple[int, ...]
@@ -134,7 +135,7 @@ class Program:
         """Create the buffers of commands, records and contacts."""
         plan, m, d = self.plan, self.model, self.data
         n, r, b = plan.worlds, plan.records, len(plan.bodies)
-        self._commands = wp.zeros((1 if plan.shared_ctrl else n, max(plan.steps, 1), m.nu), dtype=float)
+        self._commands = wp.zeros((plan.commands, max(plan.steps, 1), m.nu), dtype=float)
         self._qpos, self._qvel = wp.clone(d.qpos), wp.zeros_like(d.qvel)
         self._clock = wp.zeros(2, dtype=int)
         self._peak = wp.zeros(kernels.PEAKS, dtype=int)
@@ -167,7 +168,7 @@ class Program:
             fields: The fields that the plan names, shape (N, ...).
             qpos: Shape (N, nq) or None for the model's own.
             qvel: Shape (N, nv) or None for zero.
-            ctrl: Shape (K, nu) or (N, K, nu).
+            ctrl: Shape (n, K, nu).
             record: Steps to record, shape (R,) int.
         """
         m, tensor = self.model, self._world_model.tensor

@@ -109,6 +109,13 @@ def test_each_variant_follows_its_own_commands(engine, ctrl):
     assert rollout.qpos[0, 0, 0] > rollout.qpos[1, 0, 0] + 0.01
 
 
+def test_commands_repeat_over_the_variants(engine, ctrl):
+    both = np.stack([ctrl, 0.5 * ctrl])
+    rollout = engine.run(Variants(4), both, record=[STEPS])
+    np.testing.assert_array_equal(rollout.qpos, engine.run(Variants(4), np.tile(both, (2, 1, 1)), record=[STEPS]).qpos)
+    np.testing.assert_array_equal(rollout.qpos[:2], rollout.qpos[2:])
+
+
 def test_contact_forces_carry_the_weight_of_a_resting_block(engine):
     rollout = engine.run(Variants(1), np.zeros((200, 1)), contacts="all")
     log, m = rollout.contacts, engine.compiled

@@ -113,6 +113,15 @@ def test_chunks_of_worlds_equal_one_batch(model, warp_engine, ctrl, variants):
         np.testing.assert_array_equal(value, getattr(whole.contacts, name))
 
 
+def test_commands_repeat_over_the_worlds_of_all_chunks(model, warp_engine, ctrl):
+    both, variants = np.stack([ctrl, 0.5 * ctrl]), Variants(6)
+    tiled = warp_engine.run(variants, np.tile(both, (3, 1, 1)), record=ROWS).numpy()
+    assert np.abs(tiled.qpos[0] - tiled.qpos[1]).max() > 0.01
+    for worlds in (1, 3, 6):
+        rollout = WarpEngine(model, device="cpu", max_worlds=worlds).run(variants, both, record=ROWS).numpy()
+        assert_same(rollout, tiled)
+
+
 def test_contacts_that_overflow_grow_to_the_same_result(model, warp_engine, ctrl, variants):
     warp_engine.run(variants, ctrl, record=ROWS)
     small = WarpEngine(model, device="cpu", nconmax=4, njmax=warp_engine.buffers.constraints)
