@@ -7,7 +7,7 @@ distances stay on the device; one number per candidate comes back.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,8 +41,35 @@ class Losses:
     """Over the frames kept from it, shape (P,); equal to `fit` where none is kept."""
 
 
+@dataclass(frozen=True)
+class Aim:
+    """One target of one segment as tensors on the device that computes the losses."""
+
+    segment: int
+    """Index of the segment."""
+    body: int
+    """Index of the body among those recorded."""
+    anchor: torch.Tensor
+    """The points in the body frame [m] and a 1, shape (M, 4)."""
+    lower: torch.Tensor
+    """Record before each frame, shape (T,) int."""
+    weight: torch.Tensor
+    """Share of the record after it, shape (T,)."""
+    observed: torch.Tensor
+    """Observed positions [m], zero where not seen, shape (T, M, 3) float32."""
+    seen: torch.Tensor
+    """Which points were seen, shape (T, M) bool."""
+    fit: torch.Tensor | None
+    """Frames that the fit may use, int; None where the segment is kept from it."""
+    held: torch.Tensor | None
+    """Frames kept from it, int; None where none of the segment's are."""
+
+
 class Objective:
-    """Evaluates candidate geometries on segments of recordings."""
+    """Evaluates candidate geometries on segments of recordings.
+
+    Nothing here waits for the device but the reading of the losses: targets are put there once.
+    """
 
     def __init__(
         self, engine: Engine, segments: list[Segment], *, held_out: float, block: float, squared: bool = False
@@ -64,6 +91,7 @@ class Objective:
         self.record, _, _ = bracketing(times, engine.timestep, steps)
         self.bodies = tuple(dict.fromkeys(t.body for s in segments for t in s.targets))
         self.simulations = 0
+        self._aims: dict[tuple[torch.device, torch.dtype], list[Aim]] = {}
 
     def __call__(self, candidates: Candidates) -> Losses:
         """Return the losses of P candidates."""
@@ -84,52 +112,80 @@ class Objective:
             qpos=np.tile(np.stack([s.qpos for s in self.segments]), (count, 1)),
             qvel=np.tile(np.stack([s.qvel for s in self.segments]), (count, 1)),
         )
-        ctrl = self.ctrl[0] if n == 1 else np.tile(self.ctrl, (count, 1, 1))
         self.simulations += count * n
-        return self.engine.run(variants, ctrl, record=self.record, bodies=self.bodies)
+        return self.engine.run(variants, self.ctrl, record=self.record, bodies=self.bodies)
 
     def losses(self, rollout: Rollout, count: int) -> Losses:
         """Return the losses of `count` candidates from a rollout of candidates times segments."""
         import torch
 
         n = len(self.segments)
+        position, quaternion = torch.as_tensor(rollout.body_position), torch.as_tensor(rollout.body_quaternion)
         fit, held = [], []
-        for s, segment in enumerate(self.segments):
-            for target in segment.targets:
-                distance, counted = self.distances(rollout, slice(s, None, n), target)
-                if segment.held_out is not None:
-                    (held if segment.held_out else fit).append(distance[:, counted].mean(dim=1))
-                    continue
-                out = torch.as_tensor(target.held_out(self.held_out, self.block), device=distance.device)
-                keep = counted & ~out
-                fit.append(distance[:, keep].mean(dim=1))
-                held.append(distance[:, counted & out].mean(dim=1) if bool((counted & out).any()) else fit[-1])
+        for aim in self.aims(position.device, position.dtype):
+            mine = slice(aim.segment, None, n), slice(None), aim.body
+            distance = self.distances(position[mine], quaternion[mine], aim)
+            for losses, frames in ((fit, aim.fit), (held, aim.held)):
+                if frames is not None:
+                    losses.append(distance[:, frames].mean(dim=1))
         fit, held = fit or held, held or fit
         diverged = torch.as_tensor(rollout.diverged).reshape(count, n).any(dim=1)
         both = torch.stack([torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)])
         both = torch.where(diverged | ~torch.isfinite(both), torch.inf, both).cpu().numpy().astype(float)
         return Losses(both[0], both[1])
 
-    def distances(self, rollout: Rollout, variants: slice, target: BodyTarget) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return Chamfer distances [m], shape (P, T), and which frames have points at all, shape (T,)."""
+    def distances(self, position: torch.Tensor, quaternion: torch.Tensor, aim: Aim) -> torch.Tensor:
+        """Return Chamfer distances [m], shape (P, T).
+
+        Args:
+            position: Recorded origins of the target's body [m], shape (P, R, 3).
+            quaternion: Its orientations, wxyz, shape (P, R, 4).
+            aim: The target.
+        """
         import torch
 
         from concent_warp.kernels.chamfer import chamfer
 
-        position, quaternion = torch.as_tensor(rollout.body_position), torch.as_tensor(rollout.body_quaternion)
-        body = rollout.bodies.index(target.body)
-        position, quaternion = position[variants, :, body], quaternion[variants, :, body]
-        steps = int(self.ctrl.shape[1])
-        lower, weight = self.rows(target.time, rollout.step, steps)
-        lower, weight = torch.as_tensor(lower, device=position.device), torch.as_tensor(weight).to(position)
-        anchor = torch.as_tensor(target.anchor).to(position)
-        cloud = carried(anchor, position, quaternion)
-        predicted = torch.lerp(cloud[:, lower], cloud[:, lower + 1], weight[None, :, None, None]).float()
-        observed = torch.as_tensor(target.points, dtype=torch.float32, device=predicted.device)
-        seen = torch.isfinite(observed).all(dim=2)
-        shared = seen.expand(len(predicted), *seen.shape).contiguous()
-        distance = chamfer(predicted, observed.nan_to_num(), shared, seen, squared=self.squared)
-        return distance, seen.any(dim=1)
+        # Points are linear in the pose, so that is interpolated and not the larger clouds.
+        pose = transforms(position, quaternion)
+        pose = torch.lerp(pose[:, aim.lower], pose[:, aim.lower + 1], aim.weight[None, :, None, None])
+        predicted = (aim.anchor @ pose).float()
+        return chamfer(predicted, aim.observed, aim.seen, aim.seen, squared=self.squared)
+
+    def aims(self, device: torch.device, dtype: torch.dtype) -> list[Aim]:
+        """Return the targets on a device, where they stay."""
+        key = device, dtype
+        if key not in self._aims:
+            self._aims[key] = [
+                self.aim(s, target, device, dtype) for s, each in enumerate(self.segments) for target in each.targets
+            ]
+        return self._aims[key]
+
+    def aim(self, segment: int, target: BodyTarget, device: torch.device, dtype: torch.dtype) -> Aim:
+        """Put a target on a device."""
+        import torch
+
+        lower, weight = self.rows(target.time, self.record, int(self.ctrl.shape[1]))
+        seen = np.all(np.isfinite(target.points), axis=2)
+        counted = np.any(seen, axis=1)
+        fit = held = np.flatnonzero(counted)
+        whole = self.segments[segment].held_out
+        if whole is None:
+            out = target.held_out(self.held_out, self.block)
+            fit, held = np.flatnonzero(counted & ~out), np.flatnonzero(counted & out)
+            held = held if len(held) else fit
+        kind: dict[str, Any] = {"dtype": dtype, "device": device}
+        return Aim(
+            segment=segment,
+            body=self.bodies.index(target.body),
+            anchor=torch.as_tensor(np.column_stack([target.anchor, np.ones(len(target.anchor))]), **kind),
+            lower=torch.as_tensor(lower, device=device),
+            weight=torch.as_tensor(weight, **kind),
+            observed=torch.as_tensor(np.where(seen[..., None], target.points, 0), dtype=torch.float32, device=device),
+            seen=torch.as_tensor(seen, device=device),
+            fit=None if whole else torch.as_tensor(fit, device=device),
+            held=None if whole is False else torch.as_tensor(held, device=device),
+        )
 
     def rows(self, time: np.ndarray, recorded: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the record row before each time, and the share of the next one."""
@@ -138,11 +194,19 @@ class Objective:
         return np.searchsorted(recorded, floor), np.clip(position - floor, 0.0, 1.0)
 
 
-def carried(anchor: torch.Tensor, position: torch.Tensor, quaternion: torch.Tensor) -> torch.Tensor:
-    """Return points carried by poses: anchor (M, 3), position (..., 3), quaternion wxyz (..., 4) -> (..., M, 3)."""
+def transforms(position: torch.Tensor, quaternion: torch.Tensor) -> torch.Tensor:
+    """Return what brings points (x, y, z, 1) of a body into the world, from the right, shape (..., 4, 3).
+
+    Args:
+        position: Origin of the body [m], shape (..., 3).
+        quaternion: Its orientation, wxyz, shape (..., 4).
+    """
     import torch
 
-    w, axis = quaternion[..., None, :1], quaternion[..., None, 1:].expand(*quaternion.shape[:-1], len(anchor), 3)
-    points = anchor.expand_as(axis)
-    turn = 2 * torch.linalg.cross(axis, points)
-    return position[..., None, :] + points + w * turn + torch.linalg.cross(axis, turn)
+    w, x, y, z = quaternion.unbind(-1)
+    axes = (
+        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
+        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+        2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.cat([torch.stack(axes, dim=-1), position], dim=-1).unflatten(-1, (4, 3))
