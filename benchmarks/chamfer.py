@@ -29,7 +29,7 @@ import torch
 import warp as wp
 from concent_warp.kernels.chamfer import ChamferPlan, chamfer
 from concent_warp.kernels.chamfer_cuda import Tiling
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 PAGE = Path(__file__).parents[1] / "docs/benchmarks/chamfer.md"
 TILINGS = [
@@ -275,10 +275,10 @@ def precision(device: str) -> list[Row]:
 
 def by_trees(a: np.ndarray, b: np.ndarray, distances: np.ndarray, _call: int) -> None:
     """Chamfer distances (worlds, frames) of a (worlds, frames, n, 3) and b (frames, m, 3) by k-d trees."""
-    trees = [cKDTree(frame) for frame in b]
+    trees = [KDTree(frame) for frame in b]
     for world, frame in np.ndindex(*distances.shape):
         x, y = a[world, frame], b[frame]
-        distances[world, frame] = trees[frame].query(x)[0].mean() + cKDTree(x).query(y)[0].mean()
+        distances[world, frame] = trees[int(frame)].query(x)[0].mean() + KDTree(x).query(y)[0].mean()
 
 
 def against_kd_tree(repeats: int) -> list[Row]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import h5py
+import h5py.h5l as h5l
+import h5py.h5z as h5z
 import numpy as np
-from h5py import h5l, h5z
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.bounds import (

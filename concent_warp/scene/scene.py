@@ -103,6 +103,7 @@ def inline_mesh(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> None:
     if not path.is_file():
         raise SceneError("the scene's mesh file is missing", where=path)
     loaded = trimesh.load(path, force="mesh")
+    assert isinstance(loaded, trimesh.Trimesh)
     mesh.uservert = loaded.vertices.astype(float).ravel()
     mesh.userface = loaded.faces.astype(int).ravel()
     mesh.file = ""

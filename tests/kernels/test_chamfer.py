@@ -7,7 +7,7 @@ import warp as wp
 from concent_warp.kernels import chamfer_cpu, chamfer_cuda, chamfer_cuda_gradient, chamfer_gradient
 from concent_warp.kernels.chamfer import ChamferPlan, chamfer, chamfer_parts
 from concent_warp.kernels.chamfer_pairs import batch_of
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 
 def points(rng, *shape):
@@ -26,8 +26,8 @@ def reference_parts(a, b, a_valid=None, b_valid=None, squared=False):
     if not len(present[0]) or not len(present[1]):
         return 0.0, 0.0
     power = 2 if squared else 1
-    ab = (cKDTree(present[1]).query(present[0])[0] ** power).mean()
-    ba = (cKDTree(present[0]).query(present[1])[0] ** power).mean()
+    ab = (KDTree(present[1]).query(present[0])[0] ** power).mean()
+    ba = (KDTree(present[0]).query(present[1])[0] ** power).mean()
     return ab, ba
 
 

@@ -24,4 +24,4 @@ def test_auto_is_warp_where_there_is_a_cuda_device(model, monkeypatch):
 
 def test_unknown_engine_is_named(model):
     with pytest.raises(EngineError, match="'bullet'"):
-        make_engine("bullet", model)
+        make_engine("bullet", model)  # pyright: ignore[reportArgumentType]
