@@ -289,7 +289,7 @@ def one_pass_kernel(tiling: Tiling) -> Any:
         a_count: wp.array[int],
         b_count: wp.array[int],
     ):
-        problem, _thread = wp.tid()  # pyright: ignore
+        problem, _thread = wp.tid()
         both_directions(
             problem, a, b, a_valid, b_valid, a_batch, b_batch, a_valid_batch, b_valid_batch,
             n, m, squared, a_to_b, b_to_a, a_count, b_count,

@@ -177,7 +177,7 @@ def nearest_kernel() -> Any:
         m: int,
         nearest: wp.array2d[int],
     ):
-        problem, chunk, _thread = wp.tid()  # pyright: ignore
+        problem, chunk, _thread = wp.tid()
         search(
             problem, chunk, query, reference, query_valid, reference_valid,
             query_batch, reference_batch, query_valid_batch, reference_valid_batch, n, m, nearest,
@@ -225,8 +225,8 @@ def gradient_kernel() -> Any:
         squared: bool,
         gradient: wp.array2d[wp.vec3],
     ):
-        problem, chunk, _thread = wp.tid()  # pyright: ignore
-        n, m = own_nearest.shape[1], other_nearest.shape[1]  # pyright: ignore
+        problem, chunk, _thread = wp.tid()
+        n, m = own_nearest.shape[1], other_nearest.shape[1]
         gather(
             problem, chunk, n, m, own, other, own_batch, other_batch,
             own_nearest, other_nearest, own_count, other_count, own_upstream, other_upstream, squared, gradient,

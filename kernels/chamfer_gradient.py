@@ -8,10 +8,6 @@ and likewise for b_to_a with e_j; squared, |d|^2 stands for |d| and 2 d for d / 
 is taken as zero (a subgradient). An index of -1 marks a missing point, -2 one that has no partner.
 """
 
-# What Warp compiles only looks like Python, so its types tell pyright little.
-# pyright: basic, reportArgumentType=false, reportAssignmentType=false, reportAttributeAccessIssue=false
-# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-
 from __future__ import annotations
 
 import warp as wp

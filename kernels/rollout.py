@@ -7,8 +7,6 @@ no kernel reads a counter that another of its threads writes.
 Quaternions are wxyz, held in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
 """
 
-# pyright: reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
-# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOperatorIssue=false, reportCallIssue=false
 from __future__ import annotations
 
 import warp as wp
