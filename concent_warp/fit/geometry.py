@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from concent_warp.errors import ModelError, RecordingError
@@ -20,11 +21,14 @@ from concent_warp.fit.target import Segment, observed_states, whole
 from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
-from concent_warp.simulate.engine import Engine, Variants
+from concent_warp.simulate.engine import Engine
+from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.select import make_engine
 
 GRIP = 5e-4
 """A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
+TURN = np.radians(1.0) / 1e-3
+"""Turn of a jittered body relative to its displacement [rad/m]."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,9 @@ class FitCfg:
     batch: int | None = None
     """Segments that a generation tries its candidates on, drawn anew each time; None takes all. With hundreds of
     windows a draw of 40-80 serves as well and costs less."""
+    jitter: float = 7e-4
+    """Spread [m] of horizontal displacements of the free bodies at the start, drawn anew for each generation, with
+    turns of 1 degree a millimetre. All candidates share them; they keep the fit from what works on one path only."""
     squared: bool = False
     """Squared form of the Chamfer distance."""
     reach: float = 0.006
@@ -168,6 +175,7 @@ class Search:
         self.used = [s for s in segments if not s.held_out] or segments
         self.collidable = np.zeros(len(model.geometry), dtype=bool)
         self.frozen = np.zeros(len(model.geometry), dtype=bool)
+        self.full = MujocoEngine(model)
         self.engine: Engine | None = None
         self.best, self.best_mean, self.best_generation = np.inf, self.evolution.mean.copy(), 0
         self.history: list[dict[str, Any]] = []
@@ -180,21 +188,17 @@ class Search:
         start = time.perf_counter()
         cfg, evolution = self.cfg, self.evolution
         segments = self.draw()
-        mask, reachable = self.survey([*segments, *self.held_out])
-        engine = self.prepared(reachable | mask)
+        mask, reachable, loss, held_out = self.survey([*segments, *self.held_out])
         if evolution.generation == 0:
-            distance = float(self.objective(engine, segments)(evolution.candidates(evolution.mean[None])).fit[0])
-            evolution.scale_to(np.sqrt(distance) if cfg.squared else distance)
-        values = evolution.ask(mask, self.rng)
-        losses = self.objective(engine, segments)(evolution.candidates(np.concatenate([evolution.mean[None], values])))
-        loss, held_out = float(losses.fit[0]), float(losses.held_out[0])
-        if self.held_out:
-            held_out = float(self.objective(engine, self.held_out)(evolution.candidates(evolution.mean[None])).fit[0])
-        self.simulations += (1 + len(losses.fit)) * len(segments) + 2 * len(self.held_out)
+            evolution.scale_to(np.sqrt(loss) if cfg.squared else loss)
         if held_out < self.best:
             self.best, self.best_mean, self.best_generation = held_out, evolution.mean.copy(), evolution.generation
+        values = evolution.ask(mask, self.rng)
+        objective = self.objective(self.prepared(reachable | mask), self.jittered(segments))
+        losses = objective(evolution.candidates(values))
+        self.simulations += (1 + len(values)) * len(segments) + len(self.held_out)
         sigma = evolution.sigma * evolution.shrink
-        evolution.tell(values, losses.fit[1:], mask)
+        evolution.tell(values, losses.fit, mask)
         self.seconds += time.perf_counter() - start
         self.history.append(
             {
@@ -202,7 +206,7 @@ class Search:
                 "loss": loss,
                 "held_out": held_out,
                 "best": self.best,
-                "candidates": float(np.median(losses.fit[1:])),
+                "candidates": float(np.median(losses.fit)),
                 "sigma": sigma,
                 "moving": int(mask.sum()),
                 "collidable": int(self.collidable.sum()),
@@ -221,30 +225,60 @@ class Search:
             return self.used
         return [self.used[i] for i in np.sort(self.rng.choice(len(self.used), self.cfg.batch, replace=False))]
 
-    def survey(self, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
-        """Replay the estimate with all spheres; return those that may move and those that may come into contact."""
-        geometry = self.evolution.geometry(self.evolution.mean)
+    def jittered(self, segments: list[Segment]) -> list[Segment]:
+        """Return segments whose free bodies start a little elsewhere."""
+        if self.cfg.jitter <= 0:
+            return segments
+        m = self.model.scene.model
+        free = np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+        result = []
+        for segment in segments:
+            qpos = segment.qpos.copy()
+            for address in m.jnt_qposadr[free]:
+                qpos[address : address + 2] += self.rng.normal(0, self.cfg.jitter, 2)
+                turn = self.rng.normal(0, self.cfg.jitter) * TURN / 2
+                orientation = np.zeros(4)
+                mujoco.mju_mulQuat(
+                    orientation, np.array([np.cos(turn), 0, 0, np.sin(turn)]), qpos[address + 3 : address + 7]
+                )
+                qpos[address + 3 : address + 7] = orientation
+            result.append(replace(segment, qpos=qpos))
+        return result
+
+    def survey(self, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Replay the estimate with all spheres.
+
+        Args:
+            segments: Segments of this generation, then those held out.
+
+        Returns:
+            Spheres that may move and spheres that may come into contact, each (S,) bool; the estimate's Chamfer
+            distance over what the fit may use, and over what it is kept from [m].
+        """
+        values = self.evolution.mean[None]
+        geometry = self.evolution.geometry(values[0])
+        objective = self.objective(self.full, segments)
+        rollout = objective.simulate(self.evolution.candidates(values), contacts="touched").numpy()
+        losses = objective.losses(rollout, 1)
+        loss, held_out = float(losses.fit[0]), float(losses.held_out[0])
+        touched, gripped = touched_spheres(rollout.touched.any(axis=0), self.full.sphere_geom, self.robot)
+        every = slice(None, None, 2)
+        simulated = rollout.qpos[:, every]
+        observed = np.stack(
+            [
+                observed_states(self.model.scene.model, segment, rollout.time[every], states)
+                for segment, states in zip(segments, simulated, strict=True)
+            ]
+        )
         current = self.model.with_geometry(geometry)
-        engine = make_engine("mujoco", current)
-        n = len(segments)
-        steps = max(len(s.ctrl) for s in segments)
-        ctrl = np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in segments])
-        variants = Variants(n, qpos=np.stack([s.qpos for s in segments]), qvel=np.stack([s.qvel for s in segments]))
-        every = np.unique(np.linspace(0, steps, 1 + min(steps, round(steps * engine.timestep * 30))).astype(int))
-        rollout = engine.run(variants, ctrl, record=every, bodies=(), contacts="touched")
-        touched, gripped = touched_spheres(np.asarray(rollout.touched).any(axis=0), engine.sphere_geom, self.robot)
-        simulated = [np.asarray(rollout.qpos[s]) for s in range(n)]
-        observed = [
-            observed_states(self.model.scene.model, segment, rollout.time, simulated[s])
-            for s, segment in enumerate(segments)
-        ]
+        states = np.concatenate([simulated, observed]).reshape(-1, simulated.shape[-1])
         if self.cfg.evolution.freeze_gripped:
             # A replay that fails lets the object slip through the gripper; the real grasp is where it was observed.
-            near = spheres_near(current, np.concatenate(observed), GRIP)[:, self.robot].any(axis=1)
-            self.frozen |= near & self.movable
+            seen = observed.reshape(-1, observed.shape[-1])
+            self.frozen |= spheres_near(current, seen, GRIP)[:, self.robot].any(axis=1) & self.movable
         mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
-        reachable = spheres_near(current, np.concatenate(simulated + observed), self.cfg.reach).any(axis=1)
-        return mask, reachable | touched | gripped
+        reachable = spheres_near(current, states, self.cfg.reach).any(axis=1)
+        return mask, reachable | touched | gripped, loss, held_out
 
     def prepared(self, needed: np.ndarray) -> Engine:
         """Return an engine with at least the needed spheres collidable."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from concent_warp.fit.target import BodyTarget, Segment
-from concent_warp.simulate.engine import Engine, Rollout, Variants
+from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
 from concent_warp.simulate.replay import bracketing
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class Objective:
         """Return the losses of P candidates."""
         return self.losses(self.simulate(candidates), len(candidates.position))
 
-    def simulate(self, candidates: Candidates) -> Rollout:
+    def simulate(self, candidates: Candidates, contacts: Contacts = "none") -> Rollout:
         """Return a rollout of P candidates on each of n segments; variant p * n + s is candidate p on segment s."""
         count, n = len(candidates.position), len(self.segments)
 
@@ -113,7 +113,7 @@ class Objective:
             qvel=np.tile(np.stack([s.qvel for s in self.segments]), (count, 1)),
         )
         self.simulations += count * n
-        return self.engine.run(variants, self.ctrl, record=self.record, bodies=self.bodies)
+        return self.engine.run(variants, self.ctrl, record=self.record, bodies=self.bodies, contacts=contacts)
 
     def losses(self, rollout: Rollout, count: int) -> Losses:
         """Return the losses of `count` candidates from a rollout of candidates times segments."""
