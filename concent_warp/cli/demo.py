@@ -27,9 +27,9 @@ class Arguments:
 
     out: Path = Path("runs/demo")
     """Run folder."""
-    seeds: tuple[int, ...] = (0, 1)
+    seeds: tuple[int, ...] = (0,)
     """Demonstrations to fit, by the seed that draws them."""
-    unseen_seeds: tuple[int, ...] = (2,)
+    unseen_seeds: tuple[int, ...] = (1, 2)
     """Further demonstrations, which the fit never sees, to judge it by."""
     engine: EngineName = "auto"
     """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
