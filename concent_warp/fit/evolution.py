@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -32,6 +33,9 @@ class EvolutionCfg:
     """Displacement along the outward normals, common to a region, relative to sigma; 0 for none."""
     swelling_length: float = 0.1
     """Length over which the swelling varies [m]."""
+    swelling_along: Literal["normals", "faces"] = "normals"
+    """Swell along outward unit vectors averaged over neighbours, or so that all faces of a body move by the same
+    distance, which keeps edges sharp and faces flat where the size is wrong."""
     antithetic: bool = True
     """Draw candidates in pairs of opposite displacement."""
     elite_share: float = 0.25

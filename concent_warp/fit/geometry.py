@@ -16,6 +16,7 @@ from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
+from concent_warp.fit.offset import offset_directions
 from concent_warp.fit.perturbation import outward
 from concent_warp.fit.target import Segment, observed_states, whole
 from concent_warp.fit.windows import hold_out, windows
@@ -165,7 +166,10 @@ class Search:
         """Prepare the first generation."""
         assert model.geometry is not None
         self.model, self.segments, self.cfg, self.engine_name = model, segments, cfg, engine
-        normals = outward(model.geometry, model.scene, cfg.evolution.length / 2)
+        if cfg.evolution.swelling_along == "faces":
+            normals = offset_directions(model.geometry, model.scene)
+        else:
+            normals = outward(model.geometry, model.scene, cfg.evolution.length / 2)
         self.evolution = Evolution(model.geometry, normals, cfg.evolution)
         self.rng = np.random.default_rng(cfg.seed)
         self.robot = robot_bodies(model.scene.model)

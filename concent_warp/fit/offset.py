@@ -1,0 +1,42 @@
+"""The direction in which each sphere moves when its body grows evenly: the offset of every face by the same distance.
+
+Moving spheres along averaged unit normals rounds a body off as it grows and hollows its faces as it shrinks: at an edge
+of a box the average is diagonal, and a unit step along it moves each of the two faces by less than one. Growth by a
+distance d needs a displacement x with n . x = d for the normal n of every face that the sphere makes up, which at a
+corner of a box is d (1, 1, 1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.surface import Surface
+
+PROBES = 40_000
+"""Surface points looked at to find the faces that a sphere belongs to."""
+SLACK = 1e-3
+"""A sphere makes up the faces no farther from its centre than the nearest one plus this [m]."""
+RIDGE = 1e-3
+"""Regularisation of the least squares, relative to one: directions in which no face looks do not move."""
+
+
+def offset_directions(geometry: ContactGeometry, scene: Scene) -> np.ndarray:
+    """Return the displacement of each sphere for a unit of growth of its body, shape (S, 3).
+
+    It is the shortest x that satisfies ``n . x = 1`` in the least-squares sense for the normals n near the sphere: the
+    normal itself on a face or a smooth surface, longer at edges and corners.
+    """
+    result = np.zeros((len(geometry), 3))
+    for body in geometry.bodies:
+        rows = geometry.of(body)
+        points, normals = Surface.of_body(scene, body).sample(PROBES, np.random.default_rng(0))
+        tree = KDTree(points)
+        nearest, _ = tree.query(geometry.position[rows])
+        for row, distance in zip(rows, np.atleast_1d(nearest), strict=True):
+            near = normals[tree.query_ball_point(geometry.position[row], float(distance) + SLACK)]
+            gram = near.T @ near / len(near) + RIDGE * np.eye(3)
+            result[row] = np.linalg.solve(gram, near.mean(axis=0))
+    return result
