@@ -22,6 +22,8 @@ SPAN = 0.02
 """Samples within this time before and after count in a local fit [s]."""
 FEWEST = 2
 """Samples before and after that count in a local fit even where they lie farther apart than that."""
+ONE_SIDED = 0.5
+"""Samples on one side of a time alone are taken where the standard error of the rate falls below this share."""
 PROBES = 40
 """Times at which the precision of a signal is estimated."""
 
@@ -71,8 +73,11 @@ class Samples:
 
     def at(self, time: float) -> Estimate:
         """Return the estimate at a time [s]."""
-        rows = around(self.time, time, self.degree)
-        return local_fit(self.time[rows] - time, self.value[rows], self.degree)
+        fits = [
+            local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
+            for rows in neighbourhoods(self.time, time, self.degree)
+        ]
+        return smoothest(fits)
 
 
 @dataclass(frozen=True)
@@ -85,10 +90,12 @@ class Turns:
 
     def at(self, time: float) -> Estimate:
         """Return the estimate at a time [s]; the rate is the angular velocity in the body frame [rad/s]."""
-        rows = around(self.time, time, 2)
-        near = self.value[int(rows[0]) : int(rows[-1]) + 1]
-        vectors = (self.nearest(time).inv() * near).as_rotvec()
-        return local_fit(self.time[rows] - time, vectors, 2)
+        middle = self.nearest(time).inv()
+        fits = [
+            local_fit(self.time[rows] - time, (middle * self.value[rows.start : rows.stop]).as_rotvec(), 2)
+            for rows in neighbourhoods(self.time, time, 2)
+        ]
+        return smoothest(fits)
 
     def nearest(self, time: float) -> Rotation:
         """Return the sample nearest to a time."""
@@ -121,16 +128,30 @@ class BodyMotion:
         return np.concatenate([place.value, quaternion]), np.concatenate([linear, angular])
 
 
-def around(time: np.ndarray, now: float, degree: int) -> np.ndarray:
-    """Return the rows of the samples near a time, shape (k,), with k more than `degree` where there are so many."""
+def neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
+    """Return the samples about a time, and as many of those after it and before it alone, where there are enough."""
     nearest = int(np.abs(time - now).argmin())
     low = min(int(np.searchsorted(time, now - SPAN)), nearest - FEWEST)
     high = max(int(np.searchsorted(time, now + SPAN, side="right")), nearest + FEWEST + 1)
-    if low < 0:
-        high = max(high, degree + 2)
-    if high > len(time):
-        low = min(low, len(time) - degree - 2)
-    return np.arange(max(low, 0), min(high, len(time)))
+    count = max(high - low, degree + 2)
+    centred = slice(max(low, 0), min(high, len(time)))
+    sides = [slice(nearest, nearest + count), slice(nearest + 1 - count, nearest + 1)]
+    sides = [side for side in sides if side.start >= 0 and side.stop <= len(time)]
+    return [centred, *sides] if centred.stop - centred.start >= min(degree + 2, len(time)) else sides or [centred]
+
+
+def smoothest(fits: list[Estimate]) -> Estimate:
+    """Return the first fit, or one of the others whose rate has less than half its standard error.
+
+    The samples on both sides of a time say the most, unless an impact lies among them.
+    """
+    best = min(fits, key=rate_error)
+    return best if best.rate_error < ONE_SIDED * fits[0].rate_error else fits[0]
+
+
+def rate_error(estimate: Estimate) -> float:
+    """Return the standard error of the rate."""
+    return estimate.rate_error
 
 
 def local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
