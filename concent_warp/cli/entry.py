@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -19,7 +20,7 @@ COMMANDS = {
     "compare": "compare a model, or two, with a recording",
 }
 """Names of the commands, each a module of this package, with what they do."""
-ERROR, INTERRUPTED = 2, 130
+ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 
 
 def usage() -> str:
@@ -78,6 +79,13 @@ def run(command: str, arguments: Sequence[str]) -> int:
         module.run(settings)
     except ConcentError as error:
         print(f"concent {command}: {error}", file=sys.stderr)
+        return ERROR
+    except BrokenPipeError:  # whoever read the output has closed it, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return CLOSED
+    except OSError as error:
+        place = "" if error.filename is None else f"{error.filename}: "
+        print(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt as interrupt:
         print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)

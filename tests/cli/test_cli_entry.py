@@ -88,3 +88,17 @@ def test_errors_of_the_library_are_one_line(bench, capsys):
     assert len(lines) == 1
     assert lines[0].startswith("concent compare: nowhere.h5: ")
     assert lines[0].endswith(".")
+
+
+def test_a_reader_that_closes_the_pipe_causes_no_traceback():
+    script = f"{sys.executable} -m concent_warp fit --help | head -n 1"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("usage")
+    assert done.stderr == ""
+
+
+def test_a_place_that_cannot_be_written_is_said_in_one_sentence(bench, capsys):
+    assert main(["geometry", str(bench / "demo.h5"), "--out", "/proc/nowhere/model.toml"]) == 2
+    error = capsys.readouterr().err
+    assert "/proc/nowhere" in error
+    assert error.count("\n") == 1
