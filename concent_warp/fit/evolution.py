@@ -23,7 +23,7 @@ class EvolutionCfg:
     Chamfer distance (both directions together), at most `max_sigma`: far from the goal large steps, near it small."""
     max_sigma: float = 3e-3
     """Largest standard deviation that is chosen by itself [m]."""
-    sigma_decay: float = 0.97
+    sigma_decay: float = 0.98
     """Factor on sigma from one generation to the next."""
     length: float = 0.03
     """Length scale of the RBF kernel [m]: how far a dent reaches."""
@@ -33,7 +33,7 @@ class EvolutionCfg:
     """Displacement along the outward normals, common to a region, relative to sigma; 0 for none."""
     swelling_length: float = 0.1
     """Length over which the swelling varies [m]."""
-    swelling_along: Literal["normals", "faces"] = "normals"
+    swelling_along: Literal["normals", "faces"] = "faces"
     """Swell along outward unit vectors averaged over neighbours, or so that all faces of a body move by the same
     distance, which keeps edges sharp and faces flat where the size is wrong."""
     antithetic: bool = True

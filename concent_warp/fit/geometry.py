@@ -37,9 +37,9 @@ class FitCfg:
     """Settings of a fit."""
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
-    generations: int = 60
+    generations: int = 90
     """Generations at most."""
-    patience: int = 15
+    patience: int = 20
     """Generations without a better estimate after which the fit ends."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
