@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -30,7 +32,7 @@ class Checkpoint:
     random_state: dict[str, Any]
     """State of the random generator."""
     numbers: dict[str, float]
-    """Counters: generation, best, best_generation, simulations, seconds, sigma."""
+    """Counters: generation, best, lowest, last_gain, simulations, seconds, sigma."""
     history: list[dict[str, Any]]
     stopped: str | None
 
@@ -54,7 +56,7 @@ class Checkpoint:
             with np.load(path, allow_pickle=False) as data:
                 arrays = {name: data[name] for name in Checkpoint.ARRAYS}
                 texts = {name: json.loads(str(data[name])) for name in Checkpoint.TEXTS}
-        except (ValueError, OSError, KeyError, EOFError) as error:
+        except (ValueError, OSError, KeyError, EOFError, BadZipFile, zlib.error) as error:
             raise ModelError(
                 "not a checkpoint of a fit", where=path, found=error, fix="delete it to start anew"
             ) from None

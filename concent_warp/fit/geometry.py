@@ -28,6 +28,8 @@ from concent_warp.simulate.select import make_engine
 
 GRIP = 5e-4
 """A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
+GAIN = 1e-3
+"""Relative fall of the distance below which an estimate does not count as better."""
 TURN = np.radians(1.0) / 1e-3
 """Turn of a jittered body relative to its displacement [rad/m]."""
 
@@ -40,7 +42,7 @@ class FitCfg:
     generations: int = 90
     """Generations at most."""
     patience: int = 20
-    """Generations without a better estimate after which the fit ends."""
+    """Generations without a better estimate, on the frames of the fit or on the held-out ones, after which it ends."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
     block: float = 0.2
@@ -181,7 +183,8 @@ class Search:
         self.frozen = np.zeros(len(model.geometry), dtype=bool)
         self.full = MujocoEngine(model)
         self.engine: Engine | None = None
-        self.best, self.best_mean, self.best_generation = np.inf, self.evolution.mean.copy(), 0
+        self.best, self.best_mean = np.inf, self.evolution.mean.copy()
+        self.lowest, self.last_gain = np.inf, 0
         self.history: list[dict[str, Any]] = []
         self.simulations = 0
         self.seconds = 0.0
@@ -195,8 +198,11 @@ class Search:
         mask, reachable, loss, held_out = self.survey([*segments, *self.held_out])
         if evolution.generation == 0:
             evolution.scale_to(np.sqrt(loss) if cfg.squared else loss)
+        if held_out < (1 - GAIN) * self.best or loss < (1 - GAIN) * self.lowest:
+            self.last_gain = evolution.generation
+        self.lowest = min(loss, self.lowest)
         if held_out < self.best:
-            self.best, self.best_mean, self.best_generation = held_out, evolution.mean.copy(), evolution.generation
+            self.best, self.best_mean = held_out, evolution.mean.copy()
         values = evolution.ask(mask, self.rng)
         objective = self.objective(self.prepared(reachable | mask), self.jittered(segments))
         losses = objective(evolution.candidates(values))
@@ -220,7 +226,7 @@ class Search:
         )
         if evolution.generation >= cfg.generations:
             self.stopped = f"all {cfg.generations} generations done"
-        elif evolution.generation - self.best_generation > cfg.patience:
+        elif evolution.generation - self.last_gain > cfg.patience:
             self.stopped = f"no better estimate for {cfg.patience} generations"
 
     def draw(self) -> list[Segment]:
@@ -321,7 +327,8 @@ class Search:
             numbers={
                 "generation": self.evolution.generation,
                 "best": self.best,
-                "best_generation": self.best_generation,
+                "lowest": self.lowest,
+                "last_gain": self.last_gain,
                 "simulations": self.simulations,
                 "seconds": self.seconds,
                 "sigma": self.evolution.sigma,
@@ -338,6 +345,7 @@ class Search:
         self.rng.bit_generator.state = saved.random_state
         self.evolution.sigma = saved.numbers["sigma"]
         self.evolution.generation = int(saved.numbers["generation"])
-        self.best, self.best_generation = saved.numbers["best"], int(saved.numbers["best_generation"])
+        self.best, self.lowest = saved.numbers["best"], saved.numbers["lowest"]
+        self.last_gain = int(saved.numbers["last_gain"])
         self.simulations, self.seconds = int(saved.numbers["simulations"]), saved.numbers["seconds"]
         self.history, self.stopped = saved.history, saved.stopped
