@@ -337,6 +337,17 @@ def replace_geometry(**arrays: object) -> Callable[[Path], None]:
     return change
 
 
+def flip_byte(file: str) -> Callable[[Path], None]:
+    """Return a change that flips the byte in the middle of a file."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / file).read_bytes())
+        data[len(data) // 2] ^= 255
+        (folder / file).write_bytes(data)
+
+    return change
+
+
 def model_cases() -> Iterator[Case]:
     """Yield broken scenes and models."""
     toml, xml, npz = "model.toml", "model.scene.xml", "model.geometry.npz"
@@ -353,6 +364,8 @@ def model_cases() -> Iterator[Case]:
     yield model_case("model", "unknown key in [contact]", replace_text(toml, "condim", "condym"))
     yield model_case("model", "bad solimp", replace_text(toml, "0.95", "'stiff'"))
     yield model_case("model", "geometry missing", lambda f: (f / npz).unlink())
+    yield model_case("model", "truncated geometry", lambda f: (f / npz).write_bytes((f / npz).read_bytes()[:-40]))
+    yield model_case("model", "geometry with a flipped byte", flip_byte(npz))
     yield model_case("model", "geometry is a pickle", replace_geometry(radius=np.array([Code(), Code()], dtype=object)))
     yield model_case("model", "geometry without radii", replace_geometry(radius=np.zeros(0)))
     yield model_case("model", "negative radius", replace_geometry(radius=np.array([0.01, -0.01])))

@@ -6,9 +6,11 @@ stay for looks and for the sampling of surface points.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -116,7 +118,7 @@ class ContactGeometry:
         try:
             with np.load(path, allow_pickle=False) as data:
                 arrays = {name: data[name] for name in ("bodies", "body", "position", "radius", "mass", "friction")}
-        except (ValueError, OSError, KeyError, EOFError) as error:
+        except (ValueError, OSError, KeyError, EOFError, BadZipFile, zlib.error) as error:
             raise ModelError(
                 "not a contact geometry", where=path, expected="an .npz written by concent", found=error
             ) from None
