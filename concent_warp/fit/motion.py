@@ -79,6 +79,11 @@ class Samples:
         ]
         return smoothest(fits)
 
+    def through(self, time: float) -> Estimate:
+        """Return the estimate from samples on both sides of a time, even where an impact lies among them."""
+        rows = neighbourhoods(self.time, time, self.degree)[0]
+        return local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
+
 
 @dataclass(frozen=True)
 class Turns:

@@ -91,7 +91,7 @@ class Measured:
         size = float(np.linalg.norm(gravity)) or 9.81
         result = np.zeros(len(time), dtype=bool)
         for name in bodies:
-            estimates = [self.bodies[name].position.at(float(now)) for now in time]
+            estimates = [self.bodies[name].position.through(float(now)) for now in time]
             noise = float(np.median([e.second_error for e in estimates]))
             off = np.linalg.norm([e.second - gravity for e in estimates], axis=1)
             result |= off > max(SUPPORTED * size, 3 * noise)

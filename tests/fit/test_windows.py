@@ -92,6 +92,22 @@ def test_windows_of_free_flight_are_left_out(scene):
         cut(model, [flight], FitCfg(window=LENGTH))
 
 
+def test_a_bounce_between_two_flights_counts_as_contact(scene):
+    time = PERIOD * np.arange(60) - 0.2
+    height = 0.05 + 1.5 * np.abs(time) - 9.81 / 2 * time**2
+    bounce = Demonstration(
+        "demo_0",
+        qpos=np.array([0, 0, height[0], 1, 0, 0, 0]),
+        measured={
+            "position": Channel(time + 0.2, np.stack([0 * time, 0 * time, height], axis=1)),
+            "orientation": Channel(time + 0.2, np.tile([1.0, 0, 0, 0], (60, 1))),
+        },
+    )
+    found = [float(w.name.split("@")[1]) for w in windows(scene, bounce, ("cube",), LENGTH)]
+    assert any(start < 0.2 < start + LENGTH for start in found)
+    assert len(found) <= 2  # the other two are free flight
+
+
 def test_a_body_at_rest_counts_as_in_contact(scene):
     time = PERIOD * np.arange(60)
     rest = Demonstration(
