@@ -67,3 +67,10 @@ def test_wheel_brings_the_command_the_licence_and_the_version(wheel, root):
     assert info == f"concent_warp-{concent_warp.__version__}.dist-info"
     assert "concent = concent_warp.cli:main" in archive.read(f"{info}/entry_points.txt").decode()
     assert archive.read(f"{info}/licenses/LICENSE") == (root / "LICENSE").read_bytes()
+
+
+def test_version_is_the_same_wherever_it_is_named(root):
+    import concent_warp
+
+    assert f"\nversion: {concent_warp.__version__}\n" in (root / "CITATION.cff").read_text()
+    assert f"\n## [{concent_warp.__version__}] - " in (root / "CHANGELOG.md").read_text()
