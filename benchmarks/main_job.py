@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -48,8 +49,8 @@ class Args:
     """Run folder of the main job; replaced."""
     cores: int = 2
     """Processor cores that it may use."""
-    options: tuple[str, ...] = ()
-    """Further options of `concent demo`."""
+    options: str = ""
+    """Further options of `concent demo`, as in --options="--fit.generations 5"."""
     tests: bool = False
     """Also run `make check`."""
     table: bool = False
@@ -122,7 +123,16 @@ def stages(folder: Path, begun: float, ended: float) -> dict[str, float]:
 def measure(args: Args) -> dict[str, Any]:
     """Return the results."""
     folder = ROOT / args.out
-    command = [sys.executable, "-m", "concent_warp", "demo", "--out", str(args.out), "--overwrite", *args.options]
+    command = [
+        sys.executable,
+        "-m",
+        "concent_warp",
+        "demo",
+        "--out",
+        str(args.out),
+        "--overwrite",
+        *shlex.split(args.options),
+    ]
     begun = time.time()
     run = watch(command, args.cores)
     ended = time.time()
@@ -131,7 +141,7 @@ def measure(args: Args) -> dict[str, Any]:
     comparison = json.loads((folder / "comparison.json").read_text())
     result = {
         "machine": {**machine(), "cores": args.cores},
-        "options": list(args.options),
+        "options": args.options,
         "seconds": run.seconds,
         "stages": stages(folder, begun, ended),
         "peak_bytes": run.peak,
@@ -164,7 +174,7 @@ def page(result: dict[str, Any]) -> str:
         passed = judged(checks["seconds"], TEST_SECONDS) + ("" if checks["code"] == 0 else ", **checks failed**")
         bounds.append(["time of all checks", f"{checks['seconds']:.0f} s", f"{TEST_SECONDS} s", passed])
     rows = [[stage, f"{seconds:.1f}"] for stage, seconds in result["stages"].items()]
-    options = f" with {' '.join(result['options'])}" if result["options"] else ""
+    options = f" with `{result['options']}`" if result["options"] else ""
     return f"""# Main job
 
 {(__doc__ or "").split(chr(10) * 2, 2)[2].strip()}

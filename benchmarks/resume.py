@@ -276,8 +276,8 @@ def page(result: dict[str, Any]) -> str:
 
 Times are of the processor, since the start of the process; the whole fit takes {result["seconds"][1]:.0f} s, report
 included, and leaves {result["files"]} files. *partial* are files that were being written when the process died: they
-have names of their own, and the resumed run replaces them. *identical*: the same files; model, geometry, contact events,
-schedules and comparison byte by byte; the loss of each generation.
+have names of their own, and the resumed run replaces them. *identical*: the same files; model, geometry, contact
+events, schedules and comparison byte by byte; the loss of each generation.
 
 **{same} of {len(killed + interrupted)} fits came to the identical result and left nothing half-written**, after
 {len(stops)} kills and {sum(len(each["stops"]) for each in interrupted)} interruptions.
