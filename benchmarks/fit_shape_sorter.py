@@ -4,7 +4,7 @@ For each seed Reality shows the task three times, with the block in other places
 the first demonstration; the other two judge it. Starting geometries: spheres centred on the surface (the paper's way),
 inset against all faces, and inset then disturbed (1 mm noise, hole 1.5 mm tighter a side).
 
-    python benchmarks/fit_shape_sorter.py --out runs/fit_shape_sorter            # resumable; about 2 minutes a fit
+    python benchmarks/fit_shape_sorter.py --out runs/fit_shape_sorter            # resumable; 3-5 minutes a fit
     python benchmarks/fit_shape_sorter.py --out runs/fit_shape_sorter --report   # tables and figure into docs/
 """
 
@@ -163,11 +163,12 @@ def report(args: Args) -> None:
         "Mean block position error over align and insert [mm], from the first contact of block and box to the end,",
         "against the stand-in world's truth. *fitted*: the demonstration that the fit saw; *unseen*: two others of the",
         "same objects. *null*: a model whose block never meets the box. *exact*: the true boxes in place of spheres,",
-        "which is as near as the replay of these commands comes: grasp and tracking differ a little between the worlds.",
+        "which is as near as a replay of these commands comes: grasp and tracking differ a little between the worlds.",
         "Overlap: IoU of the frames in which block and box touch / of all body pairs with the block, after the chatter",
         "rule. Means over seeds with bootstrap 95 % intervals.",
         "",
-        f"`python benchmarks/{NAME}.py`, {platform.machine()}, {date.today().isoformat()}, C MuJoCo on 2 CPU cores.",
+        f"`python benchmarks/{NAME}.py`, {platform.machine()}, {date.today().isoformat()}; C MuJoCo, one core a fit",
+        "(`taskset -c 0`).",
         "",
         "| start | seeds | null | exact | before | after, fitted | after, unseen | fall, fitted | fall, unseen "
         "| overlap, fitted | overlap, unseen | seconds a fit |",

@@ -11,7 +11,9 @@ from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
 from concent_warp.recording.recording import Recording
 from tests.fit.conftest import HALF, RADIUS, corner_spheres
 
-CFG = FitCfg(evolution=EvolutionCfg(population=12, length=0.015, neighbours=2), generations=14, held_out=0.2, block=0.05)
+CFG = FitCfg(
+    evolution=EvolutionCfg(population=12, length=0.015, neighbours=2), generations=14, held_out=0.2, block=0.05
+)
 
 
 @pytest.fixture(scope="module")
