@@ -32,6 +32,7 @@ from concent_warp.scene.disturb import disturb, offset_normal, toward_axis
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import replay
+from concent_warp.simulate.select import EngineName
 
 ROOT = Path(__file__).resolve().parent.parent
 NAME = "fit_shape_sorter"
@@ -49,7 +50,7 @@ class Args:
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     starts: tuple[Start, ...] = ("surface", "inset", "disturbed")
     fit: FitCfg = field(default_factory=FitCfg)
-    engine: str = "mujoco"
+    engine: EngineName = "mujoco"
     report: bool = False
     """Write docs/benchmarks/fit_shape_sorter.md and its figure from the results in `out`."""
 
@@ -108,6 +109,8 @@ def run(args: Args, seed: int, start: Start, file: Path) -> None:
     began = time.perf_counter()
     result = fit_geometry(model, recording, args.fit, demonstrations=["demo_0"], engine=args.engine)
     seconds = time.perf_counter() - began
+    assert model.geometry is not None
+    assert result.model.geometry is not None
     moved = np.linalg.norm(result.model.geometry.position - model.geometry.position, axis=1)
     row: dict[str, Any] = {
         "seed": seed,

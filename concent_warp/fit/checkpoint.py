@@ -42,11 +42,11 @@ class Checkpoint:
     def save(self, path: Path) -> None:
         """Write the checkpoint in one piece or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {name: getattr(self, name) for name in self.ARRAYS}
-        texts = {name: np.array(json.dumps(getattr(self, name))) for name in self.TEXTS}
+        content: dict[str, Any] = {name: getattr(self, name) for name in self.ARRAYS}
+        content |= {name: np.array(json.dumps(getattr(self, name))) for name in self.TEXTS}
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("wb") as file:
-            np.savez(file, **arrays, **texts)
+            np.savez(file, **content)
         partial.replace(path)
 
     @staticmethod

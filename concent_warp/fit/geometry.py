@@ -24,7 +24,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.simulate.engine import Engine
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.simulate.select import make_engine
+from concent_warp.simulate.select import EngineName, make_engine
 
 GRIP = 5e-4
 """A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
@@ -104,7 +104,7 @@ def fit_geometry(
     *,
     demonstrations: Sequence[str] | None = None,
     segments: Sequence[Segment] | None = None,
-    engine: str = "auto",
+    engine: EngineName = "auto",
     checkpoint: Path | None = None,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
@@ -164,10 +164,11 @@ def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> l
 class Search:
     """The state of a fit between generations."""
 
-    def __init__(self, model: Model, segments: list[Segment], cfg: FitCfg, engine: str) -> None:
+    def __init__(self, model: Model, segments: list[Segment], cfg: FitCfg, engine: EngineName) -> None:
         """Prepare the first generation."""
         assert model.geometry is not None
-        self.model, self.segments, self.cfg, self.engine_name = model, segments, cfg, engine
+        self.model, self.segments, self.cfg = model, segments, cfg
+        self.engine_name: EngineName = engine
         if cfg.evolution.swelling_along == "faces":
             normals = offset_directions(model.geometry, model.scene)
         else:
@@ -323,7 +324,7 @@ class Search:
             best_mean=self.best_mean,
             collidable=self.collidable,
             frozen=self.frozen,
-            random_state=self.rng.bit_generator.state,
+            random_state=dict(self.rng.bit_generator.state),
             numbers={
                 "generation": self.evolution.generation,
                 "best": self.best,

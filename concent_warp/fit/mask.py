@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from concent_warp.model import Model
 from concent_warp.scene.contact_geometry import ContactGeometry
@@ -47,7 +47,7 @@ def touched_spheres(touched: np.ndarray, sphere_geom: np.ndarray, robot: np.ndar
         Spheres that touched anything but the robot, and spheres that the robot touched, each (S,) bool.
     """
     by_sphere = np.where(sphere_geom[:, None] >= 0, touched[np.maximum(sphere_geom, 0)], False)
-    return by_sphere[:, ~robot].any(axis=1), by_sphere[:, robot].any(axis=1)
+    return np.any(by_sphere[:, ~robot], axis=1), np.any(by_sphere[:, robot], axis=1)
 
 
 def with_neighbours(geometry: ContactGeometry, spheres: np.ndarray, k: int) -> np.ndarray:
@@ -57,7 +57,7 @@ def with_neighbours(geometry: ContactGeometry, spheres: np.ndarray, k: int) -> n
         rows = geometry.of(body)
         chosen = rows[spheres[rows]]
         if len(chosen) and k > 0:
-            _, near = cKDTree(geometry.position[rows]).query(geometry.position[chosen], min(k + 1, len(rows)))
+            _, near = KDTree(geometry.position[rows]).query(geometry.position[chosen], min(k + 1, len(rows)))
             result[rows[np.unique(near)]] = True
     return result
 

@@ -107,7 +107,7 @@ def resting_mean(points: np.ndarray) -> np.ndarray:
     centre = np.nanmean(points - points[:1], axis=1)
     moved = np.flatnonzero(np.linalg.norm(centre, axis=1) > REST)
     frames = max(int(moved[0]) if len(moved) else len(points), 1)
-    seen = np.isfinite(points[:frames]).all(axis=2)
+    seen = np.all(np.isfinite(points[:frames]), axis=2)
     total = np.where(seen[:, :, None], points[:frames], 0.0).sum(axis=0)
     with np.errstate(invalid="ignore"):
         return total / np.where(seen.any(axis=0), seen.sum(axis=0), np.nan)[:, None]
