@@ -7,7 +7,7 @@ A small ``concent fit`` runs once without interruption. Then it is started anew,
 at random from the whole of its time on the processor, resumed, killed again, and so on; the last run of a trial goes to
 the end.
 After each kill every file of the run folder is read. At the end the folder is compared with that of the first run.
-Further trials interrupt it with SIGINT, as Ctrl-C does.
+Further trials kill it in the middle of writing its state, or interrupt it with SIGINT, as Ctrl-C does.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,16 @@ from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.model import Model
 
 NAME = "resume"
+WRITTEN = "checkpoint.npz"
+"""File in the middle of whose writing a run is killed; others are written too quickly to be caught at it."""
 LAST = 0.75
 """Moments are drawn from this share of the time of the whole process: in the rest it only cleans up behind itself."""
 CLOCKED = {"settings.toml", "checkpoint.npz", "history.json", "report.html"}
 """Files that hold times or the command that was given, which differ from run to run."""
+
+
+Moment = float | str
+"""Processor time of a process [s], or the file in the middle of whose writing it is."""
 
 
 @dataclass(frozen=True)
@@ -121,16 +128,23 @@ class Bench:
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
-    def stop(self, out: str, after: float, kind: signal.Signals) -> Stop | None:
+    def stop(self, out: str, moment: Moment, kind: signal.Signals) -> Stop | None:
         """Run the fit and stop it by a signal; None if it came to its end before."""
         process = self.start(out)
         while process.poll() is None:
-            if processor_time(process.pid) >= after:
+            if self.has_come(moment, process.pid, out):
+                after = processor_time(process.pid)
                 process.send_signal(kind)
                 code = process.wait()
                 return self.found(out, after, kind, code if code >= 0 else 128 - code)
-            time.sleep(0.005)
         return None
+
+    def has_come(self, moment: Moment, pid: int, out: str) -> bool:
+        """Return whether a moment has come; waits a little where the moment is a matter of time."""
+        if isinstance(moment, str):
+            return (self.folder / out / f".{moment}.partial").exists()
+        time.sleep(0.005)
+        return processor_time(pid) >= moment
 
     def found(self, out: str, after: float, kind: signal.Signals, code: int) -> Stop:
         """Look at what a stopped run has left."""
@@ -206,9 +220,9 @@ def readable(path: Path) -> bool:
     return True
 
 
-def trial(bench: Bench, out: str, moments: list[float], kind: signal.Signals) -> dict[str, Any]:
+def trial(bench: Bench, out: str, moments: Sequence[Moment], kind: signal.Signals) -> dict[str, Any]:
     """Stop a fit at some moments, resume it to the end, and compare it with the reference."""
-    stops = [stop for after in moments if (stop := bench.stop(out, after, kind)) is not None]
+    stops = [stop for moment in moments if (stop := bench.stop(out, moment, kind)) is not None]
     bench.finish(out)
     left = [path.name for path in (bench.folder / out).rglob("*") if is_partial(path)]
     result = {"stops": [asdict(stop) for stop in stops], "left": left, "differs": bench.differences(out, "reference")}
@@ -232,6 +246,7 @@ def measure(args: Args) -> dict[str, Any]:
                 trial(bench, f"killed{k}", rng.uniform(0, LAST * again, args.kills).tolist(), signal.SIGKILL)
                 for k in range(args.trials)
             ],
+            "writing": [trial(bench, f"writing{k}", [WRITTEN], signal.SIGKILL) for k in range(args.trials)],
         }
         moments = [[share * again] for share in (0.05, 0.2, 0.4, LAST)]
         result["interrupted"] = [
@@ -263,7 +278,7 @@ def rows(trials: list[dict[str, Any]]) -> list[list[str]]:
 
 def page(result: dict[str, Any]) -> str:
     """Return the page."""
-    killed, interrupted = result["killed"], result["interrupted"]
+    killed, interrupted = result["killed"] + result["writing"], result["interrupted"]
     stops = [stop for each in killed for stop in each["stops"]]
     same = sum(not each["differs"] and not each["left"] for each in killed + interrupted)
     head = ["trial.run", "stopped after [s]", "exit status", "generations done", "files: whole / partial"]
@@ -284,16 +299,20 @@ events, schedules and comparison byte by byte; the loss of each generation.
 
 ## SIGKILL
 
-{table(head, rows(killed))}
+{table(head, rows(result["killed"]))}
+In the middle of writing {WRITTEN}:
+
+{table(head, rows(result["writing"]))}
 ## SIGINT
 
 {table(head, rows(interrupted))}
 """
+    text += "What it said last:\n\n"
     for each in interrupted:
         for stop in each["stops"]:
-            text += (
-                f"After {stop['after']:.1f} s{', with a traceback' if stop['traceback'] else ''}: `{stop['said']}`\n\n"
-            )
+            remarks = ", when all was written" * (stop["files"] - stop["partial"] == result["files"])
+            remarks += ", with a traceback" * stop["traceback"]
+            text += f"- after {stop['after']:.1f} s{remarks}: `{stop['said']}`\n"
     return text
 
 

@@ -61,7 +61,8 @@ def claim_folder(folder: Path, *, overwrite: bool, resume: bool) -> None:
     """Check that a run may write to a folder, make it, and empty it where that was asked, see `run_folder`."""
     if folder.exists() and not folder.is_dir():
         raise ConcentError("this is a file", where=folder, expected="a folder for the results")
-    if folder.is_dir() and any(folder.iterdir()):
+    unfinished = f".{SETTINGS}.partial"  # all that a run leaves that is killed before anything else is written
+    if folder.is_dir() and any(path.name != unfinished for path in folder.iterdir()):
         if not (folder / SETTINGS).is_file():
             raise ConcentError(
                 "the folder holds other things than a run", where=folder, fix="choose another folder with --out"

@@ -6,6 +6,8 @@ from dataclasses import replace
 import pytest
 
 from concent_warp.cli import main
+from concent_warp.cli.run_folder import claim_folder
+from concent_warp.errors import ConcentError
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.fit.geometry import Search
 from concent_warp.model import Model
@@ -63,6 +65,14 @@ def test_a_folder_with_other_things_is_left_alone_even_with_overwrite(bench, tmp
     assert fit(bench, tmp_path, "--overwrite") == 2
     assert "other things than a run" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_killed_while_it_wrote_its_settings_can_go_on(tmp_path):
+    (tmp_path / ".settings.toml.partial").write_text("comm")
+    claim_folder(tmp_path, overwrite=False, resume=True)
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(ConcentError, match="other things"):
+        claim_folder(tmp_path, overwrite=False, resume=True)
 
 
 def test_an_interrupted_fit_says_how_to_go_on_and_then_ends_as_if_it_had_not_been(
