@@ -174,8 +174,8 @@ def report(args: Args) -> None:
         f"`python benchmarks/{NAME}.py`, {platform.machine()}, {date.today().isoformat()}; C MuJoCo, one core a fit",
         "(`taskset -c 0`).",
         "",
-        "| start | seeds | null | exact | before | after, fitted | after, unseen | fall, fitted | fall, unseen | fall, exact "
-        "| overlap, fitted | overlap, unseen | seconds a fit |",
+        "| start | seeds | null | exact | before | after, fitted | after, unseen "
+        "| fall, fitted | fall, unseen | fall, exact | overlap, fitted | overlap, unseen | seconds a fit |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for start in ("surface", "inset", "disturbed"):
