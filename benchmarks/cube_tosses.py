@@ -12,7 +12,7 @@ from concent_warp.fit.target import BodyTarget, Segment, measured_pose, observed
 from concent_warp.fit.windows import Measured, windows
 from concent_warp.model import Model
 from concent_warp.recording.contactnets import EDGE
-from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.recording.recording import Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
@@ -83,19 +83,26 @@ def rests_at(model: Model) -> float:
     return 2 * float(np.mean(rollout.qpos[:, 0, 2]))
 
 
-def judge(
-    recording: Recording, tosses: Sequence[Demonstration], geometries: Sequence[ContactGeometry], window: float
-) -> Judgement:
-    """Simulate tosses with each geometry, in windows [s] and whole. The points compared are those of the true cube."""
-    model = Model(scene_of(recording, EDGE), geometries[0])
-    pieces = [windows(model.scene, d, (BODY,), window) for d in tosses]
-    distance, _, _ = errors(model, geometries, [s for group in pieces for s in group])
-    toss = np.repeat(np.arange(len(tosses)), [len(group) for group in pieces])
-    mean = np.full((len(geometries), len(tosses)), np.nan)
-    for k in np.unique(toss):
-        mean[:, k] = distance[:, toss == k].mean(axis=1)
-    _, position, rotation = errors(model, geometries, [whole(model.scene, d, (BODY,)) for d in tosses])
-    return Judgement(mean, position, rotation)
+class Judge:
+    """Simulates tosses in windows and whole. The points compared are those of the true cube."""
+
+    def __init__(self, recording: Recording, window: float) -> None:
+        """Cut all tosses into windows of a length [s]."""
+        self.scene = scene_of(recording, EDGE)
+        self.windows = {d.name: windows(self.scene, d, (BODY,), window) for d in recording.demonstrations}
+        self.whole = {d.name: whole(self.scene, d, (BODY,)) for d in recording.demonstrations}
+
+    def __call__(self, geometries: Sequence[ContactGeometry], names: Sequence[str]) -> Judgement:
+        """Return the errors of geometries on some tosses."""
+        model = Model(self.scene, geometries[0])
+        pieces = [self.windows[name] for name in names]
+        distance, _, _ = errors(model, geometries, [s for group in pieces for s in group])
+        toss = np.repeat(np.arange(len(names)), [len(group) for group in pieces])
+        mean = np.full((len(geometries), len(names)), np.nan)
+        for k in np.unique(toss):
+            mean[:, k] = distance[:, toss == k].mean(axis=1)
+        _, position, rotation = errors(model, geometries, [self.whole[name] for name in names])
+        return Judgement(mean, position, rotation)
 
 
 def errors(

@@ -12,9 +12,9 @@ RATE = 148.0
 PERIOD = 0.0068
 GRAVITY = 9.81
 MEASURES = {
-    "window": ("surface points over windows of 0.1 s", 1e3, "mm"),
-    "position": ("centre over the whole toss, open loop", 1e3, "mm"),
-    "rotation": ("orientation over the whole toss, open loop", np.degrees(1), "deg"),
+    "window": ("Surface points over windows of 0.1 s", 1e3, "mm"),
+    "position": ("Centre over the whole toss, open loop", 1e3, "mm"),
+    "rotation": ("Orientation over the whole toss, open loop", np.degrees(1), "deg"),
 }
 
 
@@ -31,90 +31,122 @@ def length_scale(document: dict[str, Any]) -> float:
 
 def page(document: dict[str, Any]) -> str:
     """Return the page in Markdown."""
-    results = document["results"]
-    edges = 1e3 * np.array([r["edge"] for r in results])
-    true, scale, resting = 1e3 * document["edge"], length_scale(document), 1e3 * document["resting_edge"]
-    fit, machine = document["fit"], document["machine"]
+    kinds = [k for k in (False, True) if any(r["friction"] == k for r in document["results"])]
+    parts = [introduction(document)]
+    parts += [section(document, [r for r in document["results"] if r["friction"] == kind]) for kind in kinds]
+    parts.append(interpretation(document))
+    return "\n".join(line for part in parts for line in part) + "\n"
+
+
+def introduction(document: dict[str, Any]) -> list[str]:
+    """Return what was done, and on what."""
+    from cube_tosses import SPHERES
+
+    results, machine = document["results"], document["machine"]
+    simulations = np.mean([r["simulations"] for r in results])
     lines = [
         "# Fitting a sphere cube to measured tosses",
         "",
         "Written by `benchmarks/fit_cube_tosses.py`; do not edit.",
         "",
         f"{document['tosses']} measured tosses of a cube on a board (ContactNets). Each fit sees"
-        f" {len(results[0]['fitted_names'])} of them, drawn at random, and starts from {spheres()} that make up a cube"
-        " whose edge is 5 % too small or too large; the other tosses judge it. The box in the scene, its markers and"
-        " its normals are scaled along, so that nothing of the true size is in the fitted model. Contact parameters,"
-        " friction (0.15, as published) and gravity are the model's own and are not fitted.",
+        f" {len(results[0]['fitted_names'])} of them, drawn at random, and starts from {SPHERES} inset spheres of 4 mm"
+        " radius that make up a cube whose edge is 5 % too small or too large; the other tosses judge it. The box in"
+        " the scene, its markers and its normals are scaled along, so that nothing of the true size is in the fitted"
+        " model. Contact parameters and gravity are the model's own and are not fitted.",
         "",
         f"Measured {document['date']} by `{document['command']}` on {machine['cpu']}, {machine['cores']} cores, python"
-        f" {machine['python']}: {document['seconds']['wall']:.0f} s in all, of them"
-        f" {sum(r['seconds']['wall'] for r in results):.0f} s for {len(results)} fits of"
-        f" {np.mean([r['simulations'] for r in results]):.0f} simulations of {fit['window']:g} s each"
-        f" ({document['seconds']['cpu']:.0f} s of processor time in all).",
+        f" {machine['python']}: {document['seconds']:.0f} s in all, for {len(results)} fits of {simulations:.0f}"
+        f" simulations of {document['fit']['window']:g} s each; a fit takes"
+        f" {np.mean([r['seconds']['cpu'] for r in results]):.0f} s of one processor.",
+        "",
+        "Errors are means over tosses, the fall with its 95 % bootstrap interval over tosses, beside two-sided paired"
+        " tests over tosses. *True size* is the error of a cube of the published size, laid with spheres in the same"
+        " way and not fitted.",
         "",
     ]
     if document["quick"]:
         lines += ["**A quick run: few tosses and generations; the figures mean little.**", ""]
-    lines += [
-        "## Error on the tosses that the fit did not see",
-        "",
-        "Mean over tosses; the fall with its 95 % bootstrap interval over tosses; two-sided paired tests over tosses;"
-        " beside them the error of a cube of the published size, laid with spheres in the same way and not fitted.",
-    ]
+    return lines
+
+
+def section(document: dict[str, Any], results: list[dict[str, Any]]) -> list[str]:
+    """Return the tables of the fits of one kind."""
+    friction = results[0]["friction"]
+    lines = [f"## {'Positions and friction' if friction else 'Positions'} of the spheres fitted"]
     for name, (title, unit, symbol) in MEASURES.items():
-        lines += ["", f"### {title[0].upper()}{title[1:]} [{symbol}]", "", *table(results, name, unit)]
+        lines += ["", f"{title} [{symbol}]:", "", *table(results, name, unit)]
+    if not friction:
+        lines += ["", "![Error of each toss before and after, and the recovered edges](data/fit_cube_tosses.png)"]
     lines += [
         "",
-        "The windows are what the fit minimises: they start from the measured state and end before a difference at the"
-        " start has grown. Simulated open loop, a toss with a first impact a little off tumbles onto another face, so"
-        " that these errors mix the geometry with chance.",
+        "Recovered edge [mm]:",
         "",
-        "![Error of each toss before and after, and the recovered edges](data/fit_cube_tosses.png)",
-        "",
-        "## Recovered edge",
-        "",
-        "Distance between opposite faces, each taken as the mean over its four quadrants of the farthest reach of a"
-        " sphere, mean of three axes. *Stands at* is twice the height at which the fitted cube comes to rest in"
-        " simulation, mean of its six faces.",
-        "",
-        "| split | start, mm | x, mm | y, mm | z, mm | edge, mm | off the published edge | stands at, mm |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "| split | start | x | y | z | edge | off the published edge | stands at | sphere friction |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
+    true = 1e3 * document["edge"]
     for r in results:
         widths = " | ".join(f"{1e3 * w:.1f}" for w in r["widths"])
+        low, middle, high = r["sphere_friction"]
         lines.append(
             f"| {r['seed']} | {1e3 * r['start_edge']:.1f} | {widths} | {1e3 * r['edge']:.1f} |"
             f" {100 * (1e3 * r['edge'] / true - 1):+.1f} % | {1e3 * r['rests_at']:.1f} |"
+            + (f" {middle:.2f} ({low:.2f} to {high:.2f}) |" if friction else f" {middle:.2f} |")
         )
-    lines += ["", f"All fits: **{edges.mean():.1f} +- {edges.std(ddof=1) if len(edges) > 1 else 0:.1f} mm** (mean and"]
-    lines[-1] += f" standard deviation) against {true:.1f} mm; " + "; ".join(
-        f"from {1e3 * factor * document['edge']:.1f} mm {mean:.1f} mm" for factor, mean in by_start(results).items()
+    starts = "; ".join(
+        f"from {1e3 * f * document['edge']:.1f} mm {mean:.1f} mm" for f, mean in by_start(results).items()
     )
-    lines[-1] += "."
-    lines += [
+    lines += ["", f"All: **{spread(results)}** (mean and standard deviation) against {true:.1f} mm; {starts}.", ""]
+    return lines
+
+
+def interpretation(document: dict[str, Any]) -> list[str]:
+    """Return what the figures mean and what they do not."""
+    true, scale, resting = 1e3 * document["edge"], length_scale(document), 1e3 * document["resting_edge"]
+    lines = [
+        "## Reading the figures",
+        "",
+        "- The edge is the distance between opposite faces, each taken as the mean over its four quadrants of the"
+        " farthest reach of a sphere, mean of three axes. *Stands at* is twice the height at which the fitted cube"
+        " comes to rest in simulation, mean of its six faces. Sphere friction: median, and the 10th and 90th"
+        " percentile.",
+        "- The windows are what a fit minimises: they start from the measured state and end before a difference at the"
+        " start has grown.",
+        "- Open loop, a whole toss says little of the size: the cube of published size is no better there than those of"
+        f" a wrong one. With the published friction of {document['friction']} it slides too far, whatever its size, and"
+        " after an impact that is a little off it tumbles onto another face. So where only positions are fitted, do"
+        " not look for the effect in the open-loop errors; where friction is fitted too, the centre follows.",
+        "- The larger of the two frictions counts in a contact, the board's or the sphere's: a fit can raise the"
+        f" friction above {document['friction']} and not lower it.",
         "",
         "What the file itself says of the edge, from the tosses that were fitted:",
         "",
-        f"- The centre of the resting cube lies {resting / 2:.1f} mm above the board: an edge of {resting:.1f} mm in"
+        f"- The centre of the resting cube lies {resting / 2:.2f} mm above the board: an edge of {resting:.1f} mm in"
         " the file's unit of length.",
         f"- Free fall has {document['free_fall']:.3f} +- {document['free_fall_error']:.3f} m/s^2 at the period of"
-        f" {1e3 * PERIOD:.1f} ms. At the nominal {RATE:.0f} Hz it is {scale * GRAVITY:.2f};"
-        f" so the file's metre measures {1 / scale:.3f} m: {true:.1f} mm are {true * scale:.1f} mm there.",
-        f"- So {edges.mean():.1f} mm in the file's unit are {edges.mean() / scale:.1f} mm"
-        f" ({100 * (edges.mean() / scale / true - 1):+.1f} %).",
-        "",
-        "The fit knows of no scale: it can only find the size that the file shows. It stands between the height at rest"
-        " and the published edge, because impacts enter as well, where restitution, friction and the rounding of the"
-        " corners, which the model does not fit, act together with the size.",
+        f" {1e3 * PERIOD:.1f} ms, {scale * GRAVITY:.2f} at the nominal {RATE:.0f} Hz. So the file's metre measures"
+        f" {1 / scale:.3f} m, and {true:.1f} mm are {true * scale:.1f} mm in the file's unit.",
     ]
-    return "\n".join(lines) + "\n"
+    for friction, words in ((False, "positions alone"), (True, "positions and friction")):
+        if results := [r for r in document["results"] if r["friction"] == friction]:
+            edge = 1e3 * float(np.mean([r["edge"] for r in results]))
+            lines.append(
+                f"- Fitted by {words}, {edge:.1f} mm in the file's unit are {edge / scale:.1f} mm"
+                f" ({100 * (edge / scale / true - 1):+.1f} % off)."
+            )
+    lines += [
+        "",
+        "A fit knows of no scale: it finds the size that the file shows, and what else the impacts show that the model"
+        " lacks (restitution, the rounding of the real corners) acts on it together with the size.",
+    ]
+    return lines
 
 
-def spheres() -> str:
-    """Return how the cube is made, in words."""
-    from cube_tosses import SPHERES
-
-    return f"{SPHERES} spheres of 4 mm radius, inset,"
+def spread(results: list[dict[str, Any]]) -> str:
+    """Return mean and standard deviation of the recovered edges, in words."""
+    edges = 1e3 * np.array([r["edge"] for r in results])
+    return f"{edges.mean():.1f} +- {edges.std(ddof=1) if len(edges) > 1 else 0:.1f} mm"
 
 
 def by_start(results: list[dict[str, Any]]) -> dict[float, float]:
@@ -147,7 +179,8 @@ def draw(document: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    results = document["results"]
+    kind = document["results"][0]["friction"]
+    results = [r for r in document["results"] if r["friction"] == kind]
     first = [r for r in results if r["seed"] == results[0]["seed"]]
     colours = {0.95: "tab:blue", 1.05: "tab:orange"}
     figure, axes = plt.subplots(1, len(first) + 1, figsize=(4.2 * (len(first) + 1), 4.2), layout="constrained")

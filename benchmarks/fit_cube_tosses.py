@@ -7,35 +7,40 @@ other tosses judge it. Nothing of the true size is in the model that is fitted: 
     python benchmarks/fit_cube_tosses.py --data ../shared/data/contactnets_cube      # writes into docs/benchmarks
     python benchmarks/fit_cube_tosses.py --quick --out /tmp/cube                       # one small split, seconds
 
-The contact parameters, the friction (the published 0.15) and gravity are the model's and are not fitted.
+The spheres' positions alone are fitted first, then positions and friction; contact parameters and gravity never are.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import platform
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from datetime import date
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
-from cube_tosses import free_fall, judge, resting_height, rests_at, sphere_cube, standing_widths
+from cube_tosses import Judge, free_fall, resting_height, rests_at, sphere_cube, standing_widths
 from cube_tosses_report import write_report
 from scipy import stats
 
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, fit_geometry
-from concent_warp.recording.contactnets import EDGE, read_contactnets
-from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.recording.contactnets import EDGE, FRICTION, read_contactnets
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data" / "contactnets_cube"
 FACTORS = (0.95, 1.05)
 RESAMPLES = 10_000
+FRICTION_SIGMA = 0.2
+"""Standard deviation of the logarithm of a sphere's friction in the first generation, where friction is fitted."""
 
 FIT = FitCfg(
     evolution=EvolutionCfg(
@@ -73,14 +78,29 @@ class Args:
     """Tosses that judge it; None takes all others."""
     limit: int | None = None
     """Tosses to read, in the order of their numbers; None reads all."""
+    friction: tuple[bool, ...] = (False, True)
+    """Fit the positions of the spheres alone, and their friction too."""
+    workers: int = len(os.sched_getaffinity(0))
+    """Fits at a time."""
     quick: bool = False
     """One split of 10 tosses to fit and 10 to judge, few generations: shows that it runs, the figures mean little."""
 
 
-def split(recording: Recording, args: Args, seed: int) -> tuple[list[Demonstration], list[Demonstration]]:
-    """Return the tosses to fit and those to judge."""
-    order = np.random.default_rng(seed).permutation(len(recording.demonstrations))
-    chosen = [recording.demonstrations[i] for i in order]
+@dataclass(frozen=True)
+class Task:
+    """One fit."""
+
+    seed: int
+    """Of the split and of the search."""
+    factor: float
+    """Edge of the start, relative to the published one."""
+    friction: bool
+    """Whether friction is fitted too."""
+
+
+def split(names: list[str], args: Args, seed: int) -> tuple[list[str], list[str]]:
+    """Return the names of the tosses to fit and of those to judge."""
+    chosen = [names[i] for i in np.random.default_rng(seed).permutation(len(names))]
     end = None if args.judged is None else args.fitted + args.judged
     return chosen[: args.fitted], chosen[args.fitted : end]
 
@@ -109,56 +129,85 @@ def p_value(result: Any) -> float:
     return float(result.pvalue)
 
 
-def run_fit(recording: Recording, args: Args, seed: int, factor: float, cfg: FitCfg) -> dict[str, Any]:
-    """Fit from one wrong size and judge; errors in m and rad."""
-    fit, others = split(recording, args, seed)
-    start = sphere_cube(recording, factor * EDGE)
-    clock, cpu = time.perf_counter(), time.process_time()
-    found = fit_geometry(
-        start, recording, replace(cfg, seed=seed), demonstrations=[d.name for d in fit], engine="mujoco"
-    )
-    seconds = {"wall": time.perf_counter() - clock, "cpu": time.process_time() - cpu}
-    truth = sphere_cube(recording, EDGE)
-    assert start.geometry is not None
-    assert found.model.geometry is not None
-    assert truth.geometry is not None
-    fitted = found.model.geometry
-    assert cfg.window is not None
-    judgements = judge(recording, others, [start.geometry, fitted, truth.geometry], cfg.window)
-    result: dict[str, Any] = {"seed": seed, "factor": factor, "seconds": seconds}
-    result |= {"simulations": found.history[-1]["simulations"], "generations": len(found.history)}
-    result |= {"fitted_names": [d.name for d in fit], "judged_names": [d.name for d in others]}
-    result["start_edge"], result["edge"] = factor * EDGE, float(standing_widths(fitted).mean())
-    result["widths"], result["rests_at"] = standing_widths(fitted).tolist(), rests_at(found.model)
-    for name, errors in asdict(judgements).items():
-        result[name] = paired(errors[0], errors[1]) | {"true_size": float(np.nanmean(errors[2]))}
-    result["tosses"] = {name: judgements.window[i].tolist() for i, name in enumerate(("before", "after", "true_size"))}
-    return result
+class Bench:
+    """What all fits share: the tosses, how to judge, and the errors of the cubes that are not fitted."""
+
+    def __init__(self, args: Args, cfg: FitCfg) -> None:
+        """Read the tosses, and judge the cubes of wrong and of published size on all of them."""
+        assert cfg.window is not None
+        self.args, self.cfg = args, cfg
+        self.recording = read_contactnets(args.data, limit=args.limit)
+        self.names = [d.name for d in self.recording.demonstrations]
+        self.judge = Judge(self.recording, cfg.window)
+        self.factors = (*FACTORS, 1.0)
+        cubes = [sphere_cube(self.recording, factor * EDGE) for factor in self.factors]
+        self.unfitted = self.judge([cube.geometry for cube in cubes if cube.geometry is not None], self.names)
+
+    def run(self, task: Task) -> dict[str, Any]:
+        """Fit from one wrong size and judge; errors in m and rad."""
+        fit, others = split(self.names, self.args, task.seed)
+        evolution = replace(self.cfg.evolution, fit_friction=task.friction, friction_sigma=FRICTION_SIGMA)
+        cfg = replace(self.cfg, seed=task.seed, evolution=evolution)
+        start = sphere_cube(self.recording, task.factor * EDGE)
+        clock, cpu = time.perf_counter(), time.process_time()
+        found = fit_geometry(start, self.recording, cfg, demonstrations=fit, engine="mujoco")
+        seconds = {"wall": time.perf_counter() - clock, "cpu": time.process_time() - cpu}
+        fitted = found.model.geometry
+        assert fitted is not None
+        columns = [self.names.index(name) for name in others]
+        after, unfitted = asdict(self.judge([fitted], others)), asdict(self.unfitted)
+        before, true = (self.factors.index(factor) for factor in (task.factor, 1.0))
+        result: dict[str, Any] = {**asdict(task), "seconds": seconds, "generations": len(found.history)}
+        result |= {"simulations": found.history[-1]["simulations"], "fitted_names": fit, "judged_names": others}
+        result["start_edge"], result["edge"] = task.factor * EDGE, float(standing_widths(fitted).mean())
+        result["widths"], result["rests_at"] = standing_widths(fitted).tolist(), rests_at(found.model)
+        result["sphere_friction"] = np.percentile(fitted.friction, [10, 50, 90]).tolist()
+        for name, errors in unfitted.items():
+            test = paired(errors[before, columns], after[name][0])
+            result[name] = test | {"true_size": float(np.nanmean(errors[true, columns]))}
+        result["tosses"] = {
+            "before": unfitted["window"][before, columns].tolist(),
+            "after": after["window"][0].tolist(),
+        }
+        return result
+
+
+def run_all(bench: Bench, tasks: list[Task]) -> list[dict[str, Any]]:
+    """Run the fits, several at a time: each simulates on its own, and Python would hold threads up."""
+    results = []
+    if bench.args.workers == 1:
+        for task in tasks:
+            results.append(bench.run(task))
+            print(progress(results[-1]), flush=True)
+        return results
+    with ProcessPoolExecutor(bench.args.workers, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(partial(Bench.run, bench), tasks):
+            results.append(result)
+            print(progress(result), flush=True)
+    return results
 
 
 def measure(args: Args, cfg: FitCfg) -> dict[str, Any]:
     """Run everything."""
-    clock, cpu = time.perf_counter(), time.process_time()
-    recording = read_contactnets(args.data, limit=args.limit)
-    results = []
-    for seed in range(args.splits):
-        for factor in FACTORS:
-            results.append(found := run_fit(recording, args, seed, factor, cfg))
-            print(progress(found), flush=True)
+    clock = time.perf_counter()
+    bench = Bench(args, cfg)
+    starts = [(seed, factor) for seed in range(args.splits) for factor in FACTORS]
+    results = run_all(bench, [Task(*start, friction) for friction in args.friction for start in starts])
     seen = sorted({name for found in results for name in found["fitted_names"]})
-    gravity, gravity_error = free_fall(recording, seen)
+    gravity, gravity_error = free_fall(bench.recording, seen)
     return {
         "date": date.today().isoformat(),
         "machine": {"cpu": cpu_name(), "cores": cores(), "python": platform.python_version()},
         "command": "python benchmarks/" + " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "quick": args.quick,
-        "tosses": len(recording.demonstrations),
+        "tosses": len(bench.names),
         "fit": asdict(cfg),
         "edge": EDGE,
-        "resting_edge": 2 * resting_height(recording, seen),
+        "friction": FRICTION,
+        "resting_edge": 2 * resting_height(bench.recording, seen),
         "free_fall": gravity,
         "free_fall_error": gravity_error,
-        "seconds": {"wall": time.perf_counter() - clock, "cpu": time.process_time() - cpu},
+        "seconds": time.perf_counter() - clock,
         "results": results,
     }
 
@@ -166,8 +215,9 @@ def measure(args: Args, cfg: FitCfg) -> dict[str, Any]:
 def progress(found: dict[str, Any]) -> str:
     """Return one line about a fit."""
     before, after, true = (1e3 * found["window"][name] for name in ("before", "after", "true_size"))
+    friction = ", friction too" if found["friction"] else ""
     return (
-        f"split {found['seed']}, start {1e3 * found['start_edge']:.1f} mm: error {before:.2f} -> {after:.2f} mm"
+        f"split {found['seed']}, start {1e3 * found['start_edge']:.1f} mm{friction}: {before:.2f} -> {after:.2f} mm"
         f" (true size {true:.2f}), edge {1e3 * found['edge']:.1f} mm, {found['seconds']['wall']:.0f} s"
     )
 
@@ -181,8 +231,6 @@ def cpu_name() -> str:
 
 def cores() -> int:
     """Return how many processors this process may use."""
-    import os
-
     return len(os.sched_getaffinity(0))
 
 
@@ -195,14 +243,14 @@ def main(args: Args) -> dict[str, Any]:
         )
     cfg = FIT
     if args.quick:
-        args = replace(args, splits=1, fitted=10, judged=10, limit=40)
+        args = replace(args, splits=1, fitted=10, judged=10, limit=24, friction=(False,), workers=1)
         cfg = replace(FIT, evolution=replace(FIT.evolution, population=8), generations=6, batch=16)
     document = measure(args, cfg)
     folder = args.out / "data"
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / ".fit_cube_tosses.json.partial"
-    partial.write_text(json.dumps(document, indent=1))
-    partial.replace(folder / "fit_cube_tosses.json")
+    unfinished = folder / ".fit_cube_tosses.json.partial"
+    unfinished.write_text(json.dumps(document) + "\n")
+    unfinished.replace(folder / "fit_cube_tosses.json")
     write_report(document, args.out)
     return document
 
