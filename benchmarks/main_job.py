@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shlex
 import subprocess
 import sys
@@ -63,6 +64,8 @@ class Run:
 
     code: int
     seconds: float
+    processor: float
+    """Processor time of the process and what it started [s]."""
     peak: int
     """Largest resident memory of the process and its descendants together [bytes]."""
     load: float
@@ -93,16 +96,24 @@ def resident(pid: int) -> int:
         return 0
 
 
+def processor_time() -> float:
+    """Return the processor time of all processes that were waited for [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def watch(command: Sequence[str], cores: int) -> Run:
     """Run a command on some cores and watch its time and memory."""
     allowed = sorted(os.sched_getaffinity(0))[:cores]
+    before = processor_time()
     begun = time.perf_counter()
     process = subprocess.Popen(command, cwd=ROOT, preexec_fn=lambda: os.sched_setaffinity(0, allowed))
     peak = 0
     while process.poll() is None:
         peak = max(peak, sum(map(resident, tree(process.pid))))
         time.sleep(PERIOD)
-    return Run(process.returncode, time.perf_counter() - begun, peak, os.getloadavg()[1])
+    seconds = time.perf_counter() - begun
+    return Run(process.returncode, seconds, processor_time() - before, peak, os.getloadavg()[1])
 
 
 def stages(folder: Path, begun: float, ended: float) -> dict[str, float]:
@@ -143,6 +154,7 @@ def measure(args: Args) -> dict[str, Any]:
         "machine": {**machine(), "cores": args.cores},
         "options": args.options,
         "seconds": run.seconds,
+        "processor_seconds": run.processor,
         "stages": stages(folder, begun, ended),
         "peak_bytes": run.peak,
         "load": run.load,
@@ -182,7 +194,8 @@ def page(result: dict[str, Any]) -> str:
 `python benchmarks/{NAME}.py`{options}. {machine_line(result["machine"])} Load average at the end: {result["load"]:.1f}.
 
 {table(["", "measured", "bound", ""], bounds)}
-{result["generations"]} generations; the report has {result["report_bytes"] / 2**20:.1f} MiB.
+{result["processor_seconds"]:.0f} s of processor time; {result["generations"]} generations; a report of
+{result["report_bytes"] / 2**20:.1f} MiB.
 
 {table(["stage", "seconds"], rows)}"""
 
