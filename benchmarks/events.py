@@ -279,7 +279,8 @@ stand-in world by 1 ms. *Contact overlap*: IoU of the frames in which block and 
 Insert comes when the replayed block slips off the rim, which depends on the geometry and not on how stages are found:
 *block 2 mm below the rim* says how much earlier or later that is in the motion itself.
 In truth as in the model the block then hangs in the mouth of the hole, 2 to 4 mm deep, until it is pushed home half a
-second later; whether it leans on a wall before that push is a close call.
+second later; whether it leans on a wall before that push is a close call. A model whose hole is too wide lets the block
+go straight in: then no align is there to be found.
 
 `python benchmarks/events.py`
 

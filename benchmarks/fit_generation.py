@@ -167,9 +167,10 @@ def measure_generation(args: Args, recording: Recording, population: int) -> dic
     generation(search, mask, engine)
     (segment,) = search.used
     bare = Bare(engine, segment.ctrl, segment.qpos, segment.qvel, population)
-    parts, times = [], []
+    parts, times, growths = [], [], 0
     for _ in range(args.repeats):
         found, position = generation(search, mask, engine)
+        growths += engine.repeats
         parts.append(found)
         times.append(bare.seconds(position))
     steps = population * len(segment.ctrl)
@@ -189,7 +190,7 @@ def measure_generation(args: Args, recording: Recording, population: int) -> dic
         "share_with_survey": spread(np.array(times) / (whole + survey)),
         "seconds": {part: float(np.median([found[part] for found in parts])) for part in PARTS},
         "survey_seconds": survey,
-        "growths": engine.repeats,
+        "growths": growths,
     }
 
 
