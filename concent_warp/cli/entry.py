@@ -58,7 +58,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] not in COMMANDS:
         print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
         return ERROR
-    return run(arguments[0], arguments[1:])
+    code = run(arguments[0], arguments[1:])
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return leave_pipe()
+    return code
+
+
+def leave_pipe() -> int:
+    """Give up standard output, which its reader has closed as `head` does, and return the exit code for that."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return CLOSED
 
 
 def run(command: str, arguments: Sequence[str]) -> int:
@@ -80,9 +91,8 @@ def run(command: str, arguments: Sequence[str]) -> int:
     except ConcentError as error:
         print(f"concent {command}: {error}", file=sys.stderr)
         return ERROR
-    except BrokenPipeError:  # whoever read the output has closed it, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return CLOSED
+    except BrokenPipeError:
+        return leave_pipe()
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
         print(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.", file=sys.stderr)
