@@ -1,0 +1,174 @@
+"""Measurement noise of a channel: as its instrument states it, else estimated from the readings themselves.
+
+Three estimates, the first that applies. At rest: the scatter about the mean of stretches in which nothing moves, which
+sees slow noise too. From differences: the third difference of independent noise has 20 times its variance, and smooth
+motion leaves little there; noise that is correlated from sample to sample leaves little there too, so that the
+estimate can be `UNDERESTIMATE` times too small. Neither falls below what the resolution of the readings leaves, a
+step / sqrt(12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Channel
+
+Kind = Literal["position", "orientation", "joint", "points", "other"]
+"""What a channel measures."""
+Source = Literal["stated", "rest", "differences", "resolution", "unknown"]
+"""Where a noise figure is from."""
+UNDERESTIMATE = 1.8
+"""By how much differences underestimate strongly autocorrelated noise."""
+REST_LENGTH = 20
+"""Samples of the windows that are searched for rest."""
+REST_WINDOWS = 3
+"""Windows in a row that make a stretch of rest."""
+REST_SCATTER = 2.5
+"""Scatter of a window at rest over the noise seen in differences."""
+FEWEST = 8
+"""Readings that tell anything of the noise."""
+ROUNDING = 1e-9
+"""Scatter below this share of the readings is rounding, as of simulated readings without noise."""
+WORDS: dict[Source, str] = {
+    "stated": "stated in the recording",
+    "rest": "estimated where nothing moves",
+    "differences": f"estimated from sample-to-sample differences, up to {UNDERESTIMATE:g} x too small if it is slow",
+    "resolution": "from the resolution of the readings",
+    "unknown": "not known",
+}
+"""The sources in words."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of the measurement noise of a channel."""
+
+    std: float
+    """Per component, in the channel's unit; of an orientation per component of the rotation vector [rad], twice that of
+    a component of the quaternion. NaN where the readings do not tell."""
+    source: Source
+    """Where it is from."""
+
+    @property
+    def words(self) -> str:
+        """Where it is from, in words."""
+        return WORDS[self.source]
+
+
+def channel_noise(channel: Channel, kind: Kind) -> Noise:
+    """Return the noise of a channel.
+
+    Args:
+        channel: Values (T, dim); of an orientation quaternions wxyz (T, 4).
+        kind: What it measures.
+    """
+    return pooled_noise((channel,), kind)
+
+
+def pooled_noise(channels: Sequence[Channel], kind: Kind) -> Noise:
+    """Return the noise of one instrument from its channels in several demonstrations; rest in any of them counts."""
+    stated = [c.noise_std for c in channels if c.noise_std]
+    if stated:
+        return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
+    pieces = [piece for c in channels for piece in finite_pieces(c.value)]
+    if sum(len(piece) for piece in pieces) < FEWEST:
+        return Noise(np.nan, "unknown")
+    fast = difference_std(pieces, kind)
+    floor = 0.0 if kind == "orientation" else resolution(pieces) / np.sqrt(12)
+    found = Noise(fast, "differences")
+    if (rest := rest_std(pieces, kind, max(fast, floor))) is not None:
+        found = Noise(max(rest, fast), "rest")
+    if found.std < floor:
+        return Noise(floor, "resolution")
+    size = max(float(np.abs(piece).max()) for piece in pieces)
+    return found if found.std > ROUNDING * size else Noise(np.nan, "unknown")
+
+
+def finite_pieces(value: np.ndarray) -> list[np.ndarray]:
+    """Return the stretches of `value` (T, dim) without missing readings, each (n, dim)."""
+    value = np.asarray(value, dtype=float).reshape(len(value), -1)
+    valid = np.asarray(np.isfinite(value).all(axis=1))
+    edges = np.flatnonzero(np.diff(valid)) + 1
+    parts = np.split(np.arange(len(value)), edges)
+    return [value[rows] for rows in parts if len(rows) and bool(valid[rows].all())]
+
+
+def difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
+    """Return the noise per component seen in third differences, by their median size, so that impacts count little.
+
+    Third differences of independent noise have the variance 1 + 9 + 9 + 1 = 20. Of orientations the first difference
+    is the rotation vector from one reading to the next.
+    """
+    third = []
+    for piece in pieces:
+        if len(piece) > 3:
+            first = turns(piece[:-1], piece[1:]) if kind == "orientation" else np.diff(piece, axis=0)
+            third.append(np.diff(first, n=2, axis=0))
+    if not third:
+        return np.nan
+    spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.67449
+    return float(np.sqrt(np.mean(spread**2) / 20))
+
+
+def rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float) -> float | None:
+    """Return the scatter about the mean of stretches of rest, None where there is none.
+
+    A window is at rest if it scatters, and its two halves differ, by no more than `REST_SCATTER` times `fast`.
+    """
+    square, freedom = 0.0, 0
+    for piece in pieces:
+        count = len(piece) // REST_LENGTH
+        windows = [piece[i * REST_LENGTH : (i + 1) * REST_LENGTH] for i in range(count)]
+        still = np.array([is_still(centred(window, kind), fast) for window in windows], dtype=bool)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+        for start, end in edges.reshape(-1, 2):
+            stretch = centred(piece[start * REST_LENGTH : end * REST_LENGTH], kind)
+            if end - start >= REST_WINDOWS and is_still(stretch, fast):
+                square += float((stretch**2).sum())
+                freedom += stretch.size - stretch.shape[1]
+    return float(np.sqrt(square / freedom)) if freedom else None
+
+
+def is_still(window: np.ndarray, fast: float) -> bool:
+    """Return whether readings about their mean, shape (n, dim), scatter and drift by no more than noise does."""
+    limit = REST_SCATTER * fast
+    half = len(window) // 2
+    drift = np.abs(window[:half].mean(axis=0) - window[half:].mean(axis=0)).max()
+    return bool(np.sqrt((window**2).mean(axis=0)).max() <= limit and drift <= limit)
+
+
+def centred(window: np.ndarray, kind: Kind) -> np.ndarray:
+    """Return readings (n, dim) less their mean; of orientations rotation vectors [rad], shape (n, 3)."""
+    value = turns(np.broadcast_to(window[0], window.shape), window) if kind == "orientation" else window
+    return value - value.mean(axis=0)
+
+
+def turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors [rad], shape (n, 3), from `start` to `end`, quaternions wxyz (n, 4)."""
+    lengths = np.linalg.norm(start, axis=1) * np.linalg.norm(end, axis=1)
+    vectors = np.zeros((len(start), 3))
+    valid = lengths > 0
+    first, second = (Rotation.from_quat(q[valid], scalar_first=True) for q in (start, end))
+    vectors[valid] = (first.inv() * second).as_rotvec()
+    return vectors
+
+
+def resolution(pieces: Sequence[np.ndarray]) -> float:
+    """Return the step in which readings come, in their unit; 0 where they do not come in steps."""
+    steps = []
+    for column in np.concatenate(pieces).T:
+        levels = np.unique(column)
+        gaps = np.diff(levels)
+        gaps = gaps[gaps > 1e-9 * np.ptp(column)]
+        if len(gaps) and len(levels) < len(column) / 2:
+            step = float(np.percentile(gaps, 10))
+            multiple = (levels - levels[0]) / step
+            if np.percentile(np.abs(multiple - np.round(multiple)), 95) < 0.05:
+                steps.append(step)
+    return max(steps, default=0.0)

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from concent_warp.diagnose.noise import UNDERESTIMATE, channel_noise, pooled_noise
+from concent_warp.recording.recording import Channel
+
+RATE = 100
+TIME = np.arange(0, 6, 1 / RATE)
+STD = 3e-4
+
+
+def moving(rng, noise):
+    """A swing in three directions with impacts, noise added."""
+    swing = 0.05 * np.sin(2 * np.pi * TIME[:, None] * [0.7, 1.1, 0.4] + [0, 1, 2])
+    swing[:, 0] += 0.1 * np.abs(np.sin(3 * TIME))
+    return swing + noise(rng, swing.shape)
+
+
+def white(rng, shape):
+    return rng.normal(0, STD, shape)
+
+
+def slow(rng, shape):
+    """First-order autoregressive noise with a correlation of 0.6 from sample to sample."""
+    found = np.zeros(shape)
+    for i in range(1, len(found)):
+        found[i] = 0.6 * found[i - 1] + np.sqrt(1 - 0.6**2) * rng.normal(0, STD, shape[1:])
+    return found
+
+
+def test_what_the_recording_states_is_believed():
+    noise = channel_noise(Channel(TIME, moving(np.random.default_rng(0), white), noise_std=0.01), "position")
+    assert (noise.std, noise.source) == (0.01, "stated")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_white_noise_on_motion_with_impacts_is_found_from_differences(seed):
+    noise = channel_noise(Channel(TIME, moving(np.random.default_rng(seed), white)), "position")
+    assert noise.source == "differences"
+    assert noise.std == pytest.approx(STD, rel=0.2)
+
+
+def test_slow_noise_is_found_at_rest_where_differences_miss_half_of_it():
+    rng = np.random.default_rng(1)
+    value = moving(rng, slow)
+    moved = channel_noise(Channel(TIME, value), "position")
+    assert moved.source == "differences"
+    assert STD / (1.3 * UNDERESTIMATE) < moved.std < STD / 1.3
+    value[300:] = value[300] + slow(rng, value[300:].shape)
+    rested = channel_noise(Channel(TIME, value), "position")
+    assert rested.source == "rest"
+    assert rested.std == pytest.approx(STD, rel=0.2)
+    assert "nothing moves" in rested.words
+
+
+def test_rest_in_one_demonstration_serves_all():
+    rng = np.random.default_rng(2)
+    moved, still = Channel(TIME, moving(rng, white)), Channel(TIME, white(rng, (len(TIME), 3)))
+    assert pooled_noise((moved, still), "position").source == "rest"
+    assert pooled_noise((moved, still), "position").std == pytest.approx(STD, rel=0.1)
+
+
+@pytest.mark.parametrize("spin", [0.0, 5.0])
+def test_noise_of_an_orientation_is_that_of_the_rotation_vector(spin):
+    rng = np.random.default_rng(3)
+    axis = np.array([1, 2, 2]) / 3
+    turn = Rotation.from_rotvec(spin * np.sin(TIME)[:, None] * axis) * Rotation.from_rotvec(
+        rng.normal(0, 0.01, (len(TIME), 3))
+    )
+    flipped = turn.as_quat(scalar_first=True) * rng.choice([-1, 1], len(TIME))[:, None]
+    noise = channel_noise(Channel(TIME, flipped), "orientation")
+    assert noise.source == ("differences" if spin else "rest")
+    assert noise.std == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_readings_in_steps_err_by_a_step_over_the_root_of_twelve(still):
+    step = 2 * np.pi / 4096
+    angle = np.zeros(len(TIME)) if still else 0.2 * np.sin(TIME)
+    angle[:100] = angle[100] - 0.1 * np.cos(0.5 * np.pi * TIME[:100])
+    noise = channel_noise(Channel(TIME, (np.round(angle / step) * step)[:, None]), "joint")
+    assert step / np.sqrt(12) <= noise.std * 1.0001 < step
+    assert noise.source == "resolution" or not still
+
+
+def test_a_slow_creep_is_not_rest():
+    rng = np.random.default_rng(4)
+    creep = 0.02 * TIME[:, None] + white(rng, (len(TIME), 1))
+    noise = channel_noise(Channel(TIME, creep), "position")
+    assert noise.std == pytest.approx(STD, rel=0.3)
+
+
+def test_exact_readings_say_nothing_of_the_noise():
+    assert channel_noise(Channel(TIME, np.zeros((len(TIME), 1))), "joint").source == "unknown"
+    assert (
+        channel_noise(Channel(TIME, 1 + 1e-16 * moving(np.random.default_rng(6), white)), "joint").source == "unknown"
+    )
+
+
+def test_gaps_are_bridged_and_too_few_readings_say_nothing():
+    rng = np.random.default_rng(5)
+    value = moving(rng, white)
+    value[::10] = np.nan
+    assert channel_noise(Channel(TIME, value), "position").std == pytest.approx(STD, rel=0.25)
+    few = channel_noise(Channel(TIME[:4], value[1:5]), "position")
+    assert few.source == "unknown"
+    assert np.isnan(few.std)
