@@ -1,9 +1,12 @@
-"""A model: scene and contact geometry, all that a simulation needs. On disk one ``model.toml`` with files beside it."""
+"""A model: scene, contact geometry and effects, all that a simulation needs.
+
+On disk one ``model.toml`` with files beside it.
+"""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
+from concent_warp.effects.table import checked_values, effects_table, read_effects
 from concent_warp.errors import ModelError
 from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
@@ -33,7 +38,7 @@ class ContactParameters:
 
 @dataclass(frozen=True)
 class Model:
-    """Scene, contact geometry and contact parameters.
+    """Scene, contact geometry, contact parameters and effects.
 
     Time step, integrator and solver are those of the scene's MJCF.
     """
@@ -41,24 +46,56 @@ class Model:
     scene: Scene
     geometry: ContactGeometry | None = None
     contact: ContactParameters = field(default_factory=ContactParameters)
+    effects: tuple[AddedEffect, ...] = ()
+    """Physical effects with the values of their parameters, in the order in which they were added."""
 
     def spec(self, collidable: np.ndarray | None = None) -> mujoco.MjSpec:
-        """Return a fresh spec with the spheres attached.
+        """Return a fresh spec with the spheres attached, prepared for the effects; `finish` what is compiled from it.
 
         `collidable`, shape (S,) bool, leaves out the spheres that are False (paper, section 3.2.2).
         """
         spec = self.scene.spec()
         if self.geometry is not None:
             self.geometry.attach(spec, collidable=collidable, **asdict(self.contact))
+        prepare(spec, self.effects)
         return spec
+
+    def finish(self, m: mujoco.MjModel) -> mujoco.MjModel:
+        """Let the effects set their fields of a model compiled from `spec`, in place, and return it."""
+        if self.effects:
+            write(m, self.effects)
+            mujoco.mj_setConst(m, mujoco.MjData(m))
+        return m
 
     def compile(self, collidable: np.ndarray | None = None) -> mujoco.MjModel:
         """Return the compiled model, see `spec`."""
-        return self.spec(collidable).compile()
+        return self.finish(self.spec(collidable).compile())
 
     def with_geometry(self, geometry: ContactGeometry | None) -> Model:
         """Return a copy with another contact geometry."""
         return replace(self, geometry=geometry)
+
+    def add(self, effect: Effect, values: Mapping[str, float] | Sequence[float] | None = None) -> Model:
+        """Return a copy with one more effect.
+
+        Args:
+            effect: The effect, on what it acts.
+            values: Values of its parameters, by name or in their order; those not named keep the null value, at which
+                the effect does nothing.
+
+        Raises:
+            ModelError: A target or a parameter does not exist, a value is out of bounds, or the model has it already.
+        """
+        base = self.compile()
+        effect.check(base)
+        if any(a.effect.name == effect.name and set(a.effect.target) & set(effect.target) for a in self.effects):
+            raise ModelError(f"the model has {effect.name} there already", found=list(effect.target))
+        added = AddedEffect(effect, checked_values(effect, base, values))
+        return replace(self, effects=(*self.effects, added))
+
+    def without(self, index: int) -> Model:
+        """Return a copy without the effect at a position of `effects`."""
+        return replace(self, effects=tuple(a for i, a in enumerate(self.effects) if i != index))
 
     def save(self, path: Path) -> None:
         """Write `path` (``.toml``), the scene as ``.xml`` and the geometry as ``.npz`` beside it.
@@ -74,6 +111,8 @@ class Model:
             document["geometry"] = f"{path.stem}.geometry.npz"
             self.geometry.save(path.with_name(document["geometry"]))
         document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self.contact).items()}
+        if self.effects:
+            document["effect"] = effects_table(self.effects)
         write_text(path, tomli_w.dumps(document))
 
     @staticmethod
@@ -98,7 +137,7 @@ class Model:
             raise ModelError(
                 "unknown version of the model file", where=path, expected=VERSION, found=document.get("version")
             )
-        known = {"format", "version", "scene", "geometry", "contact"}
+        known = {"format", "version", "scene", "geometry", "contact", "effect"}
         if unknown := sorted(set(document) - known):
             raise ModelError(
                 "unknown entries in the model file", where=path, expected=f"only {sorted(known)}", found=unknown
@@ -114,6 +153,8 @@ class Model:
             missing = [b for b in geometry.bodies if mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, b) < 0]
             if missing:
                 raise ModelError("the contact geometry names bodies that the scene lacks", where=path, found=missing)
+        for added in read_effects(document.get("effect", []), path):
+            model = replace(model.add(added.effect, added.values), effects=(*model.effects, added))
         return model
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 import mujoco
@@ -135,6 +135,8 @@ def check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Varian
             raise EngineError(
                 "friction is given twice", found="variants.sphere_friction and fields['geom_friction']", fix="give one"
             )
+    for law, values in variants.laws or ():
+        check_array(f"parameters of {type(law).__name__}", values, (n, *np.shape(values)[1:]))
     for name, value in variants.fields.items():
         check_array(f"variants.fields[{name!r}]", value, (n, *np.shape(model_field(compiled, name))))
 
@@ -204,4 +206,18 @@ def host_variants(variants: Variants) -> Variants:
         for name in (*SPHERE_FIELDS, "qpos", "qvel")
     }
     fields: Mapping[str, np.ndarray] = {k: np.asarray(host(v), dtype=float) for k, v in variants.fields.items()}
-    return Variants(variants.count, fields=fields, **arrays)
+    laws = None
+    if variants.laws is not None:
+        laws = tuple((law, np.asarray(host(values), dtype=float)) for law, values in variants.laws)
+    return Variants(variants.count, fields=fields, laws=laws, **arrays)
+
+
+def with_laws(model: Model, compiled: mujoco.MjModel, variants: Variants) -> Variants:
+    """Return the variants with the laws of the model's effects where they name none themselves."""
+    if variants.laws is not None:
+        return variants
+    laws = []
+    for added in model.effects:
+        if (law := added.effect.law(compiled)) is not None:
+            laws.append((law, np.tile(added.array, (variants.count, 1))))
+    return replace(variants, laws=tuple(laws))

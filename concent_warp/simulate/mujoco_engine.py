@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import queue
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,9 +18,10 @@ from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
-from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants
+from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants, with_laws
 
 if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
     from concent_warp.model import Model
 
 WARNING = mujoco.mjtWarning
@@ -96,7 +97,8 @@ class MujocoEngine:
         A variant that MuJoCo finds unstable is `diverged`, and its records are NaN from then on.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
-        run = Run(**{**vars(run), "variants": host_variants(variants)})
+        variants = with_laws(self.model, self._compiled, host_variants(variants))
+        run = Run(**{**vars(run), "variants": variants})
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
         self.repeats = 0
@@ -125,6 +127,9 @@ class MujocoEngine:
     def _simulate(self, run: Run, n: int) -> VariantResult | None:
         """Simulate variant n; None if its contacts or constraints did not fit the arena."""
         m = self._variant_model(run.variants, n)
+        laws = [(law, values[n]) for law, values in run.variants.laws or ()]
+        if any(law.edits for law, _ in laws):
+            m = copy.copy(m)
         d = mujoco.MjData(m)
         if run.variants.qpos is not None:
             d.qpos[:] = run.variants.qpos[n]
@@ -132,7 +137,7 @@ class MujocoEngine:
             d.qvel[:] = run.variants.qvel[n]
         result = VariantResult.empty(m, run)
         try:
-            result.diverged = not simulate(m, d, run, run.ctrl[n % len(run.ctrl)], result)
+            result.diverged = not simulate(m, d, run, run.ctrl[n % len(run.ctrl)], result, laws)
         except mujoco.FatalError as error:
             if "stack" in str(error) or "arena" in str(error):
                 return None
@@ -175,13 +180,14 @@ class MujocoEngine:
         self._workshops = queue.SimpleQueue()
         spec = self.model.spec(self._collidable)
         spec.memory = size
-        self._compiled = spec.compile()
+        self._compiled = self.model.finish(spec.compile())
 
 
 class Workshop:
     """A spec whose spheres are set and compiled for one variant after the other; for one thread at a time."""
 
     def __init__(self, model: Model, collidable: np.ndarray | None, memory: int | None) -> None:
+        self._model = model
         self._spec = model.spec(collidable)
         if memory is not None:
             self._spec.memory = memory
@@ -213,7 +219,7 @@ class Workshop:
             geom.pos = position[i]
             geom.size[0] = radius[i]
             geom.friction[0] = friction[i]
-        compiled = self._spec.compile()
+        compiled = self._model.finish(self._spec.compile())
         self._last = tuple(value.copy() for value in values), compiled
         return compiled
 
@@ -258,7 +264,14 @@ class VariantResult:
         self.body_position[row], self.body_quaternion[row] = d.xpos[body_ids], d.xquat[body_ids]
 
 
-def simulate(m: mujoco.MjModel, d: mujoco.MjData, run: Run, ctrl: np.ndarray, result: VariantResult) -> bool:
+def simulate(
+    m: mujoco.MjModel,
+    d: mujoco.MjData,
+    run: Run,
+    ctrl: np.ndarray,
+    result: VariantResult,
+    laws: Sequence[tuple[Law, np.ndarray]],
+) -> bool:
     """Step through the commands `ctrl`, shape (K, nu), filling `result`; returns whether the state stayed sane.
 
     `mj_step` computes sensors, poses and contacts from the state before the step and leaves them in `d`, so they are
@@ -268,10 +281,13 @@ def simulate(m: mujoco.MjModel, d: mujoco.MjData, run: Run, ctrl: np.ndarray, re
     watch = run.contacts != "none"
     overwritten = m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     number = d.warning.number
+    base = {name: getattr(m, name).copy() for law, _ in laws for name in law.edits}
     k = 0
-    for stop in stops(ctrl, run):
+    for stop in range(1, run.steps + 1) if laws else stops(ctrl, run):
         if m.nu:
             d.ctrl[:] = ctrl[k]
+        if laws:
+            apply_laws(m, d, laws, base)
         row = row_of.get(k)
         if row is None and not watch:
             mujoco.mj_step(m, d, nstep=stop - k)
@@ -290,10 +306,24 @@ def simulate(m: mujoco.MjModel, d: mujoco.MjData, run: Run, ctrl: np.ndarray, re
         k = stop
     mujoco.mj_checkPos(m, d)
     mujoco.mj_checkVel(m, d)
+    if laws:
+        apply_laws(m, d, laws, base)
     if run.steps in row_of and not number[DIVERGED].any():
         mujoco.mj_forward(m, d)
         result.put(row_of[run.steps], d, run.body_ids, d.qpos, d.qvel)
     return not number[DIVERGED].any()
+
+
+def apply_laws(
+    m: mujoco.MjModel, d: mujoco.MjData, laws: Sequence[tuple[Law, np.ndarray]], base: Mapping[str, np.ndarray]
+) -> None:
+    """Let force laws act on the coming step, from fields as they are in `base` and no applied force."""
+    d.qfrc_applied[:] = 0
+    d.xfrc_applied[:] = 0
+    for name, value in base.items():
+        getattr(m, name)[:] = value
+    for law, values in laws:
+        law.apply(m, d, values)
 
 
 def stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:

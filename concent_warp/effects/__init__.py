@@ -1,0 +1,1 @@
+"""Physical effects that a model may lack: one small class each."""

@@ -1,0 +1,279 @@
+"""Effects in contacts: friction of five kinds, softness and rebound, adhesion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.contact_laws import AnisotropicForce
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.select import (
+    fingers,
+    free_bodies,
+    free_body_targets,
+    geoms_of,
+    name,
+    standing_geoms,
+    surfaces,
+)
+
+if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
+
+SLIDING, TORSIONAL, ROLLING = 0, 1, 2
+NEXT_TO_NOTHING = 1e-5
+"""MuJoCo's smallest friction coefficient."""
+COULOMB = f"Coulomb friction in MuJoCo's contacts, the larger of the two geoms' coefficients ({MUJOCO})"
+
+
+class SurfaceEffect(Effect):
+    """An effect where a free body touches what stands still."""
+
+    family = "contact"
+    kind = "body"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each free body."""
+        return free_body_targets(m)
+
+    def geoms(self, m: mujoco.MjModel) -> np.ndarray:
+        """Return the geoms of the target and of all that stands still, shape (n,) int."""
+        return np.unique(np.concatenate([surfaces(m, b) for b in self.ids(m)]))
+
+
+class FrictionEffect(SurfaceEffect):
+    """A friction coefficient of these contacts."""
+
+    column: int
+    """Which of MuJoCo's three coefficients."""
+    condim: int
+    """Dimension that a contact needs to have it."""
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Give the contacts the dimension, with next to no friction where it comes anew."""
+        for n in self.target:
+            body = spec.body(n)
+            if all(geom.condim >= self.condim for geom in body.geoms):
+                continue
+            for geom in (*body.geoms, *standing(spec)):
+                for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
+                    if geom.condim < needed <= self.condim:
+                        geom.friction[column] = NEXT_TO_NOTHING
+            for geom in body.geoms:
+                geom.condim = max(geom.condim, self.condim)
+
+    def null(self, m: mujoco.MjModel) -> float:
+        """Return the coefficient that the model has."""
+        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
+        if m.geom_condim[body].max() < self.condim:
+            return 0.0
+        return float(m.geom_friction[self.geoms(m), self.column].max())
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Friction."""
+        return ("geom_friction",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the coefficient."""
+        m.geom_friction[self.geoms(m), self.column] = max(float(values[0]), NEXT_TO_NOTHING)
+
+
+class SlidingFriction(FrictionEffect):
+    """Another coefficient of sliding friction."""
+
+    name = "sliding_friction"
+    summary = "The tangential force is at most a coefficient times the normal force."
+    source = COULOMB
+    signature = "residual force against sliding, whatever the speed, in proportion to the normal force"
+    confusions = ("anisotropic_friction", "mass", "grip_force", "gravity_tilt", "torsional_friction")
+    column, condim = SLIDING, 3
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One coefficient."""
+        return (Parameter("coefficient", "-", self.null(m), 0.0, 3.0, 0.15),)
+
+
+class TorsionalFriction(FrictionEffect):
+    """Friction against spinning in place."""
+
+    name = "torsional_friction"
+    summary = "The torque about the contact normal is at most a coefficient times the normal force."
+    source = COULOMB
+    signature = "spin about the normal that dies away too soon, while sliding is right"
+    confusions = ("sliding_friction", "inertia", "rolling_friction")
+    column, condim = TORSIONAL, 4
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One coefficient, a length."""
+        return (Parameter("coefficient", "m", self.null(m), 0.0, 0.2, 0.005, scan=(0.002, 0.01)),)
+
+
+class RollingFriction(FrictionEffect):
+    """Friction against rolling."""
+
+    name = "rolling_friction"
+    summary = "The torque about tangents of a contact is at most a coefficient times the normal force."
+    source = COULOMB
+    signature = "rolling that slows down at a constant rate"
+    confusions = ("sliding_friction", "air_drag", "gravity_tilt")
+    column, condim = ROLLING, 6
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One coefficient, a length."""
+        return (Parameter("coefficient", "m", self.null(m), 0.0, 0.1, 0.002, scan=(0.0005, 0.002)),)
+
+
+class AnisotropicFriction(SurfaceEffect):
+    """A surface with a grain."""
+
+    name = "anisotropic_friction"
+    summary = (
+        "Sliding along the world's y meets ratio times the friction of sliding along x: (ratio - 1) mu N more of it, "
+        "in proportion to the share of the sliding velocity along y."
+    )
+    source = "orthotropic Coulomb friction: Goyal, Ruina, Papadopoulos, Wear 143(2), 1991, as a force beside MuJoCo's"
+    signature = "residual force against sliding in one direction of the table only"
+    confusions = ("sliding_friction", "gravity_tilt")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One ratio."""
+        return (Parameter("ratio", "-", 1.0, 0.05, 10.0, 0.4),)
+
+    def law(self, m: mujoco.MjModel) -> Law:
+        """The force that the grain adds."""
+        return AnisotropicForce(m, self.ids(m))
+
+
+class ContactCompliance(SurfaceEffect):
+    """Contacts softer, harder or bouncier than the model's."""
+
+    name = "contact_compliance"
+    summary = "Time constant and damping ratio of the contact as a mass on a spring: softness and rebound."
+    source = f"MuJoCo's solref ({MUJOCO})"
+    signature = "height of rebounds; sinking in at rest and at impacts"
+    confusions = ("size", "adhesion", "air_drag")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each free body whose contacts have a time constant."""
+        return tuple(t for t in free_body_targets(m) if (m.geom_solref[cls(*t).geoms(m), 0] > 0).all())
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Time constant and damping ratio; the null values are the means of body and surroundings, as they act."""
+        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
+        rest = np.setdiff1d(self.geoms(m), body)
+        means = [m.geom_solref[ids].mean(axis=0) for ids in (body, rest) if len(ids)]
+        time, ratio = np.mean(means, axis=0)
+        least = 2 * m.opt.timestep
+        return (
+            Parameter("time_constant", "s", float(max(time, least)), least, 0.2, 0.5 * float(time)),
+            Parameter("damping_ratio", "-", float(ratio), 0.02, 5.0, 0.4, scan=(0.1 * ratio, 0.3 * ratio, 0.6 * ratio)),
+        )
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Reference of the contact's spring."""
+        return ("geom_solref",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set it."""
+        m.geom_solref[self.geoms(m)] = values
+
+
+class Adhesion(SurfaceEffect):
+    """Surfaces that stick to each other."""
+
+    name = "adhesion"
+    summary = "A force that pulls the body towards what it touches, over a gap of up to 1 mm, at each contact point."
+    source = f"MuJoCo's adhesion of geoms ({MUJOCO})"
+    signature = "lift-off and first slip too late; residual friction that does not go with the weight"
+    confusions = ("sliding_friction", "mass")
+    threshold = True
+    GAP = 0.001
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let contacts be found over the gap, without a force yet."""
+        for n in self.target:
+            for geom in spec.body(n).geoms:
+                geom.gap = max(geom.gap, self.GAP)
+                geom.adhesion = geom.adhesion or 1e-9
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One force for each contact point."""
+        weight = float(m.body_mass[self.ids(m)].sum() * np.linalg.norm(m.opt.gravity))
+        scan = tuple(weight * x for x in (0.1, 0.3, 1.0, 3.0))
+        return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Adhesion."""
+        return ("geom_adhesion",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set it on the body's geoms."""
+        m.geom_adhesion[np.concatenate([geoms_of(m, b) for b in self.ids(m)])] = max(float(values[0]), 1e-9)
+
+
+class PadFriction(Effect):
+    """Pads that hold better or worse than the model's."""
+
+    name = "pad_friction"
+    family = "contact"
+    kind = "body"
+    summary = "Sliding friction between the fingers and what they hold."
+    source = f"Coulomb friction in MuJoCo's contacts, the pads' coefficient by priority ({MUJOCO})"
+    signature = "what is held slips or does not"
+    confusions = ("grip_force", "mass")
+    threshold = True
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the fingers."""
+        found = tuple(n for b in fingers(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return (found,) if found else ()
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let the pads' friction count, and not the larger of the two; the same as before at the null value."""
+        rough = max((geom.friction[SLIDING] for body in loose(spec) for geom in body.geoms), default=0.0)
+        for n in self.target:
+            for geom in tree_geoms(spec.body(n)):
+                geom.friction[SLIDING] = max(geom.friction[SLIDING], rough)
+                geom.priority += 1
+
+    def geoms(self, m: mujoco.MjModel) -> np.ndarray:
+        """Return the fingers' geoms, shape (n,) int."""
+        return np.unique(np.concatenate([geoms_of(m, b) for b in self.ids(m)]))
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One coefficient."""
+        held = [geoms_of(m, b) for b in free_bodies(m)]
+        null = float(m.geom_friction[np.concatenate([self.geoms(m), *held]), SLIDING].max())
+        scan = tuple(null * x for x in (0.2, 0.4, 0.7, 1.5))
+        return (Parameter("coefficient", "-", null, 0.0, 5.0, 0.3 * null, scan=scan),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Friction."""
+        return ("geom_friction",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set it."""
+        m.geom_friction[self.geoms(m), SLIDING] = max(float(values[0]), NEXT_TO_NOTHING)
+
+
+def standing(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
+    """Return the geoms of an MJCF that cannot move."""
+    compiled = spec.copy().compile()
+    still = {int(i) for i in standing_geoms(compiled)}
+    return [geom for i, geom in enumerate(spec.geoms) if i in still]
+
+
+def loose(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
+    """Return the bodies of an MJCF that have a free joint."""
+    return [body for body in spec.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
+
+
+def tree_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
+    """Return the geoms of a body and of those fixed to it."""
+    return [*body.geoms, *(geom for child in body.bodies if not child.joints for geom in tree_geoms(child))]

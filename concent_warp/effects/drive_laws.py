@@ -1,0 +1,49 @@
+"""Play between drive and link as a force."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.law import Law
+from concent_warp.effects.select import driven_joints
+
+if TYPE_CHECKING:
+    import mujoco_warp as mjw
+    import warp as wp
+
+
+class DeadZone(Law):
+    """Takes back the part of a servo's torque that an error within the play makes.
+
+    tau = -gear kp clip(error, -gear play / 2, gear play / 2), so that kp times the dead zone of the error is left. The
+    parameter is the width of the play at the joint, shape (1,).
+    """
+
+    def __init__(self, actuators: np.ndarray) -> None:
+        """Act on position-controlled actuators of single joints, ids of shape (n,)."""
+        self.actuators = np.asarray(actuators, dtype=np.int32)
+        self._device: wp.array[Any] | None = None
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        half = 0.5 * max(float(values[0]), 0.0)
+        for a in self.actuators:
+            joint = driven_joints(m, int(a))[0]
+            gear = m.actuator_gear[a, 0]
+            error = d.ctrl[a] - gear * d.qpos[m.jnt_qposadr[joint]]
+            d.qfrc_applied[m.jnt_dofadr[joint]] -= (
+                gear * m.actuator_gainprm[a, 0] * np.clip(error, -gear * half, gear * half)
+            )
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """See `Law.launch`."""
+        import warp as wp
+
+        from concent_warp.kernels import laws
+
+        if self._device is None:
+            self._device = wp.array(self.actuators, dtype=int)
+        laws.dead_zone(m, d, self._device, values)

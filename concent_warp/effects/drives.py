@@ -1,0 +1,322 @@
+"""Effects in drives: gain, saturation, delay, lag, play, elasticity, gravity compensation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.drive_laws import DeadZone
+from concent_warp.effects.effect import Effect, Parameter, Reader
+from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.select import (
+    arm_actuators,
+    dof_of,
+    driven_joints,
+    gripper_actuators,
+    name,
+    robot_bodies,
+    servo_gain,
+)
+
+if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
+
+FORCE_SENSOR = "concent_force_{}"
+"""Sensor that is added for an actuator whose force an effect needs to know."""
+
+
+class DriveEffect(Effect):
+    """An effect on the actuators of an arm."""
+
+    family = "joints"
+    kind = "actuator"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all actuators but the gripper's."""
+        found = arm_actuators(m)
+        return (found,) if found else ()
+
+
+class ServoEffect(DriveEffect):
+    """An effect on position-controlled actuators of single joints."""
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the position-controlled actuators of single joints."""
+        found = tuple(
+            n for n in arm_actuators(m) if servo_gain(m, (a := m.actuator(n).id)) > 0 and len(driven_joints(m, a)) == 1
+        )
+        return (found,) if found else ()
+
+
+class ActuatorGain(DriveEffect):
+    """A drive stronger or weaker than on its data sheet."""
+
+    name = "actuator_gain"
+    summary = "The drive's force is the model's times a factor, feedback included."
+    source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
+    signature = "residual torque in proportion to the commanded one; more or less sag under load"
+    confusions = ("joint_compliance", "gravity_compensation", "load_friction", "mass")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One factor for each actuator."""
+        return self.each("gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Gain and bias."""
+        return ("actuator_gainprm", "actuator_biasprm")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale gain and bias."""
+        ids = self.ids(m)
+        m.actuator_gainprm[ids, :3] *= values[:, None]
+        m.actuator_biasprm[ids, :3] *= values[:, None]
+
+
+class GripForce(ActuatorGain):
+    """A gripper that holds harder or softer than the model's."""
+
+    name = "grip_force"
+    family = "contact"
+    summary = "The gripper's force is the model's times a factor."
+    source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
+    signature = "what is held slips or does not; fingers close slower or faster"
+    confusions = ("pad_friction", "mass")
+    threshold = True
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the actuators of the fingers."""
+        found = tuple(n for a in gripper_actuators(m) if (n := name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a)))
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One factor for all."""
+        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=(0.3, 0.6, 1.6, 3.0)),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
+        """Gain, bias and limit of the force."""
+        return (*super().fields(m), "actuator_forcerange")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale gain, bias and limits."""
+        super().write(m, np.broadcast_to(values, (len(self.target),)))
+        m.actuator_forcerange[self.ids(m)] *= values
+
+
+class ActuatorSaturation(DriveEffect):
+    """A drive whose force has a lower limit than the model's."""
+
+    name = "actuator_saturation"
+    summary = "The drive's force does not exceed a limit."
+    source = f"MuJoCo's force range ({MUJOCO})"
+    signature = "residuals only where much torque is commanded: slow start, late arrival"
+    confusions = ("actuator_gain", "actuator_lag")
+    threshold = True
+    FREE = 1e6
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Give each actuator a limit, far away."""
+        for n in self.target:
+            actuator = spec.actuator(n)
+            if not actuator.forcelimited or actuator.forcerange[1] <= actuator.forcerange[0]:
+                actuator.forcelimited = True
+                actuator.forcerange = [-self.FREE, self.FREE]
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One limit for all actuators of the target, as a share of the largest typical torque of each."""
+        joints = np.array([driven_joints(m, a)[0] for a in self.ids(m)])
+        top = float(np.max(20 * m.dof_M0[dof_of(m, joints)]))
+        scan = tuple(top * share for share in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2))
+        return (Parameter("limit", "N m", np.inf, 0.0, 100 * top, top, scan=scan),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Limits of the force."""
+        return ("actuator_forcerange",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the limits, those that the model has already kept."""
+        ids = self.ids(m)
+        limit = min(float(values[0]), self.FREE)
+        m.actuator_forcerange[ids, 0] = np.maximum(m.actuator_forcerange[ids, 0], -limit)
+        m.actuator_forcerange[ids, 1] = np.minimum(m.actuator_forcerange[ids, 1], limit)
+
+
+class ActuatorDelay(DriveEffect):
+    """Commands that act later than they were given."""
+
+    name = "actuator_delay"
+    summary = "What acts at time t was commanded at t - delay."
+    source = "transport delay; linear between time steps"
+    signature = "residuals in proportion to the commanded speed; all later by the same time"
+    confusions = ("latency", "actuator_lag", "joint_damping")
+    history = 0.3
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One delay for all."""
+        return (Parameter("delay", "s", 0.0, 0.0, self.history, 0.02),)
+
+    def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Shift the commands."""
+        late, ids = ctrl.copy(), self.ids(m)
+        position = np.maximum(np.arange(len(ctrl)) - max(float(values[0]), 0.0) / m.opt.timestep, 0.0)
+        lower = np.floor(position).astype(int)
+        upper = np.minimum(lower + 1, len(ctrl) - 1)
+        weight = (position - lower)[:, None]
+        late[:, ids] = (1 - weight) * ctrl[lower][:, ids] + weight * ctrl[upper][:, ids]
+        return late
+
+
+class ActuatorLag(DriveEffect):
+    """A drive that follows its commands sluggishly."""
+
+    name = "actuator_lag"
+    summary = "The set point y follows the command u as time_constant dy/dt = u - y."
+    source = "first-order lag, exact for commands that are held over a step, taken at mid-step"
+    signature = "rounded corners after steps of the command"
+    confusions = ("actuator_delay", "joint_damping", "latency")
+    history = 0.5
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One time constant for all."""
+        return (Parameter("time_constant", "s", 0.0, 0.0, 1.0, 0.02),)
+
+    def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Filter the commands."""
+        from scipy.signal import lfilter
+
+        tau = float(values[0])
+        if tau < 1e-5:
+            return ctrl
+        slow, ids = ctrl.copy(), self.ids(m)
+        keep, half = np.exp(-m.opt.timestep / tau), np.exp(-0.5 * m.opt.timestep / tau)
+        u = ctrl[:, ids]
+        before = lfilter([0, 1 - keep], [1, -keep], u - u[0], axis=0) + u[0]
+        slow[:, ids] = u + (np.asarray(before) - u) * half
+        return slow
+
+
+class Backlash(ServoEffect):
+    """Play between drive and link."""
+
+    name = "backlash"
+    summary = "No torque while the link is within half the play of where the drive wants it: a dead zone of the error."
+    source = "dead-zone model: Nordin and Gutman, Automatica 38(10), 2002; gear and rotor without mass"
+    signature = "error that flips by the play at each reversal of the load; free swing in between"
+    confusions = ("joint_friction", "stribeck_friction", "joint_compliance")
+    threshold = True
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One width of the play for all."""
+        slide = all(m.jnt_type[driven_joints(m, a)[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in self.ids(m))
+        unit, size = ("m", 0.1) if slide else ("rad", 1.0)
+        scan = tuple(size * x for x in (0.005, 0.01, 0.02, 0.04, 0.08))
+        return (Parameter("play", unit, 0.0, 0.0, 0.5 * size, 0.02 * size, scan=scan),)
+
+    def law(self, m: mujoco.MjModel) -> Law:
+        """Torque that takes back the drive's within the play."""
+        return DeadZone(self.ids(m))
+
+
+class JointCompliance(ServoEffect):
+    """Gears and links that give; the encoder sits on the motor's side."""
+
+    name = "joint_compliance"
+    summary = (
+        "A spring between motor and link, without rotor inertia: the drive acts through kp / (1 + kp c), and the "
+        "encoder reads the link's angle plus c tau."
+    )
+    source = "elastic joints after Spong, J. Dyn. Sys. Meas. Control 109(4), 1987, in the limit of no rotor inertia"
+    signature = "what the robot carries sags and swings; the encoder reads less of it"
+    confusions = ("actuator_gain", "joint_offset", "backlash")
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Add a sensor of each drive's force."""
+        known = {sensor.name for sensor in spec.sensors}
+        for n in self.target:
+            if FORCE_SENSOR.format(n) not in known:
+                spec.add_sensor(
+                    name=FORCE_SENSOR.format(n),
+                    type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
+                    objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
+                    objname=n,
+                )
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One compliance for each joint."""
+        gains = np.array([servo_gain(m, a) for a in self.ids(m)])
+        slide = all(m.jnt_type[driven_joints(m, a)[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in self.ids(m))
+        unit = "m/N" if slide else "rad/(N m)"
+        return tuple(
+            Parameter(f"compliance[{t}]", unit, 0.0, 0.0, 10 / kp, 0.2 / kp)
+            for t, kp in zip(self.target, gains, strict=True)
+        )
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Gain and bias."""
+        return ("actuator_gainprm", "actuator_biasprm")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Weaken the drives by the spring in series."""
+        ids = self.ids(m)
+        share = 1 / (1 + m.actuator_gainprm[ids, 0] * np.maximum(values, 0.0))
+        m.actuator_gainprm[ids, :3] *= share[:, None]
+        m.actuator_biasprm[ids, :3] *= share[:, None]
+
+    def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:
+        """Add the twist of the spring to what encoders read."""
+        springs = {}
+        for n, a, c in zip(self.target, self.ids(m), values, strict=True):
+            joint = driven_joints(m, a)[0]
+            for i in range(m.nsensor):
+                encoder = m.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_JOINTPOS) and m.sensor_objid[i] == joint
+                if encoder:
+                    springs[m.sensor(i).name] = (FORCE_SENSOR.format(n), c / float(m.actuator_gear[a, 0]))
+
+        def reading(sensor: str, time: np.ndarray) -> np.ndarray:
+            value = read(sensor, time)
+            if sensor not in springs:
+                return value
+            force, c = springs[sensor]
+            return value + c * read(force, time)
+
+        return reading
+
+
+class GravityCompensation(Effect):
+    """A controller that holds up more or less than the robot's weight."""
+
+    name = "gravity_compensation"
+    family = "joints"
+    kind = "body"
+    summary = "Each link is pushed up by a share of its weight, beyond what the model has."
+    source = f"MuJoCo's gravcomp ({MUJOCO})"
+    signature = "residual torque like the gravity load, in every pose"
+    confusions = ("mass", "center_of_mass", "actuator_gain", "gravity_tilt")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the links of the robot."""
+        found = tuple(n for b in robot_bodies(m) if m.body_mass[b] > 0 and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return (found,) if found else ()
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Switch compensation on, of next to nothing."""
+        for n in self.target:
+            body = spec.body(n)
+            body.gravcomp = body.gravcomp or 1e-9
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One share for all links: positive lifts."""
+        return (Parameter("share", "-", 0.0, -1.5, 1.5, 0.1),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Compensation."""
+        return ("body_gravcomp",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Add to the compensation."""
+        m.body_gravcomp[self.ids(m)] += values[0]

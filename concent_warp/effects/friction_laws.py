@@ -1,0 +1,71 @@
+"""Joint friction that depends on speed or load: the friction loss, set anew before each step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.law import Law
+
+if TYPE_CHECKING:
+    import mujoco_warp as mjw
+    import warp as wp
+
+
+class DofLaw(Law):
+    """A law that acts on some degrees of freedom."""
+
+    def __init__(self, dof: np.ndarray) -> None:
+        """Act on the degrees of freedom `dof`, shape (n,) int."""
+        self.dof = np.asarray(dof, dtype=np.int32)
+        self._device: wp.array[Any] | None = None
+
+    def device_dof(self) -> wp.array[Any]:
+        """Return `dof` on Warp's current device."""
+        import warp as wp
+
+        if self._device is None:
+            self._device = wp.array(self.dof, dtype=int)
+        return self._device
+
+
+class StribeckFriction(DofLaw):
+    """Friction loss + extra exp(-(qd / speed)^2); parameters are the extras, shape (n,), then the speed."""
+
+    edits = ("dof_frictionloss", "dof_solref")
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        ratio = d.qvel[self.dof] / max(values[-1], 1e-6)
+        m.dof_frictionloss[self.dof] += np.maximum(values[:-1], 0.0) * np.exp(-ratio * ratio)
+        m.dof_solref[self.dof] = (1.5 * m.opt.timestep, 1.0)
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """See `Law.launch`."""
+        from concent_warp.kernels import laws
+
+        laws.stribeck(m, d, self.device_dof(), values)
+
+
+class LoadFriction(DofLaw):
+    """Friction loss + c |tau_m - tau_e| / 2, of the step before; parameters are the c, shape (n,).
+
+    tau_m is what the motor exerts, tau_e what the link's weight and motion do; in a static hold they are opposite, and
+    half their difference is the torque that the gears carry.
+    """
+
+    edits = ("dof_frictionloss", "dof_solref")
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        load = 0.5 * np.abs(d.qfrc_actuator[self.dof] + d.qfrc_bias[self.dof])
+        m.dof_frictionloss[self.dof] += np.maximum(values, 0.0) * load
+        m.dof_solref[self.dof] = (1.5 * m.opt.timestep, 1.0)
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """See `Law.launch`."""
+        from concent_warp.kernels import laws
+
+        laws.load(m, d, self.device_dof(), values)

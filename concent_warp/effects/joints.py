@@ -1,0 +1,187 @@
+"""Effects in joints: friction of four kinds, rotor inertia, zero offset."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.friction_laws import LoadFriction, StribeckFriction
+from concent_warp.effects.select import dof_of, joints_by_type, typical_torque
+
+if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
+
+STIFF = 1.5
+"""Time constant of friction constraints in time steps; MuJoCo's default creeps."""
+MUJOCO = "MuJoCo documentation, chapters Computation and Modeling"
+
+
+class JointEffect(Effect):
+    """An effect with one parameter for each joint."""
+
+    family = "joints"
+    kind = "joint"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all hinges, and all slides."""
+        return joints_by_type(m)
+
+    def units(self, m: mujoco.MjModel, hinge: str, slide: str) -> str:
+        """Return the unit on the target's joints."""
+        kinds = m.jnt_type[self.ids(m)]
+        return slide if (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)).all() else hinge
+
+    def spread(
+        self, name: str, unit: str, null: np.ndarray, scale: np.ndarray, high: np.ndarray
+    ) -> tuple[Parameter, ...]:
+        """Return one parameter a joint, from 0 up."""
+        rows = zip(self.target, null, high, scale, strict=True)
+        return tuple(Parameter(f"{name}[{t}]", unit, float(n), 0.0, float(h), float(s)) for t, n, h, s in rows)
+
+
+class JointFriction(JointEffect):
+    """Dry friction in joints."""
+
+    name = "joint_friction"
+    summary = "A torque of constant size against the motion, which holds the joint at rest: |tau| <= F."
+    source = f"Coulomb friction; MuJoCo's friction loss ({MUJOCO})"
+    signature = "residual torque like -sign(velocity), whatever the speed; jumps at reversals, sticks in slow motion"
+    confusions = ("joint_damping", "stribeck_friction", "load_friction")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One torque for each joint."""
+        ids = self.ids(m)
+        scale = typical_torque(m, ids)
+        null = m.dof_frictionloss[dof_of(m, ids)]
+        return self.spread("torque", self.units(m, "N m", "N"), null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Friction loss and how stiffly it holds."""
+        return ("dof_frictionloss", "dof_solref")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the friction loss."""
+        dof = dof_of(m, self.ids(m))
+        m.dof_frictionloss[dof] = np.maximum(values, 0.0)
+        m.dof_solref[dof] = (STIFF * m.opt.timestep, 1.0)
+
+
+class JointDamping(JointEffect):
+    """Viscous friction in joints."""
+
+    name = "joint_damping"
+    summary = "A torque against the motion in proportion to the speed: tau = -d qd."
+    source = f"viscous friction; MuJoCo's joint damping ({MUJOCO})"
+    signature = "residual torque in proportion to velocity"
+    confusions = ("joint_friction", "actuator_gain", "air_drag")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One coefficient for each joint."""
+        ids = self.ids(m)
+        scale, null = typical_torque(m, ids), m.dof_damping[dof_of(m, ids)]
+        unit = self.units(m, "N m s/rad", "N s/m")
+        return self.spread("damping", unit, null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Damping."""
+        return ("dof_damping",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the damping."""
+        m.dof_damping[dof_of(m, self.ids(m))] = np.maximum(values, 0.0)
+
+
+class Armature(JointEffect):
+    """Inertia of rotors behind gears."""
+
+    name = "armature"
+    summary = "Rotor inertia times the square of the gear ratio, added to the joint's own inertia."
+    source = f"MuJoCo's armature ({MUJOCO})"
+    signature = "residual torque in proportion to acceleration"
+    confusions = ("mass", "inertia", "actuator_lag")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One inertia for each joint."""
+        ids = self.ids(m)
+        inertia, null = m.dof_M0[dof_of(m, ids)], m.dof_armature[dof_of(m, ids)]
+        return self.spread("inertia", self.units(m, "kg m^2", "kg"), null, 0.3 * inertia, null + 10 * inertia)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Armature."""
+        return ("dof_armature",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the armature."""
+        m.dof_armature[dof_of(m, self.ids(m))] = np.maximum(values, 0.0)
+
+
+class JointOffset(JointEffect):
+    """Zero of encoder and drive that is not where the drawing has it."""
+
+    name = "joint_offset"
+    summary = "Encoder and drive count from a zero that lies off the drawing's by an angle."
+    source = "kinematic calibration: Hollerbach, Khalil, Gautier, in Springer Handbook of Robotics, 2016"
+    signature = "gravity load of the wrong phase; constant pose error of what the robot carries, none in its encoders"
+    confusions = ("sensor_bias", "gravity_tilt", "frame_offset")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One offset for each joint: how far the true angle is beyond the reading."""
+        slide = self.units(m, "rad", "m") == "m"
+        high, scale = (0.05, 0.003) if slide else (0.5, 0.03)
+        return self.each("offset", "m" if slide else "rad", 0.0, low=-high, high=high, scale=scale)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Reading at which the joint is as drawn."""
+        return ("qpos0",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Shift the reading at which the joint is as drawn."""
+        m.qpos0[m.jnt_qposadr[self.ids(m)]] -= values
+
+
+class Stribeck(JointEffect):
+    """More friction at rest than in motion."""
+
+    name = "stribeck_friction"
+    summary = "Friction beyond the joint's own that fades with speed: extra exp(-(qd / speed)^2)."
+    source = "Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994"
+    signature = "stick-slip and overshoot out of rest; residual torque near zero speed only"
+    confusions = ("joint_friction", "backlash")
+    threshold = True
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """One torque for each joint, and the speed at which it has fallen to a third."""
+        ids = self.ids(m)
+        torque, zero = typical_torque(m, ids), np.zeros(len(ids))
+        parameters = self.spread("extra", self.units(m, "N m", "N"), zero, 0.3 * torque, 20 * torque)
+        slide = self.units(m, "rad", "m") == "m"
+        speed = Parameter(
+            "speed", "m/s" if slide else "rad/s", 0.02 if slide else 0.2, 1e-3, 5.0, 0.02 if slide else 0.2
+        )
+        return (*parameters, speed)
+
+    def law(self, m: mujoco.MjModel) -> Law:
+        """Friction loss that depends on speed."""
+        return StribeckFriction(dof_of(m, self.ids(m)))
+
+
+class LoadDependentFriction(JointEffect):
+    """Friction that grows with the torque which the gears carry."""
+
+    name = "load_friction"
+    summary = "Friction beyond the joint's own in proportion to the load between motor and link: c |tau_m - tau_e| / 2."
+    source = "Duclusaud, Passault, Padois, Daney: Extended friction models for the simulation of servo actuators, 2024"
+    signature = "residual torque like -sign(velocity) |load|"
+    confusions = ("joint_friction", "actuator_gain")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One coefficient for each joint."""
+        return self.each("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
+
+    def law(self, m: mujoco.MjModel) -> Law:
+        """Friction loss that depends on load."""
+        return LoadFriction(dof_of(m, self.ids(m)))

@@ -1,0 +1,50 @@
+"""Forces that MuJoCo has no field for: recomputed from the state before each step, on both engines.
+
+A law writes to what the engine clears or restores before each step (`qfrc_applied`, `xfrc_applied`) or overwrites
+(`dof_frictionloss`). It sees positions and velocities of this step; what MuJoCo derives from them (forces, contacts)
+is still that of the step before.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco_warp as mjw
+    import warp as wp
+
+
+class Law:
+    """A force law with P parameters; what it acts on is fixed when it is made."""
+
+    edits: ClassVar[tuple[str, ...]] = ()
+    """Fields of the compiled model that it overwrites."""
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """Apply it in C MuJoCo.
+
+        Args:
+            m: Model of this variant alone; `edits` may be overwritten.
+            d: Its data; to be added to: `qfrc_applied` (nv,) [N m or N], `xfrc_applied` (nbody, 6) [N, N m].
+            values: Parameters, shape (P,).
+        """
+        raise NotImplementedError
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """Launch the same in MuJoCo-Warp, for all worlds.
+
+        Args:
+            m: Model; `edits` have one row a world.
+            d: Data.
+            values: Parameters, shape (N, P), float32.
+
+        Raises:
+            EngineError: The law runs in C MuJoCo only.
+        """
+        from concent_warp.errors import EngineError
+
+        del m, d, values
+        raise EngineError(f"{type(self).__name__} cannot run on MuJoCo-Warp", fix="use the mujoco engine")

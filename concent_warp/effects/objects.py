@@ -1,0 +1,140 @@
+"""Effects of what an object is: mass, where it sits, inertia, size."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.select import free_bodies, last_links, name
+
+
+class BodyEffect(Effect):
+    """An effect on one body: a free one, or what an arm carries."""
+
+    family = "objects"
+    kind = "body"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each free body and each last link of an arm."""
+        found = [name(m, mujoco.mjtObj.mjOBJ_BODY, b) for b in (*free_bodies(m), *last_links(m)) if m.body_mass[b] > 0]
+        return tuple((n,) for n in found if n)
+
+
+class Mass(BodyEffect):
+    """A body heavier or lighter than the model's."""
+
+    name = "mass"
+    summary = "Mass and inertia are the model's times a factor."
+    source = "rigid-body dynamics"
+    signature = "residual force in proportion to acceleration and gravity; how far pushes and throws carry"
+    confusions = ("actuator_gain", "sliding_friction", "armature", "grip_force")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One factor."""
+        return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Mass and inertia."""
+        return ("body_mass", "body_inertia")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale both."""
+        m.body_mass[self.ids(m)] *= values[0]
+        m.body_inertia[self.ids(m)] *= values[0]
+
+
+class CenterOfMass(BodyEffect):
+    """A centre of mass off the model's."""
+
+    name = "center_of_mass"
+    summary = "The centre of mass lies off the model's, in the body's frame; the inertia about it is the model's."
+    source = "rigid-body dynamics"
+    signature = "turns when pushed or dropped straight; tips over one edge before the other"
+    confusions = ("gravity_tilt", "frame_offset", "gravity_compensation")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """An offset along each axis of the body."""
+        body = self.ids(m)[0]
+        size = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
+        return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Centre of mass."""
+        return ("body_ipos",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Shift it."""
+        m.body_ipos[self.ids(m)] += values
+
+
+class Inertia(BodyEffect):
+    """An inertia that is not the model's."""
+
+    name = "inertia"
+    summary = "The inertia is the model's times a factor; the mass stays."
+    source = "rigid-body dynamics"
+    signature = "residual torque in proportion to angular acceleration; spins and rebounds too fast or too slow"
+    confusions = ("armature", "size", "center_of_mass")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One factor."""
+        return (Parameter("inertia", "-", 1.0, 0.1, 10.0, 0.3),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Inertia."""
+        return ("body_inertia",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale it."""
+        m.body_inertia[self.ids(m)] *= values[0]
+
+
+class Size(BodyEffect):
+    """A body larger or smaller than drawn."""
+
+    name = "size"
+    summary = (
+        "All geoms of the body, their sizes and places in it, are the model's times a factor; mass and inertia stay."
+    )
+    source = "geometry"
+    signature = "offset of the resting height; contacts come early or late"
+    confusions = ("length_scale", "frame_offset", "contact_geometry")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return each free body."""
+        return tuple((n,) for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """One factor."""
+        return (Parameter("size", "-", 1.0, 0.5, 2.0, 0.02),)
+
+    def edit(self, spec: mujoco.MjSpec, values: np.ndarray) -> None:
+        """Scale the geoms of the body; what MuJoCo would derive from them is fixed first."""
+        compiled = spec.copy().compile()
+        scale = float(values[0])
+        for n in self.target:
+            body, b = spec.body(n), compiled.body(n).id
+            body.explicitinertial = True
+            body.mass, body.inertia = float(compiled.body_mass[b]), compiled.body_inertia[b]
+            body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
+            for geom in body.geoms:
+                geom.pos = scale * np.array(geom.pos)
+                if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
+                    scale_mesh(spec, geom, scale)
+                else:
+                    geom.size = scale * np.array(geom.size)
+                    geom.fromto = scale * np.array(geom.fromto)
+
+
+def scale_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, scale: float) -> None:
+    """Give a geom a scaled copy of its mesh."""
+    mesh = spec.mesh(geom.meshname)
+    copy = spec.add_mesh(name=f"{mesh.name}_{geom.name or geom.id}_scaled")
+    copy.uservert, copy.userface = list(mesh.uservert), list(mesh.userface)
+    copy.scale = scale * np.array(mesh.scale)
+    copy.refpos, copy.refquat = mesh.refpos, mesh.refquat
+    copy.inertia = mesh.inertia
+    geom.meshname = copy.name

@@ -1,0 +1,87 @@
+"""Which effects there are: ours, and those that installed packages register.
+
+A package adds its own by an entry point of the group ``concent_warp.effects`` that names a subclass of `Effect`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import entry_points
+
+from concent_warp.effects import contact, drives, joints, measurement, objects, world
+from concent_warp.effects.effect import Effect
+from concent_warp.errors import ModelError
+
+GROUP = "concent_warp.effects"
+OURS: tuple[type[Effect], ...] = (
+    joints.JointFriction,
+    joints.JointDamping,
+    joints.Stribeck,
+    joints.LoadDependentFriction,
+    joints.Armature,
+    drives.ActuatorGain,
+    drives.ActuatorSaturation,
+    drives.ActuatorDelay,
+    drives.ActuatorLag,
+    drives.Backlash,
+    drives.JointCompliance,
+    joints.JointOffset,
+    drives.GravityCompensation,
+    objects.Mass,
+    objects.CenterOfMass,
+    objects.Inertia,
+    objects.Size,
+    contact.SlidingFriction,
+    contact.AnisotropicFriction,
+    contact.TorsionalFriction,
+    contact.RollingFriction,
+    contact.ContactCompliance,
+    contact.Adhesion,
+    drives.GripForce,
+    contact.PadFriction,
+    world.GravityTilt,
+    world.AirDrag,
+    world.Wind,
+    measurement.TimeBase,
+    measurement.Latency,
+    measurement.LengthScale,
+    measurement.FrameOffset,
+    measurement.SensorBias,
+    measurement.SensorGain,
+)
+
+
+@cache
+def effects() -> dict[str, type[Effect]]:
+    """Return all effects by name.
+
+    Raises:
+        ModelError: A package registers something else than an effect, or a name that is taken.
+    """
+    found: dict[str, type[Effect]] = {effect.name: effect for effect in OURS}
+    for entry in entry_points(group=GROUP):
+        loaded = entry.load()
+        if not (isinstance(loaded, type) and issubclass(loaded, Effect)):
+            raise ModelError(
+                "not an effect", where=f"entry point {entry.name} = {entry.value}", expected="a subclass of Effect"
+            )
+        if loaded.name in found:
+            raise ModelError("the name of an effect is taken", where=f"entry point {entry.value}", found=loaded.name)
+        found[loaded.name] = loaded
+    return found
+
+
+def effect_class(name: str) -> type[Effect]:
+    """Return the effect of a name.
+
+    Raises:
+        ModelError: There is none.
+    """
+    import difflib
+
+    known = effects()
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}"
+    raise ModelError(f"no effect {name!r}", fix=hint)

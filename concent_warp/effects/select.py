@@ -1,0 +1,146 @@
+"""What an effect may apply to in a model: driven joints, free bodies, fingers, what stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+
+JOINT = mujoco.mjtJoint
+SENSOR = mujoco.mjtSensor
+SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
+POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
+JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
+
+
+def name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
+    """Return the name of an element, empty where it has none."""
+    return mujoco.mj_id2name(m, kind, int(i)) or ""
+
+
+def joints_by_type(m: mujoco.MjModel, among: Iterable[int] | None = None) -> tuple[tuple[str, ...], ...]:
+    """Return the names of hinges, then of slides; a selection without members is left out."""
+    ids = range(m.njnt) if among is None else sorted(among)
+    groups = [
+        tuple(n for j in ids if int(m.jnt_type[j]) == kind and (n := name(m, mujoco.mjtObj.mjOBJ_JOINT, j)))
+        for kind in SINGLE
+    ]
+    return tuple(group for group in groups if group)
+
+
+def driven_joints(m: mujoco.MjModel, actuator: int) -> list[int]:
+    """Return the joints that an actuator drives, directly or through a tendon that adds joints up."""
+    kind, target = m.actuator_trntype[actuator], int(m.actuator_trnid[actuator, 0])
+    if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+        return [target]
+    if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
+        first = m.tendon_adr[target]
+        wraps = range(first, first + m.tendon_num[target])
+        return [int(m.wrap_objid[w]) for w in wraps if m.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT)]
+    return []
+
+
+def free_bodies(m: mujoco.MjModel) -> list[int]:
+    """Return the bodies with a free joint."""
+    return [int(m.jnt_bodyid[j]) for j in range(m.njnt) if m.jnt_type[j] == int(JOINT.mjJNT_FREE)]
+
+
+def free_body_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+    """Return one selection for each free body that has a name."""
+    return tuple((n,) for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+
+
+def fingers(m: mujoco.MjModel) -> list[int]:
+    """Return the bodies of a parallel gripper's fingers: neighbours that slide against the body which carries both."""
+    sliding = [
+        int(m.jnt_bodyid[j])
+        for j in range(m.njnt)
+        if m.jnt_type[j] == int(JOINT.mjJNT_SLIDE) and m.body_jntnum[m.jnt_bodyid[j]] == 1
+    ]
+    parents = [int(m.body_parentid[b]) for b in sliding]
+    return [b for b, parent in zip(sliding, parents, strict=True) if parent and parents.count(parent) > 1]
+
+
+def gripper_actuators(m: mujoco.MjModel) -> list[int]:
+    """Return the actuators that drive fingers."""
+    found = set(fingers(m))
+    return [a for a in range(m.nu) if any(int(m.jnt_bodyid[j]) in found for j in driven_joints(m, a))]
+
+
+def arm_actuators(m: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the names of the actuators of single joints that are not fingers."""
+    gripper = set(gripper_actuators(m))
+    return tuple(
+        n
+        for a in range(m.nu)
+        if a not in gripper and driven_joints(m, a) and (n := name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a))
+    )
+
+
+def servo_gain(m: mujoco.MjModel, actuator: int) -> float:
+    """Return the position gain of a position-controlled actuator, 0 for another."""
+    gain, bias = float(m.actuator_gainprm[actuator, 0]), float(m.actuator_biasprm[actuator, 1])
+    affine = m.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return gain if affine and gain > 0 and abs(gain + bias) <= 1e-6 * gain else 0.0
+
+
+def robot_bodies(m: mujoco.MjModel) -> list[int]:
+    """Return the bodies that an actuated joint carries."""
+    roots = {int(m.jnt_bodyid[j]) for a in range(m.nu) for j in driven_joints(m, a)}
+    carried = []
+    for b in range(1, m.nbody):
+        above = b
+        while above and above not in roots:
+            above = int(m.body_parentid[above])
+        if above:
+            carried.append(b)
+    return carried
+
+
+def last_links(m: mujoco.MjModel) -> list[int]:
+    """Return the moving bodies that carry no other moving body, but for free bodies and fingers; with fingers, what
+    carries them.
+    """
+    free, finger = set(free_bodies(m)), set(fingers(m))
+    jointed = {int(m.jnt_bodyid[j]) for j in range(m.njnt)} - free - finger
+    above = set()
+    for b in jointed:
+        parent = int(m.body_parentid[b])
+        while parent:
+            above.add(parent)
+            parent = int(m.body_parentid[parent])
+    return sorted(jointed - above)
+
+
+def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return the geoms that move as one with a body, shape (n,) int."""
+    return np.flatnonzero(m.body_weldid[m.geom_bodyid] == m.body_weldid[body])
+
+
+def standing_geoms(m: mujoco.MjModel) -> np.ndarray:
+    """Return the geoms that cannot move, shape (n,) int."""
+    return geoms_of(m, 0)
+
+
+def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
+    """Return the colliding geoms of a body and of all that stands still: where it slides, rolls and lands."""
+    ids = np.union1d(geoms_of(m, body), standing_geoms(m))
+    return ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
+
+
+def sensors_by_type(m: mujoco.MjModel, kinds: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the names of the sensors of some kinds."""
+    return tuple(
+        n for i in range(m.nsensor) if int(m.sensor_type[i]) in kinds and (n := name(m, mujoco.mjtObj.mjOBJ_SENSOR, i))
+    )
+
+
+def dof_of(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """Return the degree of freedom of each hinge or slide, shape (n,) int."""
+    return m.jnt_dofadr[joints]
+
+
+def typical_torque(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
+    """Return the torque [N m] or force [N] that moves each joint at 10 rad/s^2 or m/s^2, shape (n,)."""
+    return 10.0 * m.dof_M0[dof_of(m, joints)]

@@ -1,0 +1,96 @@
+"""Effects in a model file: a table each with name, target, values and intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.effect import AddedEffect, Effect
+from concent_warp.effects.registry import effect_class
+from concent_warp.errors import ModelError
+
+
+def checked_values(
+    effect: Effect, m: mujoco.MjModel, values: Mapping[str, float] | Sequence[float] | None
+) -> tuple[float, ...]:
+    """Return the values of an effect's parameters in their order.
+
+    Args:
+        effect: The effect.
+        m: The model without it, which its null values are taken from.
+        values: By name or in their order; None or a name that is missing gives the null value.
+
+    Raises:
+        ModelError: A name is unknown, a number is missing, or a value is out of bounds.
+    """
+    parameters = effect.parameters(m)
+    known = [p.name for p in parameters]
+    if values is None:
+        values = {}
+    if isinstance(values, Mapping):
+        if unknown := sorted(set(values) - set(known)):
+            raise ModelError(f"{effect.name} has no such parameter", expected=f"some of {known}", found=unknown)
+        values = [values.get(p.name, p.null) for p in parameters]
+    if len(values) != len(parameters):
+        raise ModelError(f"wrong number of values for {effect.name}", expected=f"{known}", found=len(values))
+    for parameter, value in zip(parameters, values, strict=True):
+        if not (parameter.low <= value <= parameter.high or value == parameter.null):
+            raise ModelError(
+                f"{effect.name}: {parameter.name} is out of bounds",
+                expected=f"{parameter.low:g} to {parameter.high:g} {parameter.unit}",
+                found=value,
+            )
+    return tuple(float(value) for value in values)
+
+
+def effects_table(effects: Sequence[AddedEffect]) -> list[dict[str, Any]]:
+    """Return effects as the tables of a model file."""
+    rows = []
+    for added in effects:
+        row: dict[str, Any] = {"name": added.effect.name, "target": list(added.effect.target)}
+        row["values"] = list(added.values)
+        if added.intervals:
+            row["intervals"] = [list(pair) for pair in added.intervals]
+        rows.append(row)
+    return rows
+
+
+def read_effects(rows: Any, path: Path) -> list[AddedEffect]:
+    """Read the ``[[effect]]`` tables of a model file, strictly; values are checked against the model elsewhere.
+
+    Raises:
+        ModelError: An entry is missing, unknown or of another type.
+    """
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ModelError("effects are not tables", where=path, expected="[[effect]] tables")
+    found = []
+    for i, row in enumerate(rows):
+        where = f"{path}: effect {i}"
+        if unknown := sorted(set(row) - {"name", "target", "values", "intervals"}):
+            raise ModelError("unknown entries", where=where, expected="name, target, values, intervals", found=unknown)
+        name, target, values = row.get("name"), row.get("target", []), row.get("values", [])
+        if not isinstance(name, str):
+            raise ModelError("the effect has no name", where=where, expected='name = "..."', found=name)
+        if not isinstance(target, list) or not all(isinstance(t, str) for t in target):
+            raise ModelError("target is not right", where=where, expected="a list of names", found=target)
+        intervals = row.get("intervals", [])
+        if (
+            not numbers(values)
+            or not isinstance(intervals, list)
+            or not all(numbers(p) and len(p) == 2 for p in intervals)
+        ):
+            raise ModelError("values and intervals are not right", where=where, expected="lists of numbers")
+        pairs = tuple((float(low), float(high)) for low, high in intervals)
+        found.append(AddedEffect(effect_class(name)(*target), tuple(float(v) for v in values), pairs))
+    return found
+
+
+def numbers(values: Any) -> bool:
+    """Return whether something is a list of numbers, none of them NaN."""
+    return isinstance(values, list) and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and not np.isnan(v) for v in values
+    )

@@ -1,0 +1,117 @@
+"""Effects of the surroundings: gravity that is not straight down, air."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.select import free_bodies, name
+
+AIR = 1.2
+"""Density of air at 20 degrees [kg/m^3]."""
+
+
+class GravityTilt(Effect):
+    """A table or robot base that is not level."""
+
+    name = "gravity_tilt"
+    family = "world"
+    kind = "none"
+    summary = "Gravity is turned about the world's x and y axes."
+    source = "geometry"
+    signature = "a constant residual force along one horizontal direction"
+    confusions = ("center_of_mass", "frame_offset", "wind", "anisotropic_friction")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the one selection that there is."""
+        return ((),) if np.linalg.norm(m.opt.gravity) > 0 else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Angles about x and y."""
+        return tuple(Parameter(axis, "rad", 0.0, -0.5, 0.5, 0.02) for axis in "xy")
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Gravity."""
+        return ("opt.gravity",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Turn gravity."""
+        m.opt.gravity = Rotation.from_rotvec([values[0], values[1], 0.0]).apply(m.opt.gravity)
+
+
+class AirEffect(Effect):
+    """An effect of the air on free bodies, which MuJoCo takes for ellipsoids."""
+
+    family = "world"
+    kind = "body"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all free bodies together: there is one air."""
+        found = tuple(n for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return (found,) if found else ()
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Use the ellipsoid model, on the target alone."""
+        mine = {id(geom) for n in self.target for geom in spec.body(n).geoms}
+        for geom in spec.geoms:
+            if geom.fluid_ellipsoid:
+                continue
+            chosen = id(geom) in mine or geom.parent.name in self.target
+            geom.fluid_ellipsoid = True
+            if not chosen:
+                geom.fluid_coefs = [0.0] * 5
+
+
+class AirDrag(AirEffect):
+    """Resistance of the air."""
+
+    name = "air_drag"
+    summary = (
+        "Drag of an ellipsoid of the body's size in still air, of a density that stands for air times drag factor."
+    )
+    source = f"Andersen, Pesavento, Wang, J. Fluid Mech. 541, 2005, in MuJoCo's ellipsoid fluid model ({MUJOCO})"
+    signature = "residual force against the velocity, growing with its square; fast flights fall short"
+    confusions = ("wind", "time_base", "length_scale", "joint_damping")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Density times drag factor."""
+        return (Parameter("density", "kg/m^3", float(m.opt.density), 0.0, 500.0, 5.0, scan=(2.0, 10.0)),)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Density of the medium."""
+        return ("opt.density",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the density."""
+        m.opt.density = max(float(values[0]), 0.0)
+
+
+class Wind(AirEffect):
+    """Air that moves."""
+
+    name = "wind"
+    summary = (
+        "Drag as in still air, of the body's velocity less the wind's; air of a density that the model has, or 1.2."
+    )
+    source = AirDrag.source
+    signature = "a residual force along one direction on light bodies in flight"
+    confusions = ("gravity_tilt", "air_drag")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Velocity of the wind along each axis of the world."""
+        scan = (-5.0, 5.0)
+        return tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, 3.0, scan=scan) for axis in "xyz")
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Wind and density of the medium."""
+        return ("opt.wind", "opt.density")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Set the wind."""
+        m.opt.wind = values
+        m.opt.density = max(m.opt.density, AIR)
