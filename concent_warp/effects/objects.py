@@ -54,6 +54,11 @@ class CenterOfMass(BodyEffect):
     signature = "turns when pushed or dropped straight; tips over one edge before the other"
     confusions = ("gravity_tilt", "frame_offset", "gravity_compensation")
 
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let the compiled body have a centre of mass off its origin."""
+        for n in self.target:
+            spec.body(n).simple = False
+
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """An offset along each axis of the body."""
         body = self.ids(m)[0]
