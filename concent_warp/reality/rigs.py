@@ -1,0 +1,11 @@
+"""All rigs, by name."""
+
+from __future__ import annotations
+
+from concent_warp.reality.rig import Rig
+from concent_warp.reality.rig_drop import DROP
+from concent_warp.reality.rig_pendulum import PENDULUM
+from concent_warp.reality.rig_push import PUSH
+from concent_warp.reality.rig_slide import SLIDE
+
+RIGS: dict[str, Rig] = {rig.name: rig for rig in (PENDULUM, SLIDE, DROP, PUSH)}
