@@ -15,6 +15,8 @@ from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.comparison_table import markdown_table, rich_table
+from concent_warp.diagnose.noise import WORDS
+from concent_warp.diagnose.places import LEAST, alike
 from concent_warp.errors import EventsError
 from concent_warp.ground import extract_all
 from concent_warp.model import Model
@@ -24,8 +26,8 @@ from concent_warp.simulate.select import EngineName
 
 @dataclass(frozen=True)
 class Arguments:
-    """Compare what a model predicts with what was measured, by channel and contact phase; with a baseline, say what
-    has changed.
+    """Compare what a model predicts with what was measured: by channel and phase, against the measurement noise, and
+    where it fails worst; with a baseline, say what has changed.
     """
 
     recording: tyro.conf.Positional[Path]
@@ -47,7 +49,9 @@ class Arguments:
     html: Path | None = None
     """Write a report with charts, replay and 3D views to this file."""
     phases: bool = True
-    """Tell contact phases apart; they are found in the replay of the model."""
+    """Tell phases apart: contact stages found in the replay of the model or, without any, ways of moving."""
+    places: int = 5
+    """How many of the worst places to name."""
     overwrite: bool = False
     """Replace the report if it is there."""
 
@@ -66,13 +70,17 @@ def run(arguments: Arguments) -> Comparison:
         except EventsError as error:
             say(escape(f"No contact phases: {error}"))
     stages = {name: sequence.stages for name, sequence in events.items()}
-    found = compare(models, recording, arguments.engine, phases=stages or None)
+    moving = arguments.phases and not any(stages.values())
+    found = compare(models, recording, arguments.engine, phases=None if moving else stages)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     elif arguments.markdown:
         print(markdown_table(found, every_phase=arguments.every_phase), end="")
+        print("".join(f"\n{i + 1}. {text}" for i, text in enumerate(place_lines(found, arguments.places))))
     else:
         say(rich_table(found, every_phase=arguments.every_phase))
+        say_noise(found)
+        say_places(found, arguments.places)
         say_diverged(found)
     if arguments.html is not None:
         from concent_warp.report.report import write_report
@@ -83,3 +91,33 @@ def run(arguments: Arguments) -> Comparison:
         if not arguments.json:
             say_written(arguments.html)
     return found
+
+
+def say_noise(comparison: Comparison) -> None:
+    """Write where the noise floors are from."""
+    found: dict[str, list[str]] = {}
+    for channel in comparison.channels:
+        found.setdefault(WORDS[comparison.summarise(comparison.after, channel).source], []).append(channel)
+    for words, channels in found.items():
+        say(escape(f"noise of {', '.join(channels)}: {words}"))
+
+
+def say_places(comparison: Comparison, most: int) -> None:
+    """Write where the last model fails worst."""
+    lines = place_lines(comparison, most)
+    if most > 0:
+        say("\n[bold]Worst places[/bold]" if lines else f"\nNowhere above {LEAST:g} x noise.")
+    for i, line in enumerate(lines):
+        say(escape(f"{i + 1}. {line}"))
+
+
+def place_lines(comparison: Comparison, most: int) -> list[str]:
+    """Return the worst places in words, one for each that recurs in several demonstrations."""
+    several = len(comparison.demonstrations) > 1
+    lines, seen = [], set()
+    for place in comparison.places:
+        if alike(place) not in seen and len(lines) < most:
+            seen.add(alike(place))
+            line = place.sentence(demonstration=several)
+            lines.append(line + (f" [{place.recurs} demonstrations alike]" if place.recurs > 1 else ""))
+    return lines

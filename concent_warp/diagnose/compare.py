@@ -3,38 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from concent_warp.diagnose.comparison import FREE, Comparison, Phase
-from concent_warp.diagnose.residuals import residuals
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.partners import Partners
+from concent_warp.diagnose.phases import StageLike, motion_phases, stage_phases
+from concent_warp.diagnose.places import ranked, worst_places
+from concent_warp.diagnose.residuals import instrument_noise, residuals
 from concent_warp.errors import ModelError
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
-    from concent_warp.recording.recording import Demonstration, Recording
-
-
-class StageLike(Protocol):
-    """A named span of time, such as a stage of a contact event sequence."""
-
-    @property
-    def name(self) -> str:
-        """Name."""
-        ...
-
-    @property
-    def start(self) -> float:
-        """First instant [s]."""
-        ...
-
-    @property
-    def end(self) -> float:
-        """First instant after it [s]."""
-        ...
+    from concent_warp.recording.recording import Recording
 
 
 def compare(
@@ -55,7 +39,8 @@ def compare(
         recording: What was commanded and measured.
         engine: Which engine simulates, see `make_engine`.
         phases: Contact stages by demonstration, as a contact event sequence has them; the same for every model. Where
-            there is none in any demonstration, times are not told apart.
+            there is none in any demonstration, times are not told apart. None takes the ways of moving in the replay
+            of the last model instead (`motion_phases`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
 
@@ -67,25 +52,37 @@ def compare(
     if not models:
         raise ModelError("there is no model to compare")
     chosen = recording.only(demonstrations or ()).demonstrations
-    found, diverged = {}, {}
+    found, diverged, moving, partners = {}, {}, {}, {}
+    last = tuple(models)[-1]
     for name, model in models.items():
         simulator = make_engine(engine, model)
         compiled = model.compile()
+        noise = instrument_noise(compiled, recording.demonstrations)
         for d in chosen:
-            rollout = replay(model, d, simulator).numpy()
-            found[name, d.name] = residuals(compiled, rollout, d)
+            rollout = replay(model, d, simulator, contacts="all" if name == last else "none").numpy()
+            found[name, d.name] = residuals(compiled, rollout, d, noise)
             if rollout.diverged[0]:
                 bad = ~np.isfinite(rollout.qpos[0]).all(axis=1)
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
+            if name == last:
+                partners[d.name] = Partners.of_replay(model, compiled, rollout)
+                moving[d.name] = motion_phases(model, compiled, rollout)
     staged = phases or {}
-    spans = {d.name: spans_of(d, staged[d.name]) for d in chosen if d.name in staged and any(map(len, staged.values()))}
-    return Comparison(tuple(models), tuple(d.name for d in chosen), found, spans, diverged, seed)
-
-
-def spans_of(demonstration: Demonstration, stages: Sequence[StageLike]) -> tuple[Phase, ...]:
-    """Return the phases of a demonstration: what comes before its first stage, then its stages."""
-    first = stages[0].start if stages else demonstration.duration
-    spans = [Phase(FREE, -np.inf, first)] if first > 0 else []
-    spans += [Phase(s.name, s.start, s.end) for s in stages]
-    spans[-1] = Phase(spans[-1].name, spans[-1].start, np.inf)
-    return tuple(spans)
+    spans = moving if phases is None else {}
+    if any(map(len, staged.values())):
+        spans = {d.name: stage_phases(staged[d.name], d.duration) for d in chosen if d.name in staged}
+    places = [
+        place
+        for d in chosen
+        for place in worst_places(found[last, d.name], spans.get(d.name, ()), partners[d.name], d.name)
+    ]
+    return Comparison(
+        models=tuple(models),
+        demonstrations=tuple(d.name for d in chosen),
+        residuals=found,
+        phases=spans,
+        diverged=diverged,
+        seed=seed,
+        places=ranked(places),
+        staged=phases is not None,
+    )

@@ -10,24 +10,14 @@ from typing import Any
 import numpy as np
 
 from concent_warp.diagnose.bootstrap import LEVEL, RULE, effective_count, mean_interval
+from concent_warp.diagnose.noise import Source
+from concent_warp.diagnose.phases import FREE, Phase
+from concent_warp.diagnose.places import Place
 from concent_warp.diagnose.residuals import Residual
 from concent_warp.errors import ModelError, RecordingError
 
-FREE = "free"
-"""Name of the phase before the first contact stage."""
 CARRIED = (FREE, "pick")
 """Phases in which an object stands still or is carried: what it does then says little of its contact geometry."""
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A span of a demonstration: a contact stage, or what comes before the first."""
-
-    name: str
-    start: float
-    """First instant [s]."""
-    end: float
-    """First instant after it [s]; the last phase has no end."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,11 @@ class Summary:
     """95th percentile."""
     max: float
     noise: float | None
-    """Mean error that the measurement noise alone would leave, where known."""
+    """Mean error that the measurement noise alone would leave, where it can be told."""
+    ratio: float | None
+    """Mean over that noise floor [-]."""
+    source: Source
+    """Where the noise is from."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +87,10 @@ class Comparison:
     """Time [s] at which a replay stopped being finite, by model and demonstration; absent where it stayed so."""
     seed: int = 0
     """Seed of the bootstrap."""
+    places: tuple[Place, ...] = ()
+    """Where the last model fails worst, the worst first."""
+    staged: bool = True
+    """Whether the phases are contact stages; else they are ways of moving."""
 
     @property
     def before(self) -> str:
@@ -121,7 +119,12 @@ class Comparison:
         return tuple(dict.fromkeys(phase.name for d in self.demonstrations for phase in self.phases.get(d, ())))
 
     def contact_phases(self) -> tuple[str, ...]:
-        """Return the phases in which the contact geometry shows: all but `CARRIED`, if any are left."""
+        """Return the phases in which the contact geometry shows: all but `CARRIED`, if any are left.
+
+        None, which stands for all times, where the phases are ways of moving.
+        """
+        if not self.staged:
+            return ()
         return tuple(name for name in self.phase_names if name not in CARRIED) or self.phase_names
 
     def residual(self, model: str, demonstration: str, channel: str) -> Residual | None:
@@ -159,6 +162,9 @@ class Comparison:
         low, high = mean_interval(parts, self.seed)
         noises = [(r.noise, mask.sum()) for r, mask in found if r.noise is not None]
         weight = sum(n for _, n in noises)
+        sources: list[Source] = [r.source for r, _ in found if r.noise is not None]
+        noise = float(sum(noise * n for noise, n in noises) / weight) if weight else None
+        mean = statistic(np.mean, pooled)
         return Summary(
             model=model,
             channel=channel,
@@ -166,13 +172,15 @@ class Comparison:
             unit=found[0][0].unit,
             count=len(pooled),
             effective=effective_count([p for p in parts if np.isfinite(p).all()]),
-            mean=statistic(np.mean, pooled),
+            mean=mean,
             low=low,
             high=high,
             rms=statistic(lambda e: np.sqrt(np.mean(e**2)), pooled),
             p95=statistic(lambda e: np.percentile(e, 95), pooled),
             max=statistic(np.max, pooled),
-            noise=float(sum(noise * n for noise, n in noises) / weight) if weight else None,
+            noise=noise,
+            ratio=mean / noise if noise else None,
+            source=sources[0] if sources else "unknown",
         )
 
     def difference(
@@ -226,12 +234,14 @@ class Comparison:
             "demonstrations": list(self.demonstrations),
             "phases": {d: [asdict(p) for p in self.phases.get(d, ())] for d in self.demonstrations},
             "diverged": [{"model": m, "demonstration": d, "time": t} for (m, d), t in self.diverged.items()],
+            "phases_are": "contact stages" if self.staged else "ways of moving",
             "headline": {
                 "channel": main[0],
                 "phases": list(main[1]),
                 "summaries": [asdict(self.summarise(m, *main)) for m in self.models],
                 "difference": self._difference_json(*main),
             },
+            "places": [{**asdict(place), "sentence": place.sentence(demonstration=True)} for place in self.places],
             "summaries": [asdict(self.summarise(m, c, p)) for c, p in rows for m in self.models],
             "differences": [d for c, p in rows if (d := self._difference_json(c, p))],
             "interval": {"level": LEVEL, "rule": RULE, "seed": self.seed},

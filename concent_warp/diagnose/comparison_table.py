@@ -7,34 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison, Summary
+from concent_warp.diagnose.units import percent, shown, times, unit_shown
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "m/s": (1e3, "mm/s"), "rad/s": (180 / np.pi, "°/s")}
-"""Factor and unit in which a unit is shown to people."""
-
-
-def shown(value: float | None, unit: str, *, sign: bool = False) -> str:
-    """Return a number in the unit in which it is shown, without the unit's name."""
-    if value is None or np.isnan(value):
-        return "-"
-    if np.isinf(value):
-        return "diverged"
-    value *= SHOWN.get(unit, (1, unit))[0]
-    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
-    return f"{value:{'+' if sign else ''}.{digits}f}"
-
-
-def percent(share: float) -> str:
-    """Return a relative change in whole percent with its sign."""
-    whole = round(100 * share)
-    return f"{whole:+d} %" if whole else "0 %"
-
-
-def unit_shown(unit: str) -> str:
-    """Return the name of the unit in which a unit is shown."""
-    return SHOWN.get(unit, (1, unit))[1]
 
 
 def mean_and_interval(summary: Summary) -> str:
@@ -51,12 +27,13 @@ def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[st
     Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
 
     Per channel and phase: number of samples, mean error of each model with its 95 % interval, RMS, 95th percentile and
-    largest error of the last, noise floor, and with two models or more the change of the mean, with its interval.
+    largest error of the last, noise floor and how many times that the mean is; with two models or more also the change
+    of the mean, with its interval.
     """
     several = len(comparison.models) > 1
     header = ["channel", "phase", "unit", "samples", *(f"mean {name}" for name in comparison.models)]
     header += ["change"] if several else []
-    header += ["RMS", "p95", "max", "noise"]
+    header += ["RMS", "p95", "max", "noise", "x noise"]
     rows = []
     for channel, phase in comparison.rows():
         if phase and not every_phase and channel not in (comparison.object_channels or comparison.channels):
@@ -70,6 +47,7 @@ def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[st
         if several:
             row.append(change(comparison, channel, phase))
         row += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
+        row.append("-" if last.ratio is None else times(last.ratio))
         rows.append(row)
     return header, rows
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["position", "orientation", "joint", "points", "other"]
 """What a channel measures."""
-Source = Literal["stated", "rest", "differences", "resolution", "unknown"]
+Source = Literal["stated", "rest", "differences", "resolution", "points", "unknown"]
 """Where a noise figure is from."""
 UNDERESTIMATE = 1.8
 """By how much differences underestimate strongly autocorrelated noise."""
@@ -40,6 +40,7 @@ WORDS: dict[Source, str] = {
     "rest": "estimated where nothing moves",
     "differences": f"estimated from sample-to-sample differences, up to {UNDERESTIMATE:g} x too small if it is slow",
     "resolution": "from the resolution of the readings",
+    "points": "estimated from the scatter of the first sightings of each point",
     "unknown": "not known",
 }
 """The sources in words."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import gamma
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.diagnose.noise import Kind, Noise, Source, channel_noise, pooled_noise, turns
 from concent_warp.errors import RecordingError
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, interpolate, predict
 
@@ -23,6 +25,12 @@ ANCHOR_FRAMES = 5
 SENSOR = mujoco.mjtSensor
 POSITIONS = (SENSOR.mjSENS_FRAMEPOS, SENSOR.mjSENS_SUBTREECOM)
 BODIES = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+LOCAL = (
+    *(SENSOR.mjSENS_GYRO, SENSOR.mjSENS_ACCELEROMETER, SENSOR.mjSENS_VELOCIMETER, SENSOR.mjSENS_MAGNETOMETER),
+    *(SENSOR.mjSENS_FORCE, SENSOR.mjSENS_TORQUE, SENSOR.mjSENS_FRAMEQUAT, SENSOR.mjSENS_BALLQUAT),
+    SENSOR.mjSENS_BALLANGVEL,
+)
+"""Sensors whose residual is in a frame that moves along with a body."""
 UNITS = {
     SENSOR.mjSENS_FRAMEPOS: "m",
     SENSOR.mjSENS_SUBTREECOM: "m",
@@ -63,11 +71,11 @@ class Residual:
 
     channel: str
     """Sensor name, or ``<body> points`` of a point track."""
-    kind: Literal["position", "orientation", "joint", "points", "other"]
+    kind: Kind
     unit: str
     """Unit of `value`, `error` and `noise`."""
     body: str | None
-    """Body that the channel is about, where it is about one."""
+    """Body that the channel is about, where it is about one; of a joint the body that it moves."""
     time: np.ndarray
     """Times of the measurements [s], shape (T,)."""
     value: np.ndarray
@@ -77,22 +85,42 @@ class Residual:
     """How far off, shape (T,): Euclidean norm, rotation angle, mean distance of the visible points from where the model
     has them; NaN where nothing was measured, infinite where the model has diverged."""
     noise: float | None
-    """Mean error that the measurement noise alone would leave with a perfect model, where known."""
+    """Mean error that the measurement noise alone would leave with a perfect model, where it can be told."""
+    std: float | None = None
+    """Standard deviation of the noise of each component of `value`, where it can be told; of points that of one."""
+    source: Source = "unknown"
+    """Where the noise is from."""
+    extent: float = 0.0
+    """How far the measured values move: diagonal of the box that holds them, largest turn of an orientation."""
+    local: bool = False
+    """Whether `value` is in a frame that moves along with the body, rather than in the world frame."""
+
+    @property
+    def ratio(self) -> np.ndarray | None:
+        """Error over the noise floor [-], shape (T,); 1 on average where the model is right. None without a floor."""
+        return self.error / self.noise if self.noise else None
 
 
-def residuals(compiled: mujoco.MjModel, rollout: Rollout, demonstration: Demonstration) -> tuple[Residual, ...]:
+def residuals(
+    compiled: mujoco.MjModel,
+    rollout: Rollout,
+    demonstration: Demonstration,
+    noise: Mapping[str, Noise] | None = None,
+) -> tuple[Residual, ...]:
     """Return the residuals of every measured channel and every point track.
 
     Args:
         compiled: The model as the engine compiled it.
         rollout: Replay of the demonstration, one variant, NumPy, all bodies recorded.
         demonstration: What was measured.
+        noise: Noise by channel (`instrument_noise`); estimated from this demonstration alone where there is none.
 
     Raises:
         RecordingError: A channel names a sensor or a body that the model lacks, or has another dimension.
     """
+    known = noise or {}
     found = [
-        sensor_residual(compiled, rollout, name, channel, demonstration.name)
+        sensor_residual(compiled, rollout, name, channel, demonstration.name, known.get(name))
         for name, channel in demonstration.measured.items()
     ]
     for body, track in demonstration.points.items():
@@ -106,7 +134,19 @@ def residuals(compiled: mujoco.MjModel, rollout: Rollout, demonstration: Demonst
     return tuple(found)
 
 
-def sensor_residual(compiled: mujoco.MjModel, rollout: Rollout, name: str, channel: Channel, where: str) -> Residual:
+def instrument_noise(compiled: mujoco.MjModel, demonstrations: Sequence[Demonstration]) -> dict[str, Noise]:
+    """Return the noise of each sensor that the model has, from all demonstrations together."""
+    found = {}
+    for name in dict.fromkeys(name for d in demonstrations for name in d.measured):
+        if (row := mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)) >= 0:
+            channels = [d.measured[name] for d in demonstrations if name in d.measured]
+            found[name] = pooled_noise(channels, kind_and_unit(compiled, row)[0])
+    return found
+
+
+def sensor_residual(
+    compiled: mujoco.MjModel, rollout: Rollout, name: str, channel: Channel, where: str, noise: Noise | None = None
+) -> Residual:
     """Return the residual of one sensor."""
     row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
@@ -125,7 +165,9 @@ def sensor_residual(compiled: mujoco.MjModel, rollout: Rollout, name: str, chann
     kind, unit = kind_and_unit(compiled, row)
     value = rotation_between(predicted, channel.value) if kind == "orientation" else channel.value - predicted
     error = np.linalg.norm(value, axis=1)
-    noise = None if channel.noise_std is None else channel.noise_std * mean_norm(value.shape[1])
+    if noise is None or channel.noise_std:
+        noise = channel_noise(channel, kind)
+    std = noise.std if np.isfinite(noise.std) else None
     return Residual(
         channel=name,
         kind=kind,
@@ -134,8 +176,22 @@ def sensor_residual(compiled: mujoco.MjModel, rollout: Rollout, name: str, chann
         time=channel.time,
         value=value,
         error=lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
-        noise=noise,
+        noise=None if std is None else std * mean_norm(value.shape[1]),
+        std=std,
+        source=noise.source,
+        extent=extent(channel.value, kind),
+        local=int(compiled.sensor_type[row]) in LOCAL,
     )
+
+
+def extent(value: np.ndarray, kind: Kind) -> float:
+    """Return how far readings (T, dim) move: diagonal of their box, of orientations the largest turn from the first."""
+    valid = value[np.asarray(np.isfinite(value).all(axis=1))]
+    if not len(valid):
+        return 0.0
+    if kind == "orientation":
+        return float(np.linalg.norm(turns(np.broadcast_to(valid[0], valid.shape), valid), axis=1).max())
+    return float(np.linalg.norm(np.ptp(valid, axis=0)))
 
 
 def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
@@ -163,6 +219,7 @@ def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
     some = np.asarray(measured.any(axis=1))
     value[~some] = np.nan
     error = np.where(some, (share * distance).sum(axis=1), np.nan)
+    noise = point_noise(local, anchor, sightings)
     return Residual(
         channel=f"{body} points",
         kind="points",
@@ -171,7 +228,10 @@ def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
         time=track.time,
         value=value,
         error=lost(error, position, some),
-        noise=point_noise(local, anchor, sightings),
+        noise=noise,
+        std=None if noise is None else noise / mean_norm(3),
+        source="unknown" if noise is None else "points",
+        extent=extent(value + position, "points"),
     )
 
 
@@ -194,9 +254,7 @@ def lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.n
     return np.where(diverged, np.inf, np.where(measured, error, np.nan))
 
 
-def kind_and_unit(
-    compiled: mujoco.MjModel, row: int
-) -> tuple[Literal["position", "orientation", "joint", "other"], str]:
+def kind_and_unit(compiled: mujoco.MjModel, row: int) -> tuple[Kind, str]:
     """Return what a sensor measures and the unit of its residual."""
     sensor = SENSOR(int(compiled.sensor_type[row]))
     if sensor in UNIT_QUATERNION_SENSORS:
@@ -223,10 +281,17 @@ def slides(compiled: mujoco.MjModel, sensor: mujoco.mjtSensor, target: int) -> b
 
 
 def body_of(compiled: mujoco.MjModel, row: int) -> str | None:
-    """Return the body that a frame sensor sits on."""
-    if int(compiled.sensor_objtype[row]) in BODIES:
-        return compiled.body(compiled.sensor_objid[row]).name
-    return None
+    """Return the body that a sensor sits on, or that its joint moves."""
+    kind, target = int(compiled.sensor_objtype[row]), int(compiled.sensor_objid[row])
+    owner = {
+        mujoco.mjtObj.mjOBJ_JOINT: compiled.jnt_bodyid,
+        mujoco.mjtObj.mjOBJ_SITE: compiled.site_bodyid,
+        mujoco.mjtObj.mjOBJ_GEOM: compiled.geom_bodyid,
+        mujoco.mjtObj.mjOBJ_CAMERA: compiled.cam_bodyid,
+    }
+    if kind in BODIES:
+        return compiled.body(target).name
+    return compiled.body(owner[mujoco.mjtObj(kind)][target]).name if kind in owner else None
 
 
 def mean_norm(dim: int) -> float:
@@ -241,8 +306,7 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """
     vector = np.full((len(start), 3), np.nan)
     valid = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    turn = Rotation.from_quat(start[valid], scalar_first=True).inv() * Rotation.from_quat(end[valid], scalar_first=True)
-    vector[valid] = turn.as_rotvec()
+    vector[valid] = turns(start[valid], end[valid])
     return vector
 
 

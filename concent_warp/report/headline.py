@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.comparison_table import percent, shown, unit_shown
+from concent_warp.diagnose.units import percent, shown, unit_shown, words
 from concent_warp.events.sequence import ContactEventSequence
 
 NULL = "no contact"
@@ -139,8 +139,3 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
         if held.verdict != "fallen":
             text += " On demonstrations that the fit has not seen, no gain can be shown."
     return text
-
-
-def words(channel: str) -> str:
-    """Return a channel's name as words: ``block_position`` is "block position"."""
-    return channel.replace("_", " ")

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.comparison_table import SHOWN, unit_shown
+from concent_warp.diagnose.units import SHOWN, unit_shown
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.motion_data import motion_data

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison, Summary
-from concent_warp.diagnose.comparison_table import percent, shown, unit_shown
+from concent_warp.diagnose.units import percent, shown, unit_shown
 
 Row = tuple[str, Sequence[str]]
 """Class of a table row and its cells as HTML."""

@@ -5,7 +5,8 @@ import pytest
 
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Phase
-from concent_warp.diagnose.comparison_table import markdown_table, rich_table, shown
+from concent_warp.diagnose.comparison_table import markdown_table, rich_table
+from concent_warp.diagnose.units import shown
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -190,3 +191,24 @@ def test_without_any_stage_times_are_not_told_apart():
     found = compare({"m": model(2)}, recorded(model(2)), "mujoco", phases={"demo_0": ()})
     assert found.phase_names == ()
     assert found.to_json()["headline"]["phases"] == []
+
+
+def test_without_stages_the_ways_of_moving_are_the_phases():
+    found = compare({"m": model(6)}, recorded(model(2)), "mujoco")
+    assert set(found.phase_names) == {"free"}
+    assert found.contact_phases() == ()
+    assert found.to_json()["phases_are"] == "ways of moving"
+
+
+def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):
+    wrong, right = (comparison.summarise(name, "rail") for name in ("wrong", "right"))
+    assert wrong.ratio == pytest.approx(wrong.mean / wrong.noise)
+    assert right.ratio == pytest.approx(1, rel=0.15)
+    assert (wrong.source, comparison.summarise("wrong", "cart").source) == ("stated", "differences")
+    assert "| x noise |" in markdown_table(comparison)
+
+
+def test_places_are_those_of_the_last_model(comparison):
+    assert "rail" not in {c for p in comparison.places for c in p.channels}
+    swapped = compare({"right": model(2), "wrong": model(6)}, recorded(model(2)), "mujoco")
+    assert "rail" in {c for p in swapped.places for c in p.channels}

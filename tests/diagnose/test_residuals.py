@@ -87,10 +87,10 @@ def test_units_kinds_and_bodies_are_those_of_the_sensors(engine, exact):
     assert [(r[c].kind, r[c].unit, r[c].body) for c in r] == [
         ("position", "m", "cube"),
         ("orientation", "rad", "cube"),
+        ("joint", "m", "slide"),
+        ("joint", "rad", "hinge"),
         ("joint", "m", None),
-        ("joint", "rad", None),
-        ("joint", "m", None),
-        ("other", "rad/s", None),
+        ("other", "rad/s", "cube"),
         ("points", "m", "cube"),
     ]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnose.compare import compare
-from concent_warp.diagnose.comparison_table import shown
+from concent_warp.diagnose.units import shown
 from concent_warp.model import Model
 from concent_warp.report.report import filled, write_report
 from concent_warp.report.scene_data import scene_bodies

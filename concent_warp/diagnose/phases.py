@@ -1,0 +1,235 @@
+"""Phases of a demonstration: named spans of time.
+
+Contact stages (`concent_warp.events`) need a robot that brings objects together. Where there are none - a toss, a
+push, a pendulum - the replay is parted by how things move: the contacts that it has and how fast they slip.
+
+| phase | an object, or without any the whole machine |
+|---|---|
+| free | touches nothing |
+| impact | is in contact and is jolted harder than any drive would |
+| slide | slips over what it touches |
+| stick | moves on what it touches without slipping: it rolls, or is carried along |
+| grasped | is held: the robot presses on it from opposite sides |
+| rest | does not move |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from concent_warp.events.filter import drop_blips, runs, steps_of, windowed
+from concent_warp.events.grasp import opposed
+from concent_warp.events.roles import Roles
+from concent_warp.events.touches import Motion, Touches
+from concent_warp.simulate.replay import replay
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Demonstration
+    from concent_warp.simulate.engine import Engine, Rollout
+
+IMPACT, SLIDE, GRASPED, FREE, STICK, REST = "impact", "slide", "grasped", "free", "stick", "rest"
+MOTIONS: tuple[str, ...] = (IMPACT, SLIDE, GRASPED, FREE, STICK, REST)
+"""What a body may do. With several bodies, a demonstration does what comes first here of what any of them does."""
+SLIDING = 0.005
+"""A contact slips above this speed [m/s]."""
+RESTING = 0.004
+"""A body rests while its fastest point is slower than this [m/s]."""
+JOLT = 25.0
+"""Mean acceleration over `JOLT_WINDOW` of the fastest point of a body that tells an impact [m/s^2]."""
+JOLT_WINDOW = 0.01
+"""[s]"""
+AFTERMATH = 0.02
+"""An impact lasts this much longer than the jolt [s], so that measurements fall within it."""
+HOLD = 0.03
+"""Each instant but impacts takes what prevails over windows of this length [s]."""
+LASTING = 0.1
+"""Rest lasts at least this long [s]; what is shorter is a reversal."""
+GRASP_WINDOW = 0.1
+"""Length of the windows over which pressing from opposite sides is judged [s]."""
+SQUEEZE = 0.5
+"""Forces that add up to less than this share of their magnitudes press from opposite sides."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A span of a demonstration: a contact stage, what comes before the first, or a way of moving."""
+
+    name: str
+    start: float
+    """First instant [s]; the first phase has no beginning."""
+    end: float
+    """First instant after it [s]; the last phase has no end."""
+
+
+class StageLike(Protocol):
+    """A named span of time, such as a stage of a contact event sequence."""
+
+    @property
+    def name(self) -> str:
+        """Name."""
+        ...
+
+    @property
+    def start(self) -> float:
+        """First instant [s]."""
+        ...
+
+    @property
+    def end(self) -> float:
+        """First instant after it [s]."""
+        ...
+
+
+def replay_phases(model: Model, demonstration: Demonstration, engine: Engine) -> tuple[Phase, ...]:
+    """Return the ways of moving over a demonstration's replay; one span over all where it does not stay finite."""
+    return motion_phases(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
+
+
+def motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> tuple[Phase, ...]:
+    """Return the ways of moving over a replay, without gaps.
+
+    Args:
+        model: The model.
+        compiled: The same as the engine compiled it.
+        rollout: One variant, NumPy, all steps and bodies recorded, contacts "all".
+    """
+    steps = len(rollout.step) - 1
+    if rollout.diverged[0] or rollout.contacts is None or steps < 1:
+        return (Phase(FREE, -np.inf, np.inf),)
+    roles = Roles.of(compiled, model)
+    motion = Motion.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
+    touches = Touches.of(rollout.contacts, roles)
+    movable = np.flatnonzero(compiled.body_weldid != 0)
+    watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
+    speeds = Speeds.of(motion, compiled)
+    state = np.full(motion.steps, len(MOTIONS) - 1)
+    for b in watched:
+        state = np.minimum(state, body_state(b, touches, motion, speeds, roles))
+    return spans(state, motion.timestep)
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Velocities of all bodies at every step, from the poses at the ends of the step."""
+
+    linear: np.ndarray
+    """Of the body frames' origins [m/s], world frame, shape (K, nbody, 3)."""
+    angular: np.ndarray
+    """[rad/s], world frame, shape (K, nbody, 3)."""
+    reach: np.ndarray
+    """Distance of the farthest point of each body from its frame's origin [m], shape (nbody,)."""
+
+    @staticmethod
+    def of(motion: Motion, compiled: mujoco.MjModel) -> Speeds:
+        """Differentiate the poses; the last step repeats the one before it."""
+        linear = np.diff(motion.position, axis=0) / motion.timestep
+        turn = np.einsum("kbij,kblj->kbil", motion.rotation[1:], motion.rotation[:-1])
+        skew = (
+            np.stack(
+                [
+                    turn[..., 2, 1] - turn[..., 1, 2],
+                    turn[..., 0, 2] - turn[..., 2, 0],
+                    turn[..., 1, 0] - turn[..., 0, 1],
+                ],
+                axis=-1,
+            )
+            / 2
+        )
+        angular = skew / motion.timestep
+        if not len(linear):
+            linear = angular = np.zeros((1, *motion.position.shape[1:]))
+        else:
+            linear, angular = (np.concatenate([v, v[-1:]]) for v in (linear, angular))
+        return Speeds(linear, angular, reaches(compiled))
+
+    def at(self, body: np.ndarray, step: np.ndarray, arm: np.ndarray) -> np.ndarray:
+        """Return velocities [m/s], shape (C, 3), of points at `arm` (C, 3) [m] from the origins of `body` (C,)."""
+        return self.linear[step, body] + np.cross(self.angular[step, body], arm)
+
+    def fastest(self, body: int) -> np.ndarray:
+        """Return a bound on the speed of any point of a body [m/s], shape (K,)."""
+        spin = np.linalg.norm(self.angular[:, body], axis=1)
+        return np.linalg.norm(self.linear[:, body], axis=1) + self.reach[body] * spin
+
+    def jolt(self, body: int, width: int) -> np.ndarray:
+        """Return the change of velocity over windows of `width` steps [m/s], shape (K,), that any point may feel."""
+        change = np.zeros(len(self.linear))
+        for v, arm in ((self.linear[:, body], 1.0), (self.angular[:, body], self.reach[body])):
+            padded = np.pad(v, ((width // 2, width - width // 2), (0, 0)), mode="edge")
+            change += arm * np.linalg.norm(padded[width:] - padded[:-width], axis=1)
+        return change
+
+
+def reaches(compiled: mujoco.MjModel) -> np.ndarray:
+    """Return how far the geoms of each body reach from its frame's origin [m], shape (nbody,)."""
+    reach = np.zeros(compiled.nbody)
+    far = np.linalg.norm(compiled.geom_pos, axis=1) + compiled.geom_rbound
+    np.maximum.at(reach, compiled.geom_bodyid, np.where(compiled.geom_rbound > 0, far, 0.0))
+    return reach
+
+
+def body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, roles: Roles) -> np.ndarray:
+    """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
+    dt, steps = motion.timestep, motion.steps
+    rows = touches[np.asarray((touches.body == body).any(axis=1))]
+    touching = windowed(rows.frames(steps).astype(float), steps_of(HOLD / 2, dt)) > 0
+    state = np.full(steps, MOTIONS.index(FREE))
+    state[touching] = MOTIONS.index(STICK)
+    state[touching & (slip(rows, motion, speeds) > SLIDING)] = MOTIONS.index(SLIDE)
+    still = drop_blips(speeds.fastest(body) < RESTING, steps_of(LASTING, dt))
+    state[still] = MOTIONS.index(REST)
+    hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
+    if len(hands.step) and roles.body_role[body] != "robot":
+        held = hands.frames(steps) & opposed(hands, steps, steps_of(GRASP_WINDOW, dt), SQUEEZE)
+        state[held] = MOTIONS.index(GRASPED)
+    state = prevailing(state, steps_of(HOLD, dt))
+    width = steps_of(JOLT_WINDOW, dt)
+    jolted = touching & (speeds.jolt(body, width) > JOLT * width * dt)
+    lasting = steps_of(AFTERMATH, dt)
+    for start, end in runs(jolted):
+        state[max(start - width, 0) : end + lasting] = MOTIONS.index(IMPACT)
+    return state
+
+
+def slip(rows: Touches, motion: Motion, speeds: Speeds) -> np.ndarray:
+    """Return the mean tangential speed of contacts [m/s], weighted by force, over windows of `HOLD`, shape (K,)."""
+    total = np.zeros((motion.steps, 2))
+    if len(rows.step):
+        a, b = rows.body.T
+        points = (speeds.at(body, rows.step, rows.point - motion.position[rows.step, body]) for body in (a, b))
+        relative = np.subtract(*points)
+        tangential = relative - np.einsum("ci,ci->c", relative, rows.normal)[:, None] * rows.normal
+        weight = rows.force + 1e-9
+        np.add.at(total, rows.step, np.stack([weight * np.linalg.norm(tangential, axis=1), weight], axis=1))
+    total = windowed(total, steps_of(HOLD, motion.timestep))
+    return total[:, 0] / np.maximum(total[:, 1], 1e-12)
+
+
+def prevailing(state: np.ndarray, width: int) -> np.ndarray:
+    """Return for each step the state (K,) that most of the `width` steps about it are in."""
+    return windowed(np.eye(len(MOTIONS))[state], width).argmax(axis=1)
+
+
+def spans(state: np.ndarray, timestep: float) -> tuple[Phase, ...]:
+    """Return the spans of equal `state` (K,); the first has no beginning and the last no end."""
+    edges = np.flatnonzero(np.diff(state)) + 1
+    starts = [-np.inf, *(edges * timestep).tolist()]
+    ends = [*starts[1:], np.inf]
+    first = state[np.concatenate([[0], edges])]
+    return tuple(Phase(MOTIONS[s], a, b) for s, a, b in zip(first, starts, ends, strict=True))
+
+
+def stage_phases(stages: Sequence[StageLike], duration: float) -> tuple[Phase, ...]:
+    """Return the phases of a demonstration with contact stages: what comes before the first, then they."""
+    first = stages[0].start if stages else duration
+    found = [Phase(FREE, -np.inf, first)] if first > 0 else []
+    found += [Phase(s.name, s.start, s.end) for s in stages]
+    found[-1] = Phase(found[-1].name, found[-1].start, np.inf)
+    return tuple(found)
