@@ -16,6 +16,7 @@ from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.comparison_table import markdown_table, rich_table
 from concent_warp.diagnose.noise import WORDS
+from concent_warp.diagnose.phases import tell_a_task
 from concent_warp.diagnose.places import LEAST, alike
 from concent_warp.errors import EventsError
 from concent_warp.ground import extract_all
@@ -70,7 +71,7 @@ def run(arguments: Arguments) -> Comparison:
         except EventsError as error:
             say(escape(f"No contact phases: {error}"))
     stages = {name: sequence.stages for name, sequence in events.items()}
-    moving = arguments.phases and not any(stages.values())
+    moving = arguments.phases and not tell_a_task(stages)
     found = compare(models, recording, arguments.engine, phases=None if moving else stages)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))

@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison
 from concent_warp.diagnose.partners import Partners
-from concent_warp.diagnose.phases import StageLike, motion_phases, stage_phases
+from concent_warp.diagnose.phases import Phase, StageLike, phases_by_body, stage_phases
 from concent_warp.diagnose.places import ranked, worst_places
 from concent_warp.diagnose.residuals import instrument_noise, residuals
 from concent_warp.errors import ModelError
@@ -40,7 +40,7 @@ def compare(
         engine: Which engine simulates, see `make_engine`.
         phases: Contact stages by demonstration, as a contact event sequence has them; the same for every model. Where
             there is none in any demonstration, times are not told apart. None takes the ways of moving in the replay
-            of the last model instead (`motion_phases`).
+            of the last model instead (`phases_by_body`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
 
@@ -52,7 +52,8 @@ def compare(
     if not models:
         raise ModelError("there is no model to compare")
     chosen = recording.only(demonstrations or ()).demonstrations
-    found, diverged, moving, partners = {}, {}, {}, {}
+    found, diverged, partners = {}, {}, {}
+    moving: dict[str, dict[str | None, tuple[Phase, ...]]] = {}
     last = tuple(models)[-1]
     for name, model in models.items():
         simulator = make_engine(engine, model)
@@ -66,15 +67,17 @@ def compare(
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
             if name == last:
                 partners[d.name] = Partners.of_replay(model, compiled, rollout)
-                moving[d.name] = motion_phases(model, compiled, rollout)
+                moving[d.name] = phases_by_body(model, compiled, rollout)
     staged = phases or {}
-    spans = moving if phases is None else {}
     if any(map(len, staged.values())):
-        spans = {d.name: stage_phases(staged[d.name], d.duration) for d in chosen if d.name in staged}
+        moving = {d.name: {None: stage_phases(staged[d.name], d.duration)} for d in chosen if d.name in staged}
+    elif phases is not None:
+        moving = {}
+    spans = {name: by_body[None] for name, by_body in moving.items()}
     places = [
         place
         for d in chosen
-        for place in worst_places(found[last, d.name], spans.get(d.name, ()), partners[d.name], d.name)
+        for place in worst_places(found[last, d.name], moving.get(d.name, {None: ()}), partners[d.name], d.name)
     ]
     return Comparison(
         models=tuple(models),

@@ -19,6 +19,8 @@ MOST = 2
 """Things named at a time."""
 SHARE = 0.1
 """What carries less than this share of the forces on a body is not named."""
+LASTING = 0.15
+"""What a body touches for less than this share of a span is not named."""
 SIDE = 0.85
 """From this share of the half extent of a body on, a point is on its side."""
 ORDER = {"object": 0, "robot": 1, "world": 2}
@@ -72,7 +74,8 @@ class Partners:
         mine = np.isin(self.touches.body, group)
         chosen = np.asarray((mine.sum(axis=1) == 1) & (step >= start) & (step <= end))
         rows, side = self.touches[chosen], mine[chosen].argmin(axis=1)
-        if not len(rows.step):
+        touched = len(np.unique(rows.step)) * self.motion.timestep
+        if not len(rows.step) or touched < LASTING * (end - start):
             return None
         entity = np.take_along_axis(rows.entity, side[:, None], axis=1)[:, 0]
         other = np.take_along_axis(rows.body, side[:, None], axis=1)[:, 0]

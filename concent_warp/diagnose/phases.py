@@ -1,7 +1,7 @@
 """Phases of a demonstration: named spans of time.
 
-Contact stages (`concent_warp.events`) need a robot that brings objects together. Where there are none - a toss, a
-push, a pendulum - the replay is parted by how things move: the contacts that it has and how fast they slip.
+Contact stages (`concent_warp.events`) tell how a robot brings objects together. Where it does not (`tell_a_task`) - a
+toss, a push, a pendulum - the replay is parted by how things move: the contacts that it has and how fast they slip.
 
 | phase | an object, or without any the whole machine |
 |---|---|
@@ -15,7 +15,7 @@ push, a pendulum - the replay is parted by how things move: the contacts that it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -24,6 +24,7 @@ import numpy as np
 from concent_warp.events.filter import drop_blips, runs, steps_of, windowed
 from concent_warp.events.grasp import opposed
 from concent_warp.events.roles import Roles
+from concent_warp.events.staging import ROBOT
 from concent_warp.events.touches import Motion, Touches
 from concent_warp.simulate.replay import replay
 
@@ -87,13 +88,33 @@ class StageLike(Protocol):
         ...
 
 
+class ContactStage(StageLike, Protocol):
+    """A stage of a contact event sequence."""
+
+    @property
+    def bodies(self) -> tuple[str, str]:
+        """Who opened it by touching whom; "robot" for any of its links."""
+        ...
+
+
+def tell_a_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
+    """Return whether contact stages, by demonstration, part what a robot does: it opens one of two or more of them."""
+    return any(len(found) > 1 and any(ROBOT in s.bodies for s in found) for found in stages.values())
+
+
 def replay_phases(model: Model, demonstration: Demonstration, engine: Engine) -> tuple[Phase, ...]:
     """Return the ways of moving over a demonstration's replay; one span over all where it does not stay finite."""
     return motion_phases(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
 
 
 def motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> tuple[Phase, ...]:
-    """Return the ways of moving over a replay, without gaps.
+    """Return the ways of moving over a replay, without gaps; see `phases_by_body` for the arguments."""
+    return phases_by_body(model, compiled, rollout)[None]
+
+
+def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> dict[str | None, tuple[Phase, ...]]:
+    """Return the ways of moving over a replay, without gaps: of each object, or of each moving body where there is no
+    object, and under None of all of them together.
 
     Args:
         model: The model.
@@ -102,17 +123,16 @@ def motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> t
     """
     steps = len(rollout.step) - 1
     if rollout.diverged[0] or rollout.contacts is None or steps < 1:
-        return (Phase(FREE, -np.inf, np.inf),)
+        return {None: (Phase(FREE, -np.inf, np.inf),)}
     roles = Roles.of(compiled, model)
     motion = Motion.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
     touches = Touches.of(rollout.contacts, roles)
     movable = np.flatnonzero(compiled.body_weldid != 0)
     watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
     speeds = Speeds.of(motion, compiled)
-    state = np.full(motion.steps, len(MOTIONS) - 1)
-    for b in watched:
-        state = np.minimum(state, body_state(b, touches, motion, speeds, roles))
-    return spans(state, motion.timestep)
+    states = {roles.bodies[b]: body_state(b, touches, motion, speeds, roles) for b in watched}
+    together = np.min([*states.values(), np.full(motion.steps, len(MOTIONS) - 1)], axis=0)
+    return {None: spans(together, motion.timestep), **{b: spans(s, motion.timestep) for b, s in states.items()}}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ What the body touches then is read off the contacts of the model's replay.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,17 +97,24 @@ class Place:
 
 
 def worst_places(
-    residuals: Sequence[Residual], phases: Sequence[Phase], partners: Partners | None, demonstration: str
+    residuals: Sequence[Residual],
+    phases: Mapping[str | None, Sequence[Phase]],
+    partners: Partners | None,
+    demonstration: str,
 ) -> list[Place]:
     """Return the places of one demonstration, the worst first.
 
     Args:
         residuals: Of one model.
-        phases: Of the demonstration, may be empty.
+        phases: Of each body that has phases of its own, and under None of the demonstration; may be empty.
         partners: Who touches whom in the model's replay, where it is known.
         demonstration: Its name.
     """
-    found = [place for residual in residuals for place in channel_places(residual, phases, partners, demonstration)]
+    found = [
+        place
+        for residual in residuals
+        for place in channel_places(residual, phases.get(residual.body, phases[None]), partners, demonstration)
+    ]
     return merged(sorted(found, key=severity, reverse=True))
 
 

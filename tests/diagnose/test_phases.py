@@ -1,13 +1,15 @@
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.phases import Phase, replay_phases, stage_phases
+from concent_warp.diagnose.phases import Phase, phases_by_body, replay_phases, stage_phases, tell_a_task
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.simulate.replay import replay
 
 FLOOR = """
 <mujoco>
@@ -118,3 +120,29 @@ def test_stages_are_preceded_by_a_free_phase_and_have_no_end():
     found = stage_phases((Phase("push", 0.5, 1.0),), 1.0)
     assert found == (Phase("free", -np.inf, 0.5), Phase("push", 0.5, np.inf))
     assert stage_phases((), 1.0) == (Phase("free", -np.inf, np.inf),)
+
+
+@dataclass(frozen=True)
+class Stage(Phase):
+    bodies: tuple[str, str] = ("robot", "block")
+
+
+def test_stages_tell_a_task_where_a_robot_opens_one_of_several():
+    pick, align = Stage("pick", 0.5, 1), Stage("align", 1, 2, ("block", "box"))
+    assert tell_a_task({"demo_0": (), "demo_1": (pick, align)})
+    assert not tell_a_task({"demo_0": (pick,)})
+    assert not tell_a_task({"demo_0": (align, align)})
+    assert not tell_a_task({})
+
+
+def test_two_objects_have_phases_of_their_own_and_the_livelier_one_tells_those_of_the_demonstration():
+    other = '<body name="other" pos="1 0 .03"><freejoint/><geom type="box" size=".03 .03 .03"/></body></worldbody>'
+    model = Model(Scene(thing(height=0.23).replace("</worldbody>", other)))
+    engine = MujocoEngine(model)
+    clock = Channel(np.array([0, 0.5]), np.zeros((2, 1)))
+    start = model.scene.model.qpos0
+    demonstration = Demonstration("d", qpos=start, measured={"clock": clock})
+    found = phases_by_body(model, engine.compiled, replay(model, demonstration, engine, contacts="all"))
+    assert set(found) == {None, "thing", "other"}
+    assert names(found["thing"])[:2] == names(found[None])[:2] == ["free", "impact"]
+    assert names(found["other"])[-1] == "rest"

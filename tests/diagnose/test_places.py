@@ -36,7 +36,9 @@ PHASES = (Phase("free", -np.inf, 2.5), Phase("insert", 2.5, np.inf))
 
 
 def test_two_bumps_are_two_places_the_worse_first():
-    found = worst_places([residual(bump(1, 0.1, 2e-3) + bump(3.2, 0.15, -4e-3, axis=2))], PHASES, None, "demo_0")
+    found = worst_places(
+        [residual(bump(1, 0.1, 2e-3) + bump(3.2, 0.15, -4e-3, axis=2))], {None: PHASES}, None, "demo_0"
+    )
     assert [p.phase for p in found] == ["insert", "free"]
     assert [p.peak for p in found] == pytest.approx([3.2, 1.0], abs=0.03)
     assert (found[0].start, found[0].end) == pytest.approx((3.2 - 0.15 * 1.18, 3.2 + 0.15 * 1.18), abs=0.03)
@@ -57,7 +59,7 @@ def test_channels_of_one_body_that_fail_together_are_one_place():
     wrong = bump(3, 0.2, 3e-3)
     turned = residual(bump(3.05, 0.2, 0.1, axis=1), "block_orientation", "orientation", "rad", std=1e-2)
     other = residual(wrong, "lid_position", body="lid")
-    found = worst_places([residual(wrong), turned, other], PHASES, None, "demo_0")
+    found = worst_places([residual(wrong), turned, other], {None: PHASES}, None, "demo_0")
     assert {p.channels for p in found} == {("block_position", "block_orientation"), ("lid_position",)}
     merged = next(p for p in found if p.body == "block")
     assert "block position (and orientation), insert phase" in merged.sentence()
@@ -80,7 +82,7 @@ def test_a_residual_that_swings_points_to_and_fro():
 def test_a_diverged_replay_is_the_worst_place_and_stays_json():
     r = residual(bump(1, 0.1, 2e-3))
     lost = replace(r, error=np.where(TIME > 2, np.inf, r.error))
-    found = worst_places([lost], PHASES, None, "demo_0")
+    found = worst_places([lost], {None: PHASES}, None, "demo_0")
     assert found[0].size == "diverged"
     assert found[0].start == pytest.approx(2.01)
     assert found[1].peak == pytest.approx(1, abs=0.03)
