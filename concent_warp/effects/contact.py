@@ -187,7 +187,10 @@ class Adhesion(SurfaceEffect):
     """Surfaces that stick to each other."""
 
     name = "adhesion"
-    summary = "A force that pulls the body towards what it touches, over a gap of up to 1 mm, at each contact point."
+    summary = (
+        "A force that pulls the body towards what it touches, at each contact point; over a gap of 1 mm, less where it "
+        "is below a tenth of the weight."
+    )
     source = f"MuJoCo's adhesion of geoms ({MUJOCO})"
     signature = "lift-off and first slip too late; residual friction that does not go with the weight"
     confusions = ("sliding_friction", "mass")
@@ -195,10 +198,9 @@ class Adhesion(SurfaceEffect):
     GAP = 0.001
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Let contacts be found over the gap, without a force yet."""
+        """Switch adhesion on, of next to no force."""
         for n in self.target:
             for geom in spec.body(n).geoms:
-                geom.gap = max(geom.gap, self.GAP)
                 geom.adhesion = geom.adhesion or 1e-9
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -208,12 +210,16 @@ class Adhesion(SurfaceEffect):
         return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Adhesion."""
-        return ("geom_adhesion",)
+        """Adhesion, and the gap that it acts across."""
+        return ("geom_adhesion", "geom_gap")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Set it on the body's geoms."""
-        m.geom_adhesion[np.concatenate([geoms_of(m, b) for b in self.ids(m)])] = max(float(values[0]), 1e-9)
+        """Set both on the body's geoms. Contacts brake within the gap, so that there is none without a force."""
+        geoms, force = np.concatenate([geoms_of(m, b) for b in self.ids(m)]), max(float(values[0]), 1e-9)
+        weight = float(m.body_mass[self.ids(m)].sum() * np.linalg.norm(m.opt.gravity))
+        m.geom_adhesion[geoms] = force
+        m.geom_gap[geoms] = np.maximum(m.geom_gap[geoms], self.GAP * min(force / max(0.1 * weight, 1e-6), 1.0))
+        np.maximum.at(m.body_margin, m.geom_bodyid[geoms], m.geom_margin[geoms] + m.geom_gap[geoms])
 
 
 class PadFriction(Effect):

@@ -304,10 +304,8 @@ class GravityCompensation(Effect):
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Switch compensation on, of next to nothing."""
-        for n in self.target:
-            body = spec.body(n)
-            body.gravcomp = body.gravcomp or 1e-9
+        """Switch compensation on, by that of the world, which it cannot move: MuJoCo does it for positive shares."""
+        spec.worldbody.gravcomp = 1.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One share for all links: positive lifts."""

@@ -135,12 +135,14 @@ class JointOffset(JointEffect):
         return self.each("offset", "m" if slide else "rad", 0.0, low=-high, high=high, scale=scale)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Reading at which the joint is as drawn."""
-        return ("qpos0",)
+        """Readings at which the joint is as drawn, and its spring relaxed."""
+        return ("qpos0", "qpos_spring")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Shift the reading at which the joint is as drawn."""
-        m.qpos0[m.jnt_qposadr[self.ids(m)]] -= values
+        """Shift both."""
+        address = m.jnt_qposadr[self.ids(m)]
+        m.qpos0[address] -= values
+        m.qpos_spring[address] -= values
 
 
 class Stribeck(JointEffect):

@@ -9,9 +9,12 @@ from scipy.spatial.transform import Rotation
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import free_bodies, name
+from concent_warp.scene.contact_geometry import GROUP as SPHERES
 
 AIR = 1.2
 """Density of air at 20 degrees [kg/m^3]."""
+SPECK = 1e-5
+"""Radius of what the air does not act on [m]."""
 
 
 class GravityTilt(Effect):
@@ -56,15 +59,26 @@ class AirEffect(Effect):
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Use the ellipsoid model, on the target alone."""
-        mine = {id(geom) for n in self.target for geom in spec.body(n).geoms}
-        for geom in spec.geoms:
-            if geom.fluid_ellipsoid:
-                continue
-            chosen = id(geom) in mine or geom.parent.name in self.target
-            geom.fluid_ellipsoid = True
-            if not chosen:
-                geom.fluid_coefs = [0.0] * 5
+        """Use the ellipsoid model on the target's shape, and on other bodies a speck's instead of their inertia box.
+
+        A model that is in a medium already keeps its own.
+        """
+        if spec.option.density > 0 or spec.option.viscosity > 0:
+            return
+        for body in spec.bodies[1:]:
+            if body.name in self.target:
+                drawn = [geom for geom in body.geoms if geom.group != SPHERES]
+                for geom in drawn or body.geoms:
+                    geom.fluid_ellipsoid = True
+            elif not any(geom.fluid_ellipsoid for geom in body.geoms):
+                body.add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                    size=[SPECK, 0, 0],
+                    mass=0,
+                    contype=0,
+                    conaffinity=0,
+                    fluid_ellipsoid=True,
+                )
 
 
 class AirDrag(AirEffect):

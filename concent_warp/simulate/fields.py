@@ -55,9 +55,9 @@ def apply_fields(m: mujoco.MjModel, fields: Mapping[str, np.ndarray], scratch: m
             setattr(m.opt, name[4:], value)
         else:
             getattr(m, name)[:] = value
-    if "geom_margin" in fields:
+    if "geom_margin" in fields or "geom_gap" in fields:
         m.body_margin[:] = 0
-        np.maximum.at(m.body_margin, m.geom_bodyid, m.geom_margin)
+        np.maximum.at(m.body_margin, m.geom_bodyid, m.geom_margin + m.geom_gap)
     mujoco.mj_setConst(m, scratch)
     for name in set(CONSTANTS) & set(fields) - set(SOURCES_OF_CONSTANTS):
         getattr(m, name)[:] = fields[name]

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from small_worlds import GRIPPER, MOTOR, SLIDER, G, move, world
+
+from concent_warp.effects.drives import (
+    ActuatorDelay,
+    ActuatorGain,
+    ActuatorLag,
+    ActuatorSaturation,
+    Backlash,
+    GravityCompensation,
+    GripForce,
+    JointCompliance,
+)
+
+MASS, KP = 2.0, 400.0
+CART = SLIDER.format(joint="", actuator=MOTOR)
+SERVO = SLIDER.format(joint="", actuator=f'<position name="drive" joint="rail" kp="{KP}" kv="40"/>')
+WEIGHT = SERVO.replace('gravity="0 0 0"', f'gravity="{-G} 0 0"')
+"""The cart hangs on its drive, which pulls it along +x."""
+LOAD = MASS * G
+
+
+def test_gain_scales_what_a_motor_does_and_how_far_a_servo_sags():
+    assert move(world(CART, ActuatorGain("drive"), 0.7), 0.5, ctrl=3.0).qvel[-1, 0] == pytest.approx(
+        0.7 * 0.5 * 3.0 / MASS, rel=1e-6
+    )
+    sag = move(world(WEIGHT, ActuatorGain("drive"), 0.7), 3.0, ctrl=0.1).qpos[-1, 0] - 0.1
+    assert sag == pytest.approx(-LOAD / (0.7 * KP), rel=1e-4)
+
+
+def test_saturated_drive_accelerates_by_its_limit():
+    cart = move(world(SERVO, ActuatorSaturation("drive"), 5.0), 0.2, ctrl=0.5)
+    assert cart.qvel[-1, 0] == pytest.approx(0.2 * 5.0 / MASS, rel=1e-6)
+
+
+def test_saturation_keeps_a_limit_that_the_model_has():
+    xml = CART.replace('joint="rail"/></actuator>', 'joint="rail" forcerange="-2 2"/></actuator>')
+    m = world(xml, ActuatorSaturation("drive"), 3.0).compile()
+    np.testing.assert_array_equal(m.actuator_forcerange, [[-2, 2]])
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.0154])
+def test_delayed_drive_does_later_what_it_was_told(delay):
+    ramp = np.minimum(np.arange(400) * 0.002, 0.3)[:, None] ** 2
+    late = move(world(SERVO, ActuatorDelay("drive"), delay), 0.4, ctrl=ramp)
+    plain = move(world(SERVO), 0.4, ctrl=ramp)
+    expected = np.interp(late.time - delay, plain.time, plain.qpos[:, 0])
+    np.testing.assert_allclose(late.qpos[:, 0], expected, atol=2e-6)
+
+
+def test_lagging_drive_reaches_63_percent_of_a_step_after_its_time_constant():
+    step = np.concatenate([np.zeros(1), np.ones(499)])[:, None]
+    late = ActuatorLag("drive").command(world(CART).compile(), step, np.array([0.1]))
+    assert late[100, 0] == pytest.approx(1 - np.exp(-1), abs=0.004)
+    cart = move(world(CART, ActuatorLag("drive"), 0.1), 0.5, ctrl=step)
+    t = 0.499
+    expected = (t**2 / 2 - 0.1 * t + 0.1**2 * (1 - np.exp(-t / 0.1))) / MASS
+    assert cart.qpos[-1, 0] == pytest.approx(expected, rel=0.005)
+
+
+def test_weight_hangs_half_the_play_below_a_drive_with_backlash_and_above_it_when_pulled_up():
+    for xml, side in ((WEIGHT, -1), (WEIGHT.replace(f"{-G} 0 0", f"{G} 0 0"), 1)):
+        rest = move(world(xml, Backlash("drive"), 0.01), 3.0, ctrl=0.1).qpos[-1, 0]
+        assert rest == pytest.approx(0.1 + side * (LOAD / KP + 0.005), abs=1e-5)
+
+
+def test_backlash_with_friction_makes_a_loop_as_wide_as_the_play():
+    xml = SERVO.replace('axis="1 0 0"', 'axis="1 0 0" frictionloss="2" solreffriction="0.0015 1"')
+    time = np.arange(4000) * 0.001
+    command = 0.05 * np.abs((time / 2 + 0.5) % 2 - 1) * 2 - 0.05
+    q = move(world(xml, Backlash("drive"), 0.01), 4.0, ctrl=command[:, None]).qpos[:-1, 0]
+    speed, half = 0.05, 0.005 + 2 / KP
+    down, up = (time > 0.7) & (time < 0.95), (time > 2.7) & (time < 2.95)
+    drag = 40 * speed / KP
+    np.testing.assert_allclose(q[down] - command[down], half + drag, atol=2e-4)
+    np.testing.assert_allclose(q[up] - command[up], -half - drag, atol=2e-4)
+
+
+def test_compliant_joint_sags_by_spring_and_drive_and_its_encoder_shows_the_drive_alone():
+    c = 0.001
+    model = world(WEIGHT, JointCompliance("drive"), c)
+    cart = move(model, 3.0, ctrl=0.1)
+    assert cart.qpos[-1, 0] == pytest.approx(0.1 - LOAD / KP - LOAD * c, abs=1e-6)
+    read = model.effects[0].effect.measure(model.compile(), cart.read, np.array([c]))
+    assert read("encoder", cart.time[-1:])[0, 0] == pytest.approx(0.1 - LOAD / KP, abs=1e-6)
+
+
+def test_compliant_joint_without_damping_swings_at_the_frequency_of_both_springs_in_series():
+    xml = SERVO.replace('kv="40"', "")
+    c = 0.002
+    x = move(world(xml, JointCompliance("drive"), c), 1.0, qpos=[0.01]).qpos[:, 0]
+    k = 1 / (1 / KP + c)
+    np.testing.assert_allclose(x, 0.01 * np.cos(np.sqrt(k / MASS) * np.arange(1001) * 0.001), atol=2e-4)
+
+
+@pytest.mark.parametrize("share", [0.4, 1.0, -0.3])
+def test_gravity_compensation_carries_its_share_of_the_weight(share):
+    xml = CART.replace('gravity="0 0 0"', f'gravity="{-G} 0 0"')
+    cart = move(world(xml, GravityCompensation("cart"), share), 0.5)
+    assert cart.qvel[-1, 0] == pytest.approx(-G * (1 - share) * 0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(("gain", "holds"), [(0.9, False), (1.1, True)])
+def test_gripper_drops_the_block_below_a_force_of_half_the_weight_over_mu(gain, holds):
+    needed = 0.1 * G / (2 * 0.5)
+    drop = move(world(GRIPPER, GripForce("left", "right"), gain), 0.4, ctrl=[0, needed, needed]).sensor["block"][:, 2]
+    assert (drop[0] - drop[-1] < 0.003) == holds
+
+
+def test_grip_force_scales_the_limits_too():
+    xml = GRIPPER.replace('joint="left"/>', 'joint="left" forcerange="-2 2"/>')
+    m = world(xml, GripForce("left", "right"), 3.0).compile()
+    np.testing.assert_allclose(m.actuator_forcerange[m.actuator("left").id], [-6, 6])

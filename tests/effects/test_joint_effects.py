@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from small_worlds import MOTOR, PENDULUM, SLIDER, G, move, world
+
+from concent_warp.effects.joints import (
+    Armature,
+    JointDamping,
+    JointFriction,
+    JointOffset,
+    LoadDependentFriction,
+    Stribeck,
+)
+
+MASS = 2.0
+CART = SLIDER.format(joint="", actuator=MOTOR)
+SPRUNG = SLIDER.format(joint='stiffness="50"', actuator=MOTOR)
+
+
+def test_dry_friction_stops_a_cart_after_the_distance_that_its_energy_lasts():
+    cart = move(world(CART, JointFriction("rail"), 1.5), 2.0, qvel=[0.6])
+    assert cart.qpos[-1, 0] == pytest.approx(MASS * 0.6**2 / (2 * 1.5), rel=0.01)
+    assert abs(cart.qvel[-1, 0]) < 1e-6
+
+
+def test_dry_friction_takes_four_f_over_k_off_the_amplitude_in_each_period():
+    cart = move(world(SPRUNG, JointFriction("rail"), 0.4), 2.1 * 2 * np.pi * np.sqrt(MASS / 50), qpos=[0.1])
+    x = cart.qpos[:, 0]
+    peaks = x[1:-1][(x[1:-1] > x[:-2]) & (x[1:-1] > x[2:])]
+    np.testing.assert_allclose(peaks[:2], [0.1 - 4 * 0.4 / 50, 0.1 - 8 * 0.4 / 50], atol=5e-4)
+
+
+@pytest.mark.parametrize(("force", "moves"), [(1.4, False), (1.6, True)])
+def test_dry_friction_holds_up_to_its_size(force, moves):
+    cart = move(world(CART, JointFriction("rail"), 1.5), 1.0, ctrl=force)
+    assert cart.qpos[-1, 0] == pytest.approx(0.5 * 0.1 / MASS if moves else 0.0, abs=5e-4)
+
+
+def test_viscous_friction_lets_the_amplitude_decay_exponentially():
+    cart = move(world(SPRUNG, JointDamping("rail"), 1.2), 2.0, qpos=[0.1])
+    rate = 1.2 / (2 * MASS)
+    swing = np.sqrt(50 / MASS - rate**2)
+    envelope = np.exp(-rate * cart.time)
+    expected = 0.1 * envelope * (np.cos(swing * cart.time) + rate / swing * np.sin(swing * cart.time))
+    np.testing.assert_allclose(cart.qpos[:, 0], expected, atol=5e-4)
+
+
+def test_stribeck_friction_holds_at_rest_and_fades_with_speed():
+    xml = SLIDER.format(joint='frictionloss="1" solreffriction="0.0015 1"', actuator=MOTOR)
+    model = world(xml, Stribeck("rail"), 0.8, 0.1)
+    assert abs(move(model, 0.5, ctrl=1.7).qpos[-1, 0]) < 1e-4
+    cart = move(model, 0.5, ctrl=1.7, qvel=[0.15])
+
+    def acceleration(_, state):
+        return [state[1], (1.7 - 1.0 - 0.8 * np.exp(-((state[1] / 0.1) ** 2))) / MASS]
+
+    expected = solve_ivp(acceleration, (0, 0.5), [0, 0.15], t_eval=[0.5], rtol=1e-8).y[:, -1]
+    np.testing.assert_allclose([cart.qpos[-1, 0], cart.qvel[-1, 0]], expected, rtol=5e-3)
+
+
+def test_load_friction_takes_its_share_of_half_the_drive_of_a_cart_that_nothing_else_loads():
+    cart = move(world(CART, LoadDependentFriction("rail"), 0.4), 0.5, ctrl=3.0)
+    assert cart.qvel[-1, 0] == pytest.approx(0.5 * 3.0 * (1 - 0.4 / 2) / MASS, rel=0.01)
+
+
+@pytest.mark.parametrize(("share", "held"), [(0.84, True), (0.80, False), (1.20, True), (1.25, False)])
+def test_load_friction_holds_a_weight_within_a_band_around_the_torque_that_carries_it(share, held):
+    """|tau - w| <= c (tau + w) / 2, so tau / w between (2 - c) / (2 + c) and its inverse: 0.818 to 1.222 at c = 0.2."""
+    weight = 0.5 * G * 0.2
+    pendulum = move(world(PENDULUM, LoadDependentFriction("hinge"), 0.2), 0.2, ctrl=-share * weight, qpos=[-np.pi / 2])
+    assert (abs(pendulum.qpos[-1, 0] + np.pi / 2) < 2e-3) == held
+
+
+def test_armature_adds_to_what_a_drive_accelerates():
+    cart = move(world(CART, Armature("rail"), 0.5), 0.5, ctrl=3.0)
+    assert cart.qvel[-1, 0] == pytest.approx(0.5 * 3.0 / (MASS + 0.5), rel=1e-6)
+
+
+def test_offset_pendulum_hangs_where_its_encoder_reads_less_by_the_offset():
+    model = world(PENDULUM, JointOffset("hinge"), 0.2)
+    np.testing.assert_allclose(move(model, 1.0, qpos=[-0.2]).qpos, -0.2, atol=1e-9)
+    swing = move(model, 0.3, qpos=[0.1])
+    plain = move(world(PENDULUM), 0.3, qpos=[0.3])
+    np.testing.assert_allclose(swing.qpos + 0.2, plain.qpos, atol=1e-9)
+
+
+def test_offset_leaves_the_springs_of_a_joint_where_they_are_in_space():
+    cart = move(world(SPRUNG, JointOffset("rail"), 0.03), 0.2, qpos=[-0.03])
+    np.testing.assert_allclose(cart.qpos, -0.03, atol=1e-9)

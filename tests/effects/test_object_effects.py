@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from small_worlds import BALL, BLOCK, FLOOR, MOTOR, PENDULUM, SLIDER, G, move, world
+
+from concent_warp.effects.objects import CenterOfMass, Inertia, Mass, Size
+
+CART = SLIDER.format(joint="", actuator=MOTOR)
+
+
+def test_heavier_cart_is_accelerated_less_by_the_same_force():
+    cart = move(world(CART, Mass("cart"), 1.6), 0.5, ctrl=3.0)
+    assert cart.qvel[-1, 0] == pytest.approx(0.5 * 3.0 / (2 * 1.6), rel=1e-6)
+
+
+def test_mass_leaves_the_period_of_a_pendulum():
+    plain, heavy = (move(world(PENDULUM, Mass("link"), f), 0.5, qpos=[0.3]) for f in (1.0, 2.0))
+    np.testing.assert_allclose(plain.qpos, heavy.qpos, atol=1e-9)
+
+
+def test_pendulum_hangs_with_its_shifted_centre_of_mass_below_the_hinge():
+    shifted = world(PENDULUM, CenterOfMass("link"), 0.05, 0.0, 0.02)
+    rest = np.arctan2(0.05, 0.2 - 0.02)
+    np.testing.assert_allclose(move(shifted, 0.5, qpos=[rest]).qpos, rest, atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset", "tips"), [(0.045, False), (0.055, True)])
+def test_block_tips_over_the_edge_that_its_centre_of_mass_lies_beyond(offset, tips):
+    block = move(world(BLOCK, CenterOfMass("thing"), offset, 0.0, 0.0), 0.5)
+    upright = 1 - 2 * (block.qpos[-1, 4] ** 2 + block.qpos[-1, 5] ** 2)
+    assert (upright < 0.9) == tips
+
+
+def test_thrown_body_turns_about_its_shifted_centre_of_mass():
+    ball = move(world(BALL, CenterOfMass("thing"), 0.02, 0.0, 0.0), 0.2, qpos=[0, 0, 1, 1, 0, 0, 0], qvel=[0] * 5 + [5])
+    angle = 5 * ball.time
+    speed = np.array([0, 5 * 0.02])
+    centre = np.array([0.02, 0.0]) + speed * ball.time[:, None]
+    np.testing.assert_allclose(
+        ball.qpos[:, :2], centre - 0.02 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("factor", [0.5, 3.0])
+def test_pendulum_of_another_inertia_swings_with_another_period(factor):
+    swing = move(world(PENDULUM, Inertia("link"), factor), 2.0, qpos=[0.02]).qpos[:, 0]
+    falls = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
+    period = np.diff(falls)[0] * 0.001
+    assert period == pytest.approx(2 * np.pi * np.sqrt((0.004 * factor + 0.5 * 0.2**2) / (0.5 * G * 0.2)), abs=0.002)
+
+
+@pytest.mark.parametrize(("shape", "size", "half"), [("box", "0.05 0.04 0.02", 0.02), ("sphere", "0.05", 0.05)])
+def test_larger_body_rests_higher_in_proportion(shape, size, half):
+    xml = FLOOR.format(type=shape, size=size, height=half, floor="", geom="")
+    plain, large = (
+        move(world(xml, Size("thing"), factor), 1.0, qpos=[0, 0, factor * half, 1, 0, 0, 0]) for factor in (1.0, 1.2)
+    )
+    assert large.qpos[-1, 2] - plain.qpos[-1, 2] == pytest.approx(0.2 * half, abs=2e-5)
+
+
+MESH = """
+<mujoco><asset><mesh name="wedge" scale="2 1 1" vertex="-.02 -.02 -.02 .02 -.02 -.02 0 .02 -.02 0 0 .02"/></asset>
+<worldbody><body name="thing"><freejoint/><geom name="a" type="mesh" mesh="wedge" pos="0.1 0 0" mass="0.3"/>
+<geom name="b" type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" mass="0.1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("xml", [BLOCK, MESH], ids=["box", "mesh and capsule"])
+def test_size_scales_shapes_and_places_and_leaves_mass_and_inertia(xml):
+    plain, large = world(xml).compile(), world(xml, Size("thing"), 1.25).compile()
+    for name in ("body_mass", "body_inertia", "body_ipos"):
+        np.testing.assert_allclose(getattr(large, name), getattr(plain, name), atol=1e-9)
+    mine = plain.geom_bodyid == plain.body("thing").id
+    for name in ("geom_pos", "geom_rbound"):
+        np.testing.assert_allclose(getattr(large, name)[mine], 1.25 * getattr(plain, name)[mine], atol=1e-9)
+    np.testing.assert_allclose(large.geom_aabb[mine], 1.25 * plain.geom_aabb[mine], atol=1e-9)
