@@ -61,7 +61,7 @@ def compare(
         noise = instrument_noise(compiled, recording.demonstrations)
         for d in chosen:
             rollout = replay(model, d, simulator, contacts="all" if name == last else "none").numpy()
-            found[name, d.name] = residuals(compiled, rollout, d, noise)
+            found[name, d.name] = residuals(compiled, rollout, d, noise, model.effects)
             if rollout.diverged[0]:
                 bad = ~np.isfinite(rollout.qpos[0]).all(axis=1)
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])

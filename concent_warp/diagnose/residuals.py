@@ -13,10 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnose.noise import Kind, Noise, Source, channel_noise, pooled_noise, turns
 from concent_warp.errors import RecordingError
+from concent_warp.recording.recording import Channel
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, interpolate, predict
 
 if TYPE_CHECKING:
-    from concent_warp.recording.recording import Channel, Demonstration, PointTrack
+    from concent_warp.effects.effect import AddedEffect, Reader
+    from concent_warp.recording.recording import Demonstration, PointTrack
     from concent_warp.simulate.engine import Rollout
 
 ANCHOR_FRAMES = 5
@@ -106,6 +108,7 @@ def residuals(
     rollout: Rollout,
     demonstration: Demonstration,
     noise: Mapping[str, Noise] | None = None,
+    effects: Sequence[AddedEffect] = (),
 ) -> tuple[Residual, ...]:
     """Return the residuals of every measured channel and every point track.
 
@@ -114,13 +117,17 @@ def residuals(
         rollout: Replay of the demonstration, one variant, NumPy, all bodies recorded.
         demonstration: What was measured.
         noise: Noise by channel (`instrument_noise`); estimated from this demonstration alone where there is none.
+        effects: Those of the model; what they do to the instruments is in what is predicted.
 
     Raises:
         RecordingError: A channel names a sensor or a body that the model lacks, or has another dimension.
     """
     known = noise or {}
+    read: Reader = lambda sensor, time: predict(compiled, rollout, sensor, Channel(time, time))  # noqa: E731
+    for added in effects:
+        read = added.effect.measure(compiled, read, added.array)
     found = [
-        sensor_residual(compiled, rollout, name, channel, demonstration.name, known.get(name))
+        sensor_residual(compiled, read, name, channel, demonstration.name, known.get(name))
         for name, channel in demonstration.measured.items()
     ]
     for body, track in demonstration.points.items():
@@ -145,9 +152,9 @@ def instrument_noise(compiled: mujoco.MjModel, demonstrations: Sequence[Demonstr
 
 
 def sensor_residual(
-    compiled: mujoco.MjModel, rollout: Rollout, name: str, channel: Channel, where: str, noise: Noise | None = None
+    compiled: mujoco.MjModel, read: Reader, name: str, channel: Channel, where: str, noise: Noise | None = None
 ) -> Residual:
-    """Return the residual of one sensor."""
+    """Return the residual of one sensor; `read` tells what it reads at given times in the model's world."""
     row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
         names = [compiled.sensor(i).name for i in range(compiled.nsensor)]
@@ -161,7 +168,7 @@ def sensor_residual(
             expected=int(compiled.sensor_dim[row]),
             found=channel.value.shape[1],
         )
-    predicted = predict(compiled, rollout, name, channel)
+    predicted = read(name, channel.time)
     kind, unit = kind_and_unit(compiled, row)
     value = rotation_between(predicted, channel.value) if kind == "orientation" else channel.value - predicted
     error = np.linalg.norm(value, axis=1)

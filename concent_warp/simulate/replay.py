@@ -108,11 +108,16 @@ def replay(
     bodies: Sequence[str] | None = None,
     contacts: Contacts = "none",
 ) -> Rollout:
-    """Run the recorded commands from the recorded initial state; one variant, see `Engine.run`."""
+    """Run the recorded commands, as the model's effects change them, from the recorded initial state.
+
+    One variant, see `Engine.run`.
+    """
     compiled = model.scene.model
     steps = step_count(demonstration, engine.timestep)
     qpos, qvel = initial_state(compiled, demonstration)
     ctrl = commands(compiled, demonstration, steps)
+    for added in model.effects:
+        ctrl = added.effect.command(compiled, ctrl, added.array)
     variants = Variants(1, qpos=qpos[None], qvel=qvel[None])
     return engine.run(variants, ctrl, record=record, bodies=bodies, contacts=contacts)
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,10 +8,14 @@ from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Phase
 from concent_warp.diagnose.comparison_table import markdown_table, rich_table
 from concent_warp.diagnose.units import shown
+from concent_warp.effects.drives import ActuatorDelay
+from concent_warp.effects.measurement import Latency
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.simulate.replay import replay
 
 XML = """
 <mujoco>
@@ -212,3 +217,29 @@ def test_places_are_those_of_the_last_model(comparison):
     assert "rail" not in {c for p in comparison.places for c in p.channels}
     swapped = compare({"right": model(2), "wrong": model(6)}, recorded(model(2)), "mujoco")
     assert "rail" in {c for p in swapped.places for c in p.channels}
+
+
+def delayed(recording):
+    """The same recording with commands that reach the drive 60 ms late."""
+    d = recording[0]
+    late = Channel(TIME + 0.06, d.action["drive"].value)
+    truth = model(2)
+    rollout = replay(truth, replace(d, action={"drive": late}), MujocoEngine(truth))
+    value = np.interp(TIME, rollout.time, rollout.sensordata[0][:, 0])[:, None]
+    return replace(recording, demonstrations=(replace(d, measured={"rail": Channel(TIME, value, 1e-4)}),))
+
+
+def stale(recording):
+    """The same recording with readings that are 50 ms old."""
+    d = recording[0]
+    rail = d.measured["rail"]
+    return replace(recording, demonstrations=(replace(d, measured={"rail": replace(rail, time=TIME + 0.05)}),))
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "changed"), [(ActuatorDelay("drive"), 0.06, delayed), (Latency("rail"), 0.05, stale)]
+)
+def test_effects_of_a_model_act_in_its_replay_and_in_what_it_reads(effect, value, changed):
+    found = compare({"without": model(2), "with": model(2).add(effect, [value])}, changed(recorded(model(2))), "mujoco")
+    assert found.summarise("without", "rail").ratio > 20
+    assert found.summarise("with", "rail").ratio < 1.2
