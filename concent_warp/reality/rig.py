@@ -91,6 +91,27 @@ class Rig:
     """What the recording tells of the state at time 0, as estimated from the first readings: nothing; the state of
     bodies that stand on something, so that height, roll and pitch are those of standing; or of bodies in flight."""
 
+    body: str = ""
+    """The body under test: what slides, falls or is held, or the arm's last link."""
+    surface: str = ""
+    """The geom on which it slides or lands."""
+    grippers: tuple[str, ...] = ()
+    """Actuators that hold something."""
+    pads: tuple[str, ...] = ()
+    """Geoms that they hold it with."""
+
+    @property
+    def slides(self) -> bool:
+        """Whether it is slides that are driven, not hinges."""
+        m = self.scene.model
+        kinds = {int(m.jnt_type[m.actuator_trnid[a, 0]]) for a in range(m.nu)}
+        return kinds == {int(mujoco.mjtJoint.mjJNT_SLIDE)}
+
+    @property
+    def body_tracked(self) -> bool:
+        """Whether the body under test is loose, and the tracker follows it."""
+        return int(mujoco.mjtJoint.mjJNT_FREE) in self.scene.model.jnt_type
+
     def world(self, effects: Sequence[HiddenEffect] = ()) -> mujoco.MjSpec:
         """Return the world, hidden effects included, ready to be compiled."""
         spec = self.scene.spec()

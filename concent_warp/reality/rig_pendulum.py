@@ -18,11 +18,10 @@ XML = """
     <geom name="stand" type="box" pos="0 0.05 0.3" size="0.02 0.015 0.02" contype="0" conaffinity="0"/>
     <body name="arm" pos="0 0 0.3">
       <joint name="hinge" axis="0 1 0"/>
-      <geom name="arm" type="capsule" fromto="0 0 0 0 0 -0.1" size="0.008" mass="0.03" contype="0" conaffinity="0"/>
-      <body name="payload" pos="0 0 -0.1">
-        <geom name="payload" type="cylinder" size="0.022 0.01" euler="1.5707963 0 0" mass="0.3"
-              contype="0" conaffinity="0"/>
-      </body>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.1" size="0.008" mass="0.03" contype="0" conaffinity="0"/>
+      <geom name="weight" type="cylinder" pos="0 0 -0.1" size="0.022 0.01" euler="1.5707963 0 0" mass="0.3"
+            contype="0" conaffinity="0"/>
+      <site name="marker" pos="0 0 -0.1" size="0.004"/>
     </body>
   </worldbody>
   <actuator>
@@ -30,7 +29,7 @@ XML = """
   </actuator>
   <sensor>
     <jointpos name="hinge_position" joint="hinge"/>
-    <framepos name="payload_position" objtype="xbody" objname="payload"/>
+    <framepos name="marker_position" objtype="site" objname="marker"/>
   </sensor>
 </mujoco>
 """
@@ -55,4 +54,4 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 
 
 SCENE = Scene(XML, "pendulum rig")
-PENDULUM = Rig("pendulum", SCENE, plan, of_coarser_step(SCENE))
+PENDULUM = Rig("pendulum", SCENE, plan, of_coarser_step(SCENE), body="arm")

@@ -88,4 +88,4 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 
 
 SCENE = Scene(XML, "push rig")
-PUSH = Rig("push", SCENE, plan, of_coarser_step(SCENE), start="resting")
+PUSH = Rig("push", SCENE, plan, of_coarser_step(SCENE), start="resting", body="block", surface="table")

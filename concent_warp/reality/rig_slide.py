@@ -66,4 +66,4 @@ def coulomb(time: float, point: np.ndarray) -> np.ndarray:
 
 
 PHYSICS = WorldPhysics(edit=glossy, force=rub(coulomb, "block", "table"))
-SLIDE = Rig("slide", Scene(XML, "slide rig"), plan, PHYSICS, throws=6, start="resting")
+SLIDE = Rig("slide", Scene(XML, "slide rig"), plan, PHYSICS, throws=6, start="resting", body="block", surface="table")

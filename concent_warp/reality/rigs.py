@@ -7,5 +7,6 @@ from concent_warp.reality.rig_drop import DROP
 from concent_warp.reality.rig_pendulum import PENDULUM
 from concent_warp.reality.rig_push import PUSH
 from concent_warp.reality.rig_slide import SLIDE
+from concent_warp.reality.rig_tumble import TUMBLE
 
-RIGS: dict[str, Rig] = {rig.name: rig for rig in (PENDULUM, SLIDE, DROP, PUSH)}
+RIGS: dict[str, Rig] = {rig.name: rig for rig in (PENDULUM, SLIDE, DROP, TUMBLE, PUSH)}

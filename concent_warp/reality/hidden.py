@@ -1,0 +1,50 @@
+"""Every hidden effect by name, single or several at once, and of three sizes on each rig that shows it.
+
+Each is made by means of its own, so that finding it is not reading the same code backwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from concent_warp.reality.hidden_case import Builder, Hidden
+from concent_warp.reality.hidden_contact import CONTACT
+from concent_warp.reality.hidden_drives import DRIVES
+from concent_warp.reality.hidden_joints import JOINTS
+from concent_warp.reality.hidden_measurement import MEASUREMENT
+from concent_warp.reality.hidden_objects import OBJECTS
+from concent_warp.reality.hidden_outside import OUTSIDE
+from concent_warp.reality.hidden_world import WORLD
+from concent_warp.reality.rig import Rig
+
+INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **OBJECTS, **CONTACT, **WORLD, **MEASUREMENT}
+"""Effects that a library of effects has, by canonical name."""
+EVERY: dict[str, Builder] = {**INSIDE, **OUTSIDE}
+
+
+def hidden(name: str, magnitude: float, rig: Rig) -> Hidden:
+    """Return an effect to be hidden in a rig.
+
+    Args:
+        name: Canonical name, or one of `OUTSIDE`.
+        magnitude: Value of its main parameter, in the parameter's unit.
+        rig: Where.
+
+    Raises:
+        KeyError: There is no such effect.
+    """
+    return EVERY[name](rig, magnitude)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Effects hidden in a rig."""
+
+    rig: str
+    magnitudes: Mapping[str, float]
+    """Value of the main parameter of each effect, by name; none where nothing is hidden."""
+
+    def build(self, rig: Rig) -> tuple[Hidden, ...]:
+        """Return the effects."""
+        return tuple(hidden(name, magnitude, rig) for name, magnitude in self.magnitudes.items())

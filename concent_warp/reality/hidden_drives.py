@@ -1,0 +1,202 @@
+"""Hidden effects in drives: commands late or smoothed, weak or limited motors, play, springs, wrong zeros.
+
+Play and springs have a rotor of their own, a second joint that the servo drives, coupled to the link by a tendon.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import mujoco
+import numpy as np
+
+from concent_warp.reality.hidden_case import Builder, Drive, Fresh, Hidden, drives, each
+from concent_warp.reality.rig import Rig
+from concent_warp.reality.world import HiddenEffect
+
+
+class Late(Fresh):
+    """Commands pass through a queue and act after a delay."""
+
+    def __init__(self, delay: float) -> None:
+        super().__init__()
+        self.delay = delay
+        self.queue: deque[tuple[float, np.ndarray]] = deque()
+        self.acting = np.zeros(0)
+
+    def __call__(self, now: float, ctrl: np.ndarray) -> np.ndarray:
+        """Return what acts now."""
+        if self.step(now) is None:
+            self.queue.clear()
+            self.acting = ctrl.copy()
+        self.queue.append((now + self.delay, ctrl.copy()))
+        while self.queue and self.queue[0][0] <= now + 1e-9:
+            self.acting = self.queue.popleft()[1]
+        return self.acting
+
+
+class Sluggish(Fresh):
+    """Set points follow the commands by dy/dt = (u - y) / time constant."""
+
+    def __init__(self, time_constant: float) -> None:
+        super().__init__()
+        self.time_constant = time_constant
+        self.y = np.zeros(0)
+
+    def __call__(self, now: float, ctrl: np.ndarray) -> np.ndarray:
+        """Return what acts over the step that begins now: the set point at its middle."""
+        elapsed = self.step(now)
+        if elapsed is None:
+            self.y = ctrl.copy()
+            return self.y
+        middle = ctrl + (self.y - ctrl) * np.exp(-0.5 * elapsed / self.time_constant)
+        self.y = ctrl + (self.y - ctrl) * np.exp(-elapsed / self.time_constant)
+        return middle
+
+
+def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
+    """Return the effect of a hook on the commands of the arm; the gripper's pass."""
+    columns = [rig.scene.model.actuator(d.actuator).id for d in drives(rig)]
+
+    def command(now: float, ctrl: np.ndarray) -> np.ndarray:
+        changed = ctrl.copy()
+        changed[columns] = hook(now, ctrl)[columns]
+        return changed
+
+    return HiddenEffect(type(hook).__name__, command=command)
+
+
+def actuator_delay(rig: Rig, magnitude: float) -> Hidden:
+    """Commands act later [s]."""
+    return Hidden("actuator_delay", arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
+
+
+def actuator_lag(rig: Rig, magnitude: float) -> Hidden:
+    """Set points follow with a time constant [s]."""
+    return Hidden("actuator_lag", arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig)))
+
+
+def actuator_gain(rig: Rig, magnitude: float) -> Hidden:
+    """Every drive's force is that of the drawing times a factor [-]."""
+    found = drives(rig)
+
+    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        for d in found:
+            data.qfrc_applied[model.joint(d.joint).dofadr[0]] += (magnitude - 1) * d.error_force(model, data)
+
+    truth = each("gain", names(found), np.full(len(found), magnitude))
+    return Hidden("actuator_gain", HiddenEffect("actuator_gain", force=force), truth, names(found))
+
+
+def actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
+    """No drive exceeds a limit [N m or N]."""
+    found = drives(rig)
+
+    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        for d in found:
+            asked = d.error_force(model, data)
+            data.qfrc_applied[model.joint(d.joint).dofadr[0]] += np.clip(asked, -magnitude, magnitude) - asked
+
+    effect = HiddenEffect("actuator_saturation", force=force)
+    return Hidden("actuator_saturation", effect, {"limit": magnitude}, names(found))
+
+
+def add_rotor(spec: mujoco.MjSpec, drive: Drive, inertia: float) -> mujoco.MjsTendon:
+    """Give a drive a rotor beside its joint, and return the tendon whose length is rotor angle less link angle."""
+    link = spec.joint(drive.joint)
+    rotor = spec.worldbody.add_body(name=f"{drive.joint}_rotor")
+    rotor.explicitinertial = True
+    rotor.mass, rotor.inertia = (inertia, [1e-6] * 3) if link.type == SLIDE else (1e-3, [inertia] * 3)
+    rotor.add_joint(name=f"{drive.joint}_rotor", type=link.type, axis=[0, 0, 1] if link.type != SLIDE else [1, 0, 0])
+    spec.actuator(drive.actuator).target = f"{drive.joint}_rotor"
+    tendon = spec.add_tendon(name=f"{drive.joint}_gear")
+    tendon.wrap_joint(f"{drive.joint}_rotor", 1.0)
+    tendon.wrap_joint(drive.joint, -1.0)
+    return tendon
+
+
+SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
+
+
+def light(drive: Drive, rig: Rig) -> float:
+    """Return a rotor inertia that hardly counts beside what the drive moves [kg m^2 or kg]."""
+    m = rig.scene.model
+    return 0.01 * float(m.dof_M0[m.joint(drive.joint).dofadr[0]])
+
+
+def backlash(rig: Rig, magnitude: float) -> Hidden:
+    """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
+    found = drives(rig)
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for d in found:
+            tendon = add_rotor(spec, d, light(d, rig))
+            tendon.limited, tendon.range = True, [-magnitude / 2, magnitude / 2]
+            tendon.solref_limit = [2 * spec.option.timestep, 1.0]
+            tendon.solimp_limit = [0.95, 0.99, 1e-4, 0.5, 2.0]
+
+    return Hidden("backlash", HiddenEffect("backlash", edit=edit), {"play": magnitude}, names(found))
+
+
+def joint_compliance(rig: Rig, magnitude: float) -> Hidden:
+    """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
+    found = drives(rig)
+    compliance = np.array([magnitude / d.weight for d in found])
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for d, c in zip(found, compliance, strict=True):
+            tendon = add_rotor(spec, d, light(d, rig))
+            tendon.stiffness = [1 / c, 0, 0]
+            tendon.damping = [1e-3 / c, 0, 0]
+            tendon.springlength = [0.0, 0.0]
+            for sensor in spec.sensors:
+                if sensor.type == mujoco.mjtSensor.mjSENS_JOINTPOS and sensor.objname == d.joint:
+                    sensor.objname = f"{d.joint}_rotor"
+
+    truth = each("compliance", names(found), compliance)
+    return Hidden("joint_compliance", HiddenEffect("joint_compliance", edit=edit), truth, names(found))
+
+
+def joint_offset(rig: Rig, magnitude: float) -> Hidden:
+    """How far the true angle is beyond what encoder and drive take it for [rad or m], in alternate directions."""
+    found = drives(rig)
+    m = rig.scene.model
+    offset = magnitude * np.array([(-1.0) ** k for k in range(len(found))])
+    columns = [m.actuator(d.actuator).id for d in found]
+    sensors = {}
+    for i in range(m.nsensor):
+        if m.sensor_type[i] == mujoco.mjtSensor.mjSENS_JOINTPOS:
+            joint = m.joint(m.sensor_objid[i]).name
+            sensors[m.sensor(i).name] = next((o for d, o in zip(found, offset, strict=True) if d.joint == joint), 0.0)
+
+    def command(now: float, ctrl: np.ndarray) -> np.ndarray:
+        del now
+        shifted = ctrl.copy()
+        shifted[columns] += offset
+        return shifted
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return time, value - sensors.get(name, 0.0)
+
+    joints = tuple(d.joint for d in found)
+    effect = HiddenEffect("joint_offset", command=command, measure=measure)
+    return Hidden("joint_offset", effect, each("offset", joints, offset), joints)
+
+
+def names(found: tuple[Drive, ...]) -> tuple[str, ...]:
+    """Return the actuators of drives."""
+    return tuple(d.actuator for d in found)
+
+
+DRIVES: dict[str, Builder] = {
+    f.__name__: f
+    for f in (
+        actuator_gain,
+        actuator_saturation,
+        actuator_delay,
+        actuator_lag,
+        backlash,
+        joint_compliance,
+        joint_offset,
+    )
+}
