@@ -88,7 +88,8 @@ class Model:
         """
         base = self.compile()
         effect.check(base)
-        if any(a.effect.name == effect.name and set(a.effect.target) & set(effect.target) for a in self.effects):
+        same = (a.effect.target for a in self.effects if a.effect.name == effect.name)
+        if any(set(target) & set(effect.target) or target == effect.target for target in same):
             raise ModelError(f"the model has {effect.name} there already", found=list(effect.target))
         added = AddedEffect(effect, checked_values(effect, base, values))
         return replace(self, effects=(*self.effects, added))

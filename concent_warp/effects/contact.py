@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -16,7 +17,6 @@ from concent_warp.effects.select import (
     free_body_targets,
     geoms_of,
     name,
-    standing_geoms,
     surfaces,
 )
 
@@ -34,6 +34,11 @@ class SurfaceEffect(Effect):
 
     family = "contact"
     kind = "body"
+    wants = "bodies with geoms that collide"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the body collides."""
+        return collides(m, i)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -55,16 +60,15 @@ class FrictionEffect(SurfaceEffect):
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Give the contacts the dimension, with next to no friction where it comes anew."""
-        for n in self.target:
-            body = spec.body(n)
-            if all(geom.condim >= self.condim for geom in body.geoms):
-                continue
-            for geom in (*body.geoms, *standing(spec)):
-                for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
-                    if geom.condim < needed <= self.condim:
-                        geom.friction[column] = NEXT_TO_NOTHING
-            for geom in body.geoms:
-                geom.condim = max(geom.condim, self.condim)
+        raised = [geom for n in self.target for geom in colliding(spec.body(n).geoms) if geom.condim < self.condim]
+        if not raised:
+            return
+        for geom in colliding(spec.geoms):
+            for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
+                if geom.condim < needed <= self.condim:
+                    geom.friction[column] = NEXT_TO_NOTHING
+        for geom in raised:
+            geom.condim = self.condim
 
     def null(self, m: mujoco.MjModel) -> float:
         """Return the coefficient that the model has."""
@@ -78,8 +82,10 @@ class FrictionEffect(SurfaceEffect):
         return ("geom_friction",)
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Set the coefficient."""
-        m.geom_friction[self.geoms(m), self.column] = max(float(values[0]), NEXT_TO_NOTHING)
+        """Set the largest coefficient, and all others in proportion."""
+        geoms = self.geoms(m)
+        share = np.maximum(m.geom_friction[geoms, self.column], NEXT_TO_NOTHING)
+        m.geom_friction[geoms, self.column] = np.maximum(values[0] * share / share.max(), NEXT_TO_NOTHING)
 
 
 class SlidingFriction(FrictionEffect):
@@ -156,18 +162,27 @@ class ContactCompliance(SurfaceEffect):
     source = f"MuJoCo's solref ({MUJOCO})"
     signature = "height of rebounds; sinking in at rest and at impacts"
     confusions = ("size", "adhesion", "air_drag")
+    wants = "bodies that collide, where their contacts and those of all that stands still have a time constant"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the contacts have a time constant."""
+        return super().suits(m, i) and bool((m.geom_solref[surfaces(m, i), 0] > 0).all())
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body whose contacts have a time constant."""
-        return tuple(t for t in free_body_targets(m) if (m.geom_solref[cls(*t).geoms(m), 0] > 0).all())
+        return tuple(t for t in free_body_targets(m) if cls(*t).suits(m, m.body(t[0]).id))
+
+    def mean(self, m: mujoco.MjModel) -> np.ndarray:
+        """Return time constant [s] and damping ratio of body and surroundings, as they act together, shape (2,)."""
+        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
+        geoms = self.geoms(m)
+        sides = [np.intersect1d(geoms, body), np.setdiff1d(geoms, body)]
+        return np.mean([m.geom_solref[ids].mean(axis=0) for ids in sides if len(ids)], axis=0)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """Time constant and damping ratio; the null values are the means of body and surroundings, as they act."""
-        body = np.concatenate([geoms_of(m, b) for b in self.ids(m)])
-        rest = np.setdiff1d(self.geoms(m), body)
-        means = [m.geom_solref[ids].mean(axis=0) for ids in (body, rest) if len(ids)]
-        time, ratio = np.mean(means, axis=0)
+        """Time constant and damping ratio; the null values are the means of body and surroundings."""
+        time, ratio = self.mean(m)
         least = 2 * m.opt.timestep
         return (
             Parameter("time_constant", "s", float(max(time, least)), least, 0.2, 0.5 * float(time)),
@@ -179,8 +194,8 @@ class ContactCompliance(SurfaceEffect):
         return ("geom_solref",)
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Set it."""
-        m.geom_solref[self.geoms(m)] = values
+        """Set the mean, and all others in proportion."""
+        m.geom_solref[self.geoms(m)] *= values / self.mean(m)
 
 
 class Adhesion(SurfaceEffect):
@@ -233,6 +248,11 @@ class PadFriction(Effect):
     signature = "what is held slips or does not"
     confusions = ("grip_force", "mass")
     threshold = True
+    wants = "bodies with geoms that collide"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the finger collides."""
+        return collides(m, i)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -241,12 +261,19 @@ class PadFriction(Effect):
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Let the pads' friction count, and not the larger of the two; the same as before at the null value."""
-        rough = max((geom.friction[SLIDING] for body in loose(spec) for geom in body.geoms), default=0.0)
+        """Let the pads' friction count, and not the larger of the two; the same as before at the null value.
+
+        With priority the pads' other parameters count alone, too, so they take on what the contact had.
+        """
+        held = colliding(geom for body in loose(spec) for geom in body.geoms)
         for n in self.target:
-            for geom in tree_geoms(spec.body(n)):
-                geom.friction[SLIDING] = max(geom.friction[SLIDING], rough)
-                geom.priority += 1
+            for pad in colliding(tree_geoms(spec.body(n))):
+                pad.priority += 1
+                if held:
+                    pad.friction = np.max([pad.friction, *(geom.friction for geom in held)], axis=0)
+                    pad.condim = max(pad.condim, *(geom.condim for geom in held))
+                    pad.solref = 0.5 * (np.array(pad.solref) + np.mean([geom.solref for geom in held], axis=0))
+                    pad.solimp = 0.5 * (np.array(pad.solimp) + np.mean([geom.solimp for geom in held], axis=0))
 
     def geoms(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the fingers' geoms, shape (n,) int."""
@@ -255,7 +282,9 @@ class PadFriction(Effect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """One coefficient."""
         held = [geoms_of(m, b) for b in free_bodies(m)]
-        null = float(m.geom_friction[np.concatenate([self.geoms(m), *held]), SLIDING].max())
+        among = np.concatenate([self.geoms(m), *held])
+        among = among[(m.geom_contype[among] != 0) | (m.geom_conaffinity[among] != 0)]
+        null = float(m.geom_friction[among, SLIDING].max())
         scan = tuple(null * x for x in (0.2, 0.4, 0.7, 1.5))
         return (Parameter("coefficient", "-", null, 0.0, 5.0, 0.3 * null, scan=scan),)
 
@@ -268,11 +297,15 @@ class PadFriction(Effect):
         m.geom_friction[self.geoms(m), SLIDING] = max(float(values[0]), NEXT_TO_NOTHING)
 
 
-def standing(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
-    """Return the geoms of an MJCF that cannot move."""
-    compiled = spec.copy().compile()
-    still = {int(i) for i in standing_geoms(compiled)}
-    return [geom for i, geom in enumerate(spec.geoms) if i in still]
+def collides(m: mujoco.MjModel, body: int) -> bool:
+    """Return whether any geom of a body takes part in collisions."""
+    geoms = geoms_of(m, body)
+    return bool(((m.geom_contype[geoms] != 0) | (m.geom_conaffinity[geoms] != 0)).any())
+
+
+def colliding(geoms: Iterable[mujoco.MjsGeom]) -> list[mujoco.MjsGeom]:
+    """Return those of some geoms that take part in collisions."""
+    return [geom for geom in geoms if geom.contype or geom.conaffinity]
 
 
 def loose(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:

@@ -11,6 +11,7 @@ from concent_warp.effects.drive_laws import DeadZone
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import (
+    SINGLE,
     arm_actuators,
     dof_of,
     driven_joints,
@@ -32,6 +33,11 @@ class DriveEffect(Effect):
 
     family = "joints"
     kind = "actuator"
+    wants = "actuators of joints, or of tendons that add joints up"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the actuator drives a joint."""
+        return bool(driven_joints(m, i))
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -43,12 +49,16 @@ class DriveEffect(Effect):
 class ServoEffect(DriveEffect):
     """An effect on position-controlled actuators of single joints."""
 
+    wants = "position-controlled actuators of single hinges and slides"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the actuator is position-controlled and drives one joint."""
+        return is_servo(m, i)
+
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the position-controlled actuators of single joints."""
-        found = tuple(
-            n for n in arm_actuators(m) if servo_gain(m, (a := m.actuator(n).id)) > 0 and len(driven_joints(m, a)) == 1
-        )
+        found = tuple(n for n in arm_actuators(m) if is_servo(m, m.actuator(n).id))
         return (found,) if found else ()
 
 
@@ -318,3 +328,9 @@ class GravityCompensation(Effect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Add to the compensation."""
         m.body_gravcomp[self.ids(m)] += values[0]
+
+
+def is_servo(m: mujoco.MjModel, actuator: int) -> bool:
+    """Return whether an actuator is position-controlled and drives one hinge or slide."""
+    joints = driven_joints(m, actuator)
+    return servo_gain(m, actuator) > 0 and len(joints) == 1 and int(m.jnt_type[joints[0]]) in SINGLE

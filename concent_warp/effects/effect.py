@@ -69,6 +69,8 @@ class Effect:
     family: ClassVar[Family]
     kind: ClassVar[Kind]
     """What a target names."""
+    wants: ClassVar[str] = ""
+    """What a target must be beyond that, in words; see `suits`."""
     summary: ClassVar[str]
     """What it does, with the formula."""
     source: ClassVar[str]
@@ -95,6 +97,10 @@ class Effect:
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the selections to which the effect may apply in a model, each to be tried by itself."""
         raise NotImplementedError
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:  # noqa: ARG002
+        """Return whether the effect may act on the joint, actuator, body, geom or sensor of an id."""
+        return True
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return the parameters, P of them; bounds and null values follow from the model without the effect."""
@@ -141,7 +147,7 @@ class Effect:
         return type(self).command is not Effect.command
 
     def check(self, m: mujoco.MjModel) -> None:
-        """Check that the targets exist in a model.
+        """Check that the targets exist in a model and suit the effect.
 
         Raises:
             ModelError: One does not, or there is none.
@@ -157,6 +163,8 @@ class Effect:
             )
         if not self.target:
             raise ModelError(f"{self.name} has no target", expected=f"{self.kind}s among {known}", found="none")
+        if unfit := [n for n, i in zip(self.target, self.ids(m), strict=True) if not self.suits(m, int(i))]:
+            raise ModelError(f"{self.name} cannot act there", expected=self.wants, found=unfit)
 
     def ids(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the ids of the targets, shape (n,) int."""

@@ -34,13 +34,12 @@ class DofLaw(Law):
 class StribeckFriction(DofLaw):
     """Friction loss + extra exp(-(qd / speed)^2); parameters are the extras, shape (n,), then the speed."""
 
-    edits = ("dof_frictionloss", "dof_solref")
+    edits = ("dof_frictionloss",)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
         ratio = d.qvel[self.dof] / max(values[-1], 1e-6)
         m.dof_frictionloss[self.dof] += np.maximum(values[:-1], 0.0) * np.exp(-ratio * ratio)
-        m.dof_solref[self.dof] = (1.5 * m.opt.timestep, 1.0)
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
@@ -56,13 +55,12 @@ class LoadFriction(DofLaw):
     half their difference is the torque that the gears carry.
     """
 
-    edits = ("dof_frictionloss", "dof_solref")
+    edits = ("dof_frictionloss",)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
         load = 0.5 * np.abs(d.qfrc_actuator[self.dof] + d.qfrc_bias[self.dof])
         m.dof_frictionloss[self.dof] += np.maximum(values, 0.0) * load
-        m.dof_solref[self.dof] = (1.5 * m.opt.timestep, 1.0)
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.friction_laws import LoadFriction, StribeckFriction
-from concent_warp.effects.select import dof_of, joints_by_type, typical_torque
+from concent_warp.effects.select import SINGLE, dof_of, joints_by_type, typical_torque
 
 if TYPE_CHECKING:
     from concent_warp.effects.law import Law
@@ -24,6 +24,11 @@ class JointEffect(Effect):
 
     family = "joints"
     kind = "joint"
+    wants = "hinges and slides"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the joint has one degree of freedom."""
+        return int(m.jnt_type[i]) in SINGLE
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -43,7 +48,18 @@ class JointEffect(Effect):
         return tuple(Parameter(f"{name}[{t}]", unit, float(n), 0.0, float(h), float(s)) for t, n, h, s in rows)
 
 
-class JointFriction(JointEffect):
+class DryFriction(JointEffect):
+    """Friction that holds the joint at rest."""
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let it hold stiffly, where the joint has no friction of its own yet."""
+        for n in self.target:
+            joint = spec.joint(n)
+            if not joint.frictionloss:
+                joint.solref_friction = [STIFF * spec.option.timestep, 1.0]
+
+
+class JointFriction(DryFriction):
     """Dry friction in joints."""
 
     name = "joint_friction"
@@ -60,14 +76,12 @@ class JointFriction(JointEffect):
         return self.spread("torque", self.units(m, "N m", "N"), null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Friction loss and how stiffly it holds."""
-        return ("dof_frictionloss", "dof_solref")
+        """Friction loss."""
+        return ("dof_frictionloss",)
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the friction loss."""
-        dof = dof_of(m, self.ids(m))
-        m.dof_frictionloss[dof] = np.maximum(values, 0.0)
-        m.dof_solref[dof] = (STIFF * m.opt.timestep, 1.0)
+        m.dof_frictionloss[dof_of(m, self.ids(m))] = np.maximum(values, 0.0)
 
 
 class JointDamping(JointEffect):
@@ -145,7 +159,7 @@ class JointOffset(JointEffect):
         m.qpos_spring[address] -= values
 
 
-class Stribeck(JointEffect):
+class Stribeck(DryFriction):
     """More friction at rest than in motion."""
 
     name = "stribeck_friction"
@@ -171,7 +185,7 @@ class Stribeck(JointEffect):
         return StribeckFriction(dof_of(m, self.ids(m)))
 
 
-class LoadDependentFriction(JointEffect):
+class LoadDependentFriction(DryFriction):
     """Friction that grows with the torque which the gears carry."""
 
     name = "load_friction"

@@ -66,6 +66,11 @@ class LengthScale(MeasurementEffect):
     summary = "Positions are read as the true ones times 1 + scale, from the world's origin."
     signature = "residuals in proportion to the position; resting heights off, free fall with another g"
     confusions = ("size", "time_base", "frame_offset")
+    wants = "sensors of positions in space"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the sensor shows a position."""
+        return int(m.sensor_type[i]) in POSES[:1]
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -89,6 +94,11 @@ class FrameOffset(MeasurementEffect):
     summary = "Poses are read in a frame shifted and turned against the world's."
     signature = "residuals that are constant in place, or turn with the distance from the origin"
     confusions = ("size", "gravity_tilt", "center_of_mass", "joint_offset")
+    wants = "sensors of positions and orientations in space"
+
+    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+        """Return whether the sensor shows a position or an orientation."""
+        return int(m.sensor_type[i]) in POSES
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
