@@ -38,22 +38,25 @@ class AnisotropicForce(Law):
         if not d.ncon or not extra:
             return
         contact = d.contact
-        geom, address = contact.geom, contact.efc_address
+        geom, address, dim = contact.geom, contact.efc_address, contact.dim
         forward = self.moving[geom[:, 1]] & self.still[geom[:, 0]]
         backward = self.moving[geom[:, 0]] & self.still[geom[:, 1]]
-        wrench = np.zeros(6)
-        for i in np.flatnonzero((forward | backward) & (address >= 0)):
-            body = m.geom_bodyid[geom[i, 1] if forward[i] else geom[i, 0]]
-            mujoco.mj_contactForce(m, d, int(i), wrench)
-            arm = contact.pos[i] - d.xipos[body]
-            spin, linear = d.cvel[body, :3], d.cvel[body, 3:]
-            velocity = linear + np.cross(spin, contact.pos[i] - d.subtree_com[m.body_rootid[body]])
-            normal = contact.frame[i, :3]
-            velocity = velocity - normal * (normal @ velocity)
-            speed = np.sqrt(velocity @ velocity + SMOOTH**2)
-            force = -extra * contact.friction[i, 0] * wrench[0] * velocity[1] / speed
-            d.xfrc_applied[body, 1] += force
-            d.xfrc_applied[body, 3:] += np.cross(arm, (0.0, force, 0.0))
+        rows = np.flatnonzero((forward | backward) & (address >= 0) & (dim >= 3))
+        if not len(rows):
+            return
+        summed = np.concatenate([[0.0], np.cumsum(d.efc_force)])
+        pyramid = m.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        first = address[rows]
+        pressed = summed[first + (2 * (dim[rows] - 1) if pyramid else 1)] - summed[first]
+        body = m.geom_bodyid[np.where(forward[rows], geom[rows, 1], geom[rows, 0])]
+        position, normal = contact.pos[rows], contact.frame[rows, :3]
+        spin, linear = d.cvel[body, :3], d.cvel[body, 3:]
+        velocity = linear + np.cross(spin, position - d.subtree_com[m.body_rootid[body]])
+        velocity -= normal * (normal * velocity).sum(axis=1, keepdims=True)
+        speed = np.sqrt((velocity * velocity).sum(axis=1) + SMOOTH**2)
+        force = np.zeros_like(velocity)
+        force[:, 1] = -extra * contact.friction[rows, 0] * pressed * velocity[:, 1] / speed
+        np.add.at(d.xfrc_applied, body, np.hstack([force, np.cross(position - d.xipos[body], force)]))
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""

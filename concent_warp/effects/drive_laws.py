@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class DeadZone(Law):
-    """Takes back the part of a servo's torque that an error within the play makes.
+    """Takes back the part of a servo's force that an error within the play makes: a dead zone of the error is left.
 
-    tau = -gear kp clip(error, -gear play / 2, gear play / 2), so that kp times the dead zone of the error is left. The
-    parameter is the width of the play at the joint, shape (1,).
+    With e the error, l the length, kp the gain and g the gear, the force f(e) = clip(kp e + b - kv l') becomes
+    f(e - clip(e, -|g| play / 2, |g| play / 2)). The parameter is the width of the play at the joint, shape (1,).
     """
 
     def __init__(self, actuators: np.ndarray) -> None:
@@ -32,11 +32,16 @@ class DeadZone(Law):
         half = 0.5 * max(float(values[0]), 0.0)
         for a in self.actuators:
             joint = driven_joints(m, int(a))[0]
-            gear = m.actuator_gear[a, 0]
-            error = d.ctrl[a] - gear * d.qpos[m.jnt_qposadr[joint]]
-            d.qfrc_applied[m.jnt_dofadr[joint]] -= (
-                gear * m.actuator_gainprm[a, 0] * np.clip(error, -gear * half, gear * half)
-            )
+            dof = m.jnt_dofadr[joint]
+            gear, kp, bias = m.actuator_gear[a, 0], m.actuator_gainprm[a, 0], m.actuator_biasprm[a]
+            command = np.clip(d.ctrl[a], *m.actuator_ctrlrange[a]) if m.actuator_ctrllimited[a] else d.ctrl[a]
+            length = gear * d.qpos[m.jnt_qposadr[joint]]
+            change = -kp * np.clip(command - length, -abs(gear) * half, abs(gear) * half)
+            if m.actuator_forcelimited[a]:
+                force = kp * command + bias[0] + bias[1] * length + bias[2] * gear * d.qvel[dof]
+                limits = m.actuator_forcerange[a]
+                change = np.clip(force + change, *limits) - np.clip(force, *limits)
+            d.qfrc_applied[dof] += gear * change
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""

@@ -49,16 +49,18 @@ class DriveEffect(Effect):
 class ServoEffect(DriveEffect):
     """An effect on position-controlled actuators of single joints."""
 
-    wants = "position-controlled actuators of single hinges and slides"
+    wants = "position-controlled actuators of single hinges and slides, without a filter"
 
     def suits(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether the actuator is position-controlled and drives one joint."""
-        return is_servo(m, i)
+        """Return whether the actuator is position-controlled by its command and drives one joint."""
+        joints = driven_joints(m, i)
+        single = len(joints) == 1 and int(m.jnt_type[joints[0]]) in SINGLE
+        return single and servo_gain(m, i) > 0 and m.actuator_dyntype[i] == int(mujoco.mjtDyn.mjDYN_NONE)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the position-controlled actuators of single joints."""
-        found = tuple(n for n in arm_actuators(m) if is_servo(m, m.actuator(n).id))
+        found = tuple(n for n in arm_actuators(m) if cls().suits(m, m.actuator(n).id))
         return (found,) if found else ()
 
 
@@ -328,9 +330,3 @@ class GravityCompensation(Effect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Add to the compensation."""
         m.body_gravcomp[self.ids(m)] += values[0]
-
-
-def is_servo(m: mujoco.MjModel, actuator: int) -> bool:
-    """Return whether an actuator is position-controlled and drives one hinge or slide."""
-    joints = driven_joints(m, actuator)
-    return servo_gain(m, actuator) > 0 and len(joints) == 1 and int(m.jnt_type[joints[0]]) in SINGLE

@@ -112,3 +112,12 @@ def test_grip_force_scales_the_limits_too():
     xml = GRIPPER.replace('joint="left"/>', 'joint="left" forcerange="-2 2"/>')
     m = world(xml, GripForce("left", "right"), 3.0).compile()
     np.testing.assert_allclose(m.actuator_forcerange[m.actuator("left").id], [-6, 6])
+
+
+def test_backlash_leaves_the_limits_of_a_drive_as_they_are():
+    """Error 0.1 beyond the play at kp 400 would be 38 N; the limit of 5 N holds with and without play."""
+    xml = SERVO.replace('kp="400.0"', 'kp="400.0" forcerange="-5 5" ctrlrange="-0.2 0.2"')
+    cart = move(world(xml, Backlash("drive"), 0.01), 0.1, ctrl=7.0)
+    assert cart.qvel[-1, 0] == pytest.approx(0.1 * 5.0 / MASS, rel=1e-6)
+    rest = move(world(xml, Backlash("drive"), 0.01), 4.0, ctrl=7.0, qpos=[0.15])
+    assert rest.qpos[-1, 0] == pytest.approx(0.2, abs=0.00501)

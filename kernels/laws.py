@@ -1,0 +1,305 @@
+"""Forces that MuJoCo has no field for, in all worlds of MuJoCo-Warp: `concent_warp.effects` has the formulas.
+
+Each function launches one kernel. It adds to what the caller has cleared (applied forces) or restored (friction loss).
+Positions and velocities are of the coming step; what MuJoCo derives from them is of the step before.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
+
+
+def stribeck(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
+    """Add friction loss that fades with speed: extra exp(-(qd / speed)^2).
+
+    Args:
+        m: Model whose `dof_frictionloss` has one row a world.
+        d: Data.
+        dof: Degrees of freedom, shape (n,) int.
+        values: An extra for each of them, then the speed, shape (N, n + 1).
+    """
+    wp.launch(stribeck_kernel, dim=(d.nworld, dof.size), inputs=[dof, values, d.qvel], outputs=[m.dof_frictionloss])
+
+
+def load(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
+    """Add friction loss in proportion to the load: c |tau_m - tau_e| / 2.
+
+    Args:
+        m: Model whose `dof_frictionloss` has one row a world.
+        d: Data; `qfrc_actuator` is tau_m, `qfrc_bias` is -tau_e.
+        dof: Degrees of freedom, shape (n,) int.
+        values: A coefficient for each of them, shape (N, n).
+    """
+    wp.launch(
+        load_kernel,
+        dim=(d.nworld, dof.size),
+        inputs=[dof, values, d.qfrc_actuator, d.qfrc_bias],
+        outputs=[m.dof_frictionloss],
+    )
+
+
+def dead_zone(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], values: wp.array[Any]) -> None:
+    """Take back the part of a servo's force that an error within the play makes, as far as its limits let it through.
+
+    Args:
+        m: Model.
+        d: Data; `qfrc_applied` is added to.
+        actuators: Position-controlled actuators of single hinges and slides, shape (n,) int.
+        values: Width of the play at the joint, shape (N, 1).
+    """
+    wp.launch(
+        dead_zone_kernel,
+        dim=(d.nworld, actuators.size),
+        inputs=[
+            actuators,
+            values,
+            m.actuator_trnid,
+            m.actuator_gear,
+            m.actuator_gainprm,
+            m.actuator_biasprm,
+            m.actuator_ctrllimited,
+            m.actuator_ctrlrange,
+            m.actuator_forcelimited,
+            m.actuator_forcerange,
+            m.jnt_qposadr,
+            m.jnt_dofadr,
+            d.ctrl,
+            d.qpos,
+            d.qvel,
+        ],
+        outputs=[d.qfrc_applied],
+    )
+
+
+def anisotropic(
+    m: mjw.Model, d: mjw.Data, moving: wp.array[Any], still: wp.array[Any], values: wp.array[Any], smooth: float
+) -> None:
+    """Add -(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y where a body slides on what stands still.
+
+    Args:
+        m: Model.
+        d: Data; `xfrc_applied` is added to.
+        moving: Which geoms are the body's, shape (ngeom,) bool.
+        still: Which geoms stand still, shape (ngeom,) bool.
+        values: The ratio, shape (N, 1).
+        smooth: v0 [m/s].
+    """
+    contact = d.contact
+    wp.launch(
+        anisotropic_kernel,
+        dim=d.naconmax,
+        inputs=[
+            int(m.opt.cone),
+            moving,
+            still,
+            values,
+            smooth,
+            m.geom_bodyid,
+            m.body_rootid,
+            d.nacon,
+            contact.worldid,
+            contact.geom,
+            contact.dim,
+            contact.efc_address,
+            contact.pos,
+            contact.frame,
+            contact.friction,
+            d.efc.force,
+            d.xipos,
+            d.subtree_com,
+            d.cvel,
+        ],
+        outputs=[d.xfrc_applied],
+    )
+
+
+@wp.kernel
+def stribeck_kernel(
+    dof: wp.array[int],
+    values: wp.array2d[float],
+    qvel: wp.array2d[float],
+    frictionloss: wp.array2d[float],
+):
+    """See `stribeck`; dim (N, n).
+
+    Args:
+        dof: Shape (n,).
+        values: Shape (N, n + 1).
+        qvel: Shape (N, nv).
+        frictionloss: Shape (N, nv), added to.
+    """
+    world, i = wp.tid()
+    row = dof[i]
+    ratio = qvel[world, row] / wp.max(values[world, dof.shape[0]], 1.0e-6)
+    frictionloss[world, row] += wp.max(values[world, i], 0.0) * wp.exp(-ratio * ratio)
+
+
+@wp.kernel
+def load_kernel(
+    dof: wp.array[int],
+    values: wp.array2d[float],
+    actuator: wp.array2d[float],
+    bias: wp.array2d[float],
+    frictionloss: wp.array2d[float],
+):
+    """See `load`; dim (N, n).
+
+    Args:
+        dof: Shape (n,).
+        values: Shape (N, n).
+        actuator: Shape (N, nv).
+        bias: Shape (N, nv).
+        frictionloss: Shape (N, nv), added to.
+    """
+    world, i = wp.tid()
+    row = dof[i]
+    carried = 0.5 * wp.abs(actuator[world, row] + bias[world, row])
+    frictionloss[world, row] += wp.max(values[world, i], 0.0) * carried
+
+
+@wp.kernel
+def dead_zone_kernel(
+    actuators: wp.array[int],
+    values: wp.array2d[float],
+    joint_of: wp.array[wp.vec2i],
+    gear: wp.array2d[wp.spatial_vector],
+    gain: wp.array2d[Any],
+    bias: wp.array2d[Any],
+    command_limited: wp.array[bool],
+    command_range: wp.array2d[wp.vec2],
+    force_limited: wp.array[bool],
+    force_range: wp.array2d[wp.vec2],
+    qpos_address: wp.array[int],
+    dof_address: wp.array[int],
+    ctrl: wp.array2d[float],
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    applied: wp.array2d[float],
+):
+    """See `dead_zone`; dim (N, n).
+
+    Args:
+        actuators: Shape (n,).
+        values: Shape (N, 1).
+        joint_of: What each actuator drives, shape (nu,).
+        gear: Shape (1 or N, nu).
+        gain: Gain parameters, the position gain first, shape (1 or N, nu).
+        bias: Bias parameters: constant, by length, by velocity, shape (1 or N, nu).
+        command_limited: Shape (nu,).
+        command_range: Shape (1 or N, nu).
+        force_limited: Shape (nu,).
+        force_range: Shape (1 or N, nu).
+        qpos_address: Shape (njnt,).
+        dof_address: Shape (njnt,).
+        ctrl: Shape (N, nu).
+        qpos: Shape (N, nq).
+        qvel: Shape (N, nv).
+        applied: Shape (N, nv), added to.
+    """
+    world, i = wp.tid()
+    a = actuators[i]
+    joint = joint_of[a][0]
+    dof = dof_address[joint]
+    ratio = gear[world % gear.shape[0], a][0]
+    kp = gain[world % gain.shape[0], a][0]
+    b = bias[world % bias.shape[0], a]
+    command = ctrl[world, a]
+    if command_limited[a]:
+        limits = command_range[world % command_range.shape[0], a]
+        command = wp.clamp(command, limits[0], limits[1])
+    length = ratio * qpos[world, qpos_address[joint]]
+    half = 0.5 * wp.abs(ratio) * wp.max(values[world, 0], 0.0)
+    change = -kp * wp.clamp(command - length, -half, half)
+    if force_limited[a]:
+        limits = force_range[world % force_range.shape[0], a]
+        force = kp * command + b[0] + b[1] * length + b[2] * ratio * qvel[world, dof]
+        change = wp.clamp(force + change, limits[0], limits[1]) - wp.clamp(force, limits[0], limits[1])
+    wp.atomic_add(applied, world, dof, ratio * change)
+
+
+@wp.kernel
+def anisotropic_kernel(
+    cone: int,
+    moving: wp.array[bool],
+    still: wp.array[bool],
+    values: wp.array2d[float],
+    smooth: float,
+    body_of: wp.array[int],
+    root_of: wp.array[int],
+    contacts: wp.array[int],
+    world_of: wp.array[int],
+    geom: wp.array[wp.vec2i],
+    condim: wp.array[int],
+    address: wp.array2d[int],
+    position: wp.array[wp.vec3],
+    frame: wp.array[wp.mat33],
+    friction: wp.array[Any],
+    efc_force: wp.array2d[float],
+    xipos: wp.array2d[wp.vec3],
+    subtree_com: wp.array2d[wp.vec3],
+    cvel: wp.array2d[wp.spatial_vector],
+    applied: wp.array2d[wp.spatial_vector],
+):
+    """See `anisotropic`; dim the contact capacity.
+
+    Args:
+        cone: Kind of friction cone.
+        moving: Shape (ngeom,).
+        still: Shape (ngeom,).
+        values: Shape (N, 1).
+        smooth: [m/s].
+        body_of: Body of each geom, shape (ngeom,).
+        root_of: Root of each body's tree, shape (nbody,).
+        contacts: Contacts found in all worlds, shape (1,).
+        world_of: World of each contact, shape (capacity,).
+        geom: Its two geoms, shape (capacity,).
+        condim: Its dimensions, shape (capacity,).
+        address: Its constraint rows, -1 where it is not active, shape (capacity, rows).
+        position: Its point [m], shape (capacity,).
+        frame: Its frame, normal first, shape (capacity,).
+        friction: Its coefficients, sliding first, shape (capacity,).
+        efc_force: Forces of the constraint rows, shape (N, rows).
+        xipos: Centres of mass [m], shape (N, nbody).
+        subtree_com: Centres of mass of trees [m], shape (N, nbody).
+        cvel: Angular and linear velocities of bodies about those of their trees, shape (N, nbody).
+        applied: Forces and torques on bodies, shape (N, nbody), added to.
+    """
+    i = wp.tid()
+    if i >= contacts[0]:
+        return
+    first = address[i, 0]
+    pair = geom[i]
+    if first < 0 or condim[i] < 3 or pair[0] < 0 or pair[1] < 0:
+        return
+    mine = pair[1]
+    if not (moving[pair[1]] and still[pair[0]]):
+        mine = pair[0]
+        if not (moving[pair[0]] and still[pair[1]]):
+            return
+
+    world = world_of[i]
+    pressed = efc_force[world, first]
+    rows = wp.where(cone == PYRAMIDAL, 2 * (condim[i] - 1), 1)
+    for k in range(1, rows):
+        if first + k < efc_force.shape[1]:
+            pressed += efc_force[world, first + k]
+
+    body = body_of[mine]
+    moved = cvel[world, body]
+    velocity = wp.spatial_bottom(moved) + wp.cross(
+        wp.spatial_top(moved), position[i] - subtree_com[world, root_of[body]]
+    )
+    normal = wp.vec3(frame[i][0, 0], frame[i][0, 1], frame[i][0, 2])
+    velocity -= normal * wp.dot(normal, velocity)
+    speed = wp.sqrt(wp.dot(velocity, velocity) + smooth * smooth)
+    force = wp.vec3(0.0, (1.0 - values[world, 0]) * friction[i][0] * pressed * velocity[1] / speed, 0.0)
+    torque = wp.cross(position[i] - xipos[world, body], force)
+    wp.atomic_add(applied, world, body, wp.spatial_vector(force, torque))
