@@ -89,8 +89,9 @@ def rolling_friction(rig: Rig, magnitude: float) -> Hidden:
 
 
 def contact_compliance(rig: Rig, magnitude: float) -> Hidden:
-    """Another damping ratio [-] of the contact, and a time constant 1.2 times that of the drawing."""
-    time_constant = 1.2 * float(rig.scene.model.geom(rig.surface).solref[0])
+    """Another damping ratio [-] of the contact, and a time constant that goes with its root."""
+    drawn = rig.scene.model.geom(rig.surface).solref
+    time_constant = float(drawn[0] * np.sqrt(magnitude / drawn[1]))
 
     def edit(spec: mujoco.MjSpec) -> None:
         for geom in (spec.geom(rig.surface), *spec.body(rig.body).geoms):

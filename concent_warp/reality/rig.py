@@ -68,7 +68,8 @@ def of_coarser_step(scene: Scene, **rest: Any) -> WorldPhysics:
     m = scene.model
     timestep = m.opt.timestep / 3
     short = (m.opt.timestep - timestep) / 2
-    damping = {m.joint(m.actuator_trnid[a, 0]).name: -m.actuator_biasprm[a, 2] for a in range(m.nu)}
+    driven = [a for a in range(m.nu) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT]
+    damping = {m.joint(m.actuator_trnid[a, 0]).name: -m.actuator_biasprm[a, 2] for a in driven}
     return WorldPhysics(
         timestep=timestep, lead=short, armature={j: kv * short for j, kv in damping.items() if kv > 0}, **rest
     )
@@ -99,12 +100,15 @@ class Rig:
     """Actuators that hold something."""
     pads: tuple[str, ...] = ()
     """Geoms that they hold it with."""
+    recorder: Callable[[Sequence[HiddenEffect], int, int], Recording] | None = None
+    """Records effects, so many demonstrations, from a seed, where the experiment is not one of trials."""
 
     @property
     def slides(self) -> bool:
         """Whether it is slides that are driven, not hinges."""
         m = self.scene.model
-        kinds = {int(m.jnt_type[m.actuator_trnid[a, 0]]) for a in range(m.nu)}
+        joints = [m.actuator_trnid[a, 0] for a in range(m.nu) if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT]
+        kinds = {int(m.jnt_type[j]) for j in joints}
         return kinds == {int(mujoco.mjtJoint.mjJNT_SLIDE)}
 
     @property
@@ -151,6 +155,8 @@ def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: i
         seed: All chance: starts, commands, clocks, noise. Motion k is the same whatever follows it, and the same with
             and without hidden effects, but for what these do.
     """
+    if rig.recorder is not None:
+        return rig.recorder(effects, demonstrations, seed)
     model = rig.world(effects).compile()
     taken = []
     for k in range(demonstrations * rig.throws):

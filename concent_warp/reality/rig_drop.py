@@ -1,4 +1,4 @@
-"""A light ball is thrown from several heights: it flies and bounces on a soft mat."""
+"""A ball is thrown from several heights: it flies and bounces on a soft mat."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ XML = f"""
     <geom name="mat" type="plane" size="4 4 0.1" friction="0.5 0.005 0.0001" solref="0.04 0.4" priority="1"/>
     <body name="ball" pos="0 0 0.5">
       <freejoint name="ball_joint"/>
-      <geom name="ball" type="sphere" size="{RADIUS}" mass="0.05" friction="0.5 0.005 0.0001" solref="0.04 0.4"/>
+      <geom name="ball" type="sphere" size="{RADIUS}" mass="0.4" friction="0.5 0.005 0.0001" solref="0.04 0.4"/>
     </body>
   </worldbody>
   <sensor>
