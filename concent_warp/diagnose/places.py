@@ -85,7 +85,7 @@ class Place:
         """Return the place in words, such as "block position, insert phase, 3.1-3.6 s, 8 x noise (3.4 mm), ..."."""
         name = words(self.channels[0])
         if len(self.channels) > 1:
-            also = (words(c.removeprefix(f"{self.body}_")) for c in self.channels[1:])
+            also = (words(c).removeprefix(f"{words(self.body or '')} ") for c in self.channels[1:])
             name += f" (and {', '.join(also)})"
         parts = [f"{self.demonstration}: {name}" if demonstration else name]
         parts += [f"{self.phase} phase"] if self.phase else []

@@ -296,9 +296,11 @@ def body_of(compiled: mujoco.MjModel, row: int) -> str | None:
         mujoco.mjtObj.mjOBJ_GEOM: compiled.geom_bodyid,
         mujoco.mjtObj.mjOBJ_CAMERA: compiled.cam_bodyid,
     }
-    if kind in BODIES:
-        return compiled.body(target).name
-    return compiled.body(owner[mujoco.mjtObj(kind)][target]).name if kind in owner else None
+    if kind not in BODIES:
+        if kind not in owner:
+            return None
+        target = int(owner[mujoco.mjtObj(kind)][target])
+    return compiled.body(target).name or f"body{target}"
 
 
 def mean_norm(dim: int) -> float:

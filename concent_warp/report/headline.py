@@ -8,12 +8,14 @@ from html import escape
 
 import numpy as np
 
-from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.units import percent, shown, unit_shown, words
+from concent_warp.diagnose.comparison import Comparison, Summary
+from concent_warp.diagnose.units import percent, shown, times, unit_shown, words
 from concent_warp.events.sequence import ContactEventSequence
 
 NULL = "no contact"
 """Name of the model whose objects do not touch one another, where a comparison has one."""
+AT_NOISE = 1.2
+"""A mean error below this many times the noise floor is as good as the floor."""
 ENOUGH_OVERLAP = 0.8
 """Overlap of contact frames with the truth from which the contact counts as reproduced."""
 
@@ -57,7 +59,7 @@ def cards(
         if ends:
             figure = arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
             found.append(Card("Overlap (IoU) of object contact with the truth; 1 is perfect", figure))
-    if any(sequence.stages for sequence in events.values()):
+    if comparison.staged and any(sequence.stages for sequence in events.values()):
         counts = sorted({len(sequence.stages) for sequence in events.values()})
         names = " · ".join(dict.fromkeys(stage.name for s in events.values() for stage in s.stages))
         figure = " or ".join(map(str, counts)) + " <small>stages</small>"
@@ -74,6 +76,15 @@ def cards(
     elif noise:
         found.append(Card("Error that the measurement noise alone would leave", noise))
     return found
+
+
+def above_noise(summary: Summary) -> str:
+    """Return how far a mean error stands above the noise, as the end of a sentence; empty where it cannot be told."""
+    if summary.ratio is None or not np.isfinite(summary.ratio):
+        return ""
+    if summary.ratio < AT_NOISE:
+        return ", as much as the measurement noise alone would leave"
+    return f", {times(summary.ratio)} what the measurement noise alone would leave"
 
 
 def error_card(
@@ -112,7 +123,8 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
     if not np.isfinite(after.mean):
         return f"The simulation of “{comparison.after}” does not stay finite: see the table for when it diverges."
     if len(comparison.models) < 2:
-        return f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}."
+        text = f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}"
+        return f"{text}{above_noise(after)}."
     before = comparison.summarise(comparison.before, channel, phases)
     found = comparison.difference(channel, phases)
     change = {
@@ -122,7 +134,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
     }[found.verdict]
     text = (
         f"The error of {words(channel)}{during} {change}: {shown(before.mean, before.unit)} {unit} "
-        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}."
+        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{above_noise(after)}."
     )
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)

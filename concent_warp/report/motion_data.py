@@ -34,16 +34,17 @@ def motion_data(
     duration = demonstration.duration
     count = int(np.clip(np.ceil(duration * RATE) + 1, 2, MOST_FRAMES))
     time = np.linspace(0, duration, count)
-    poses = {}
+    poses, qpos = {}, np.zeros(0)
     for name, model in models.items():
         engine = engines[name]
         steps = np.unique(np.round(time / engine.timestep).astype(int))
         rollout = replay(model, demonstration, engine, record=steps, bodies=bodies).numpy()
         rows = np.searchsorted(rollout.time, time - engine.timestep / 2).clip(0, len(rollout.time) - 1)
         pose = np.concatenate([rollout.body_position[0], rollout.body_quaternion[0]], axis=2)
-        poses[name] = packed(pose[rows])
-    compiled = next(iter(models.values())).scene.model
+        poses[name], qpos = packed(pose[rows]), rollout.qpos[0][rows]
+    compiled = list(models.values())[-1].scene.model
     measured = measured_poses(compiled, demonstration, time)
+    measured = {**measured_links(compiled, demonstration, time, qpos, measured), **measured}
     points = {
         body: point_data(track)
         for body, track in demonstration.points.items()
@@ -76,8 +77,53 @@ def measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time:
     return poses
 
 
+def measured_links(
+    compiled: mujoco.MjModel,
+    demonstration: Demonstration,
+    time: np.ndarray,
+    qpos: np.ndarray,
+    free: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Return the poses (T, 7) at `time` (T,) of the bodies that measured joints move, by forward kinematics.
+
+    Args:
+        compiled: The scene.
+        demonstration: What was measured.
+        time: Times [s].
+        qpos: Simulated positions at these times, shape (T, nq), which stand in for joints that were not measured.
+        free: Poses of free bodies that were measured, shape (T, 7) each.
+    """
+    state = np.array(qpos)
+    known = np.zeros(compiled.nbody, dtype=bool)
+    for name, channel in demonstration.measured.items():
+        row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if row >= 0 and compiled.sensor_type[row] == mujoco.mjtSensor.mjSENS_JOINTPOS:
+            joint = int(compiled.sensor_objid[row])
+            state[:, compiled.jnt_qposadr[joint]] = resampled(channel, time)[:, 0]
+            known[compiled.jnt_bodyid[joint]] = True
+    for body, pose in free.items():
+        joint = int(compiled.body_jntadr[compiled.body(body).id])
+        if joint >= 0 and compiled.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            address = int(compiled.jnt_qposadr[joint])
+            state[:, address : address + 7] = pose
+    for b in range(1, compiled.nbody):
+        known[b] |= known[compiled.body_parentid[b]]
+    if not known.any():
+        return {}
+    data = mujoco.MjData(compiled)
+    poses = np.full((len(time), compiled.nbody, 7), np.nan)
+    for k in np.flatnonzero(np.isfinite(state).all(axis=1)):
+        data.qpos[:] = state[k]
+        mujoco.mj_kinematics(compiled, data)
+        poses[k] = np.concatenate([data.xpos, data.xquat], axis=1)
+    return {compiled.body(b).name or f"body{b}": poses[:, b] for b in np.flatnonzero(known)}
+
+
 def resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.ndarray:
-    """Return a channel at other times, shape (T, dim); gaps are bridged. `align` flips quaternions to one side."""
+    """Return a channel at other times, shape (T, dim); NaN before its first and after its last reading.
+
+    Gaps are bridged. `align` flips quaternions to one side.
+    """
     valid = np.isfinite(channel.value).all(axis=1)
     value = channel.value[valid]
     if not len(value):
@@ -85,7 +131,11 @@ def resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.
     if align:
         flips = np.where((value[1:] * value[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         value = value * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-    return interpolate(channel.time[valid], value, time)
+    found = interpolate(channel.time[valid], value, time)
+    first, last = channel.time[valid][[0, -1]]
+    period = (last - first) / max(len(value) - 1, 1) + float(np.ptp(time)) / max(len(time) - 1, 1)
+    found[(time < first - period) | (time > last + period)] = np.nan
+    return found
 
 
 def point_data(track: PointTrack) -> dict[str, Any]:

@@ -9,11 +9,13 @@ import mujoco
 import numpy as np
 
 from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.units import SHOWN, unit_shown
+from concent_warp.diagnose.places import Place
+from concent_warp.diagnose.units import SHOWN, unit_shown, words
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.motion_data import motion_data
 from concent_warp.report.scene_data import geometry_data, packed, scene_bodies
+from concent_warp.report.where import numbered
 from concent_warp.simulate.replay import initial_state
 from concent_warp.simulate.select import make_engine
 
@@ -44,6 +46,7 @@ def page_data(
         {
             "name": d.name,
             "duration": d.duration,
+            "measured_until": max((float(c.time[-1]) for c in [*d.measured.values(), *d.points.values()]), default=0.0),
             "phases": phase_bands(comparison, d),
             "channels": channel_lines(comparison, d.name),
             "schedule": schedule_data(events[d.name]) if d.name in events else None,
@@ -60,6 +63,28 @@ def page_data(
         "demonstrations": found,
         "history": [] if fit is None else fit.history,
         "view": camera_views(last, demonstrations[0]),
+        "places": [place_data(comparison, number, place) for number, place in numbered(comparison)],
+    }
+
+
+def place_data(comparison: Comparison, number: int, place: Place) -> dict[str, Any]:
+    """Return what the page shows of a place: where it is in time and on which body, and which way it points."""
+    found = [comparison.residual(comparison.after, place.demonstration, channel) for channel in place.channels]
+    shift = next((r for r in found if r is not None and r.kind in ("position", "points")), None)
+    arrow = None
+    if shift is not None:
+        within = (shift.time >= place.start) & (shift.time <= place.end) & np.isfinite(shift.value).all(axis=1)
+        arrow = shift.value[within].mean(axis=0).tolist() if within.any() else None
+    return {
+        "number": number,
+        "demonstration": place.demonstration,
+        "channels": list(place.channels),
+        "body": place.body,
+        "start": place.start,
+        "end": place.end,
+        "peak": place.peak,
+        "point": place.point,
+        "arrow": arrow,
     }
 
 
@@ -91,6 +116,7 @@ def channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str, 
                 "unit": unit_shown(first.unit),
                 "factor": SHOWN.get(first.unit, (1.0, first.unit))[0],
                 "noise": first.noise,
+                "words": words(channel),
                 "time": packed(np.array([first.time[rows[0]] for rows in pieces])),
                 "errors": {model: packed(np.array([e[rows].max() for rows in pieces])) for model, e in errors.items()},
             }
@@ -142,9 +168,11 @@ def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
     data = mujoco.MjData(compiled)
     data.qpos[:] = initial_state(compiled, demonstration)[0]
     mujoco.mj_kinematics(compiled, data)
-    objects = model.scene.objects() or tuple(compiled.body(i).name for i in range(1, compiled.nbody))
-    size = {name: extent(compiled, compiled.body(name).id) for name in objects}
-    places = np.array([data.body(name).xpos for name in objects])
+    objects = {name: compiled.body(name).id for name in model.scene.objects() if name}
+    moving = [i for i in range(1, compiled.nbody) if compiled.body_weldid[i] != 0] or list(range(1, compiled.nbody))
+    objects = objects or {compiled.body(i).name or f"body{i}": i for i in moving}
+    size = {name: extent(compiled, i) for name, i in objects.items()}
+    places = np.array([data.xpos[i] for i in objects.values()])
     spread = float(np.linalg.norm(np.ptp(places, axis=0))) + max(size.values())
     return {
         "scene": {"target": places.mean(axis=0).tolist(), "distance": 3.5 * spread},

@@ -15,9 +15,11 @@ from concent_warp.diagnose.bootstrap import RULE
 from concent_warp.diagnose.comparison import Comparison, finite
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import write_text
+from concent_warp.report.diagnosis import diagnosis_section
 from concent_warp.report.headline import cards, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
+from concent_warp.report.where import noise_words, place_list
 
 if TYPE_CHECKING:
     from concent_warp.fit.geometry import FitResult
@@ -39,6 +41,7 @@ def write_report(
     fitted: Sequence[str] = (),
     overlap: Mapping[str, Mapping[str, float]] | None = None,
     settings: Mapping[str, Any] | None = None,
+    diagnosis: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report, in one piece or not at all.
 
@@ -52,6 +55,7 @@ def write_report(
         fitted: Demonstrations that the fit has seen; empty where there was none.
         overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
         settings: ``command``, ``versions`` and ``settings`` to show.
+        diagnosis: JSON object of a diagnosis (`concent_warp.report.diagnosis`).
     """
     events, overlap = events or {}, overlap or {}
     shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
@@ -68,9 +72,13 @@ def write_report(
             f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
         )
         + '<span class="key noise"></span>noise floor',
+        "diagnosis": diagnosis_section(diagnosis),
+        "where": where_section(comparison, [d.name for d in shown_demonstrations]),
+        "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (
-            "How far the simulation is from the measurement at each instant of the replay. The bands are the contact "
-            "stages, found in the replay of the last model. Click to move the replay below to that instant."
+            "How far the simulation is from the measurement at each instant of the replay. The bands are "
+            f"{bands(comparison)}, found in the replay of the last model; numbers mark the worst places. "
+            "Click to move the replay to that instant."
         ),
         "schedule": page_file("schedule.html") if events else "",
         "replay_about": (
@@ -91,7 +99,7 @@ def write_report(
         "footer": escape(f"Written by concent {concent_warp.__version__}. {left_out(comparison)}"),
         "data": script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
         "style": page_file("style.css"),
-        "script": "\n".join(page_file(name) for name in ("scene3d.js", "charts.js", "page.js")),
+        "script": "\n".join(page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
     }
     write_text(path, filled(page_file("page.html"), parts))
 
@@ -101,6 +109,23 @@ def follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
     main = comparison.main_channel()
     about = {r.body for d in comparison.demonstrations if (r := comparison.residual(comparison.before, d, main))}
     return sorted(data["view"]["bodies"], key=lambda name: name not in about)
+
+
+def where_section(comparison: Comparison, shown: Sequence[str]) -> str:
+    """Return the section that says where the last model fails."""
+    strips = ""
+    if len(comparison.models) > 1:
+        strips = f" The upper strip is “{comparison.before}”, the lower one “{comparison.after}”."
+    about = (
+        f"Every channel over time, coloured by how far its error stands above the measurement noise.{strips} Bands are "
+        f"{bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
+    )
+    return filled(page_file("where.html"), {"about": escape(about), "places": place_list(comparison, shown)})
+
+
+def bands(comparison: Comparison) -> str:
+    """Return what the phases of a comparison are."""
+    return "the contact stages" if comparison.staged else "the ways of moving"
 
 
 def geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:
@@ -188,4 +213,5 @@ def script_safe(text: str) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
+PLACE_SWITCH = '<label><input type="checkbox" id="mark" checked> worst places</label>'
 SPHERE_SWITCH = '<label><input type="checkbox" id="spheres"> objects as spheres</label>'

@@ -185,8 +185,8 @@ def check_record(record: Sequence[int] | np.ndarray | None, steps: int) -> np.nd
 
 
 def check_bodies(compiled: mujoco.MjModel, bodies: Sequence[str] | None) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return names and ids, shape (B,), of the bodies to record; all by default."""
-    known = tuple(compiled.body(i).name for i in range(compiled.nbody))
+    """Return names and ids, shape (B,), of the bodies to record; all by default. ``body<id>`` names a nameless one."""
+    known = tuple(compiled.body(i).name or f"body{i}" for i in range(compiled.nbody))
     if bodies is None:
         return known, np.arange(compiled.nbody)
     if unknown := [name for name in bodies if name not in known]:

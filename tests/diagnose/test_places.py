@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnose.compare import compare
+from concent_warp.diagnose.noise import Kind
 from concent_warp.diagnose.phases import Phase
 from concent_warp.diagnose.places import LEAST, channel_places, smoothed, worst_places
 from concent_warp.diagnose.residuals import Residual
@@ -17,7 +18,7 @@ TIME = np.arange(0, 4, 0.01)
 RNG = np.random.default_rng(0)
 
 
-def residual(shift, channel="block_position", kind="position", unit="m", body="block", std=1e-4):
+def residual(shift, channel="block_position", kind: Kind = "position", unit="m", body="block", std=1e-4):
     """A residual of white noise and of `shift` (T, 3)."""
     value = np.random.default_rng(len(channel)).normal(0, std, (len(TIME), 3)) + shift
     return Residual(
@@ -44,7 +45,7 @@ def test_two_bumps_are_two_places_the_worse_first():
     assert (found[0].start, found[0].end) == pytest.approx((3.2 - 0.15 * 1.18, 3.2 + 0.15 * 1.18), abs=0.03)
     assert [p.direction for p in found] == ["along -z", "along +x"]
     assert found[0].ratio == pytest.approx(found[0].error / (1e-4 * 1.5958))
-    assert 15 < found[0].ratio < 25
+    assert found[0].ratio == pytest.approx(20, rel=0.2)
     assert found[0].onset == pytest.approx(3.2 - 0.15 * np.sqrt(2 * np.log(4e-3 / (LEAST * 1.6e-4))), abs=0.04)
 
 

@@ -37,6 +37,23 @@ XML = """
 """
 
 
+DIAGNOSIS = {
+    "verdict": "group",
+    "effects": [
+        {
+            "name": name,
+            "family": "contact",
+            "gain": {"value": gain, "interval": [gain - 0.1, gain + 0.1]},
+            "p": p,
+            "parameters": [{"name": "coefficient[block]", "value": 0.31, "interval": [0.28, 0.35], "unit": "-"}],
+        }
+        for name, gain, p in (("sliding_friction", 0.5, 0.001), ("grip_force", 0.48, 0.001), ("air_drag", -0.02, 1.0))
+    ],
+    "groups": [["sliding_friction", "grip_force"]],
+    "next_experiment": {"sentence": "Push the block without grasping it."},
+}
+
+
 def push(name, far):
     """The pusher drives the block against the stop; measured with exact boxes."""
     m = mujoco.MjModel.from_xml_string(XML)
@@ -101,6 +118,7 @@ class Case:
             fit=self.fit,
             fitted=("demo_0",),
             overlap={"before": {"demo_0": 0.41}, "after": {"demo_0": 0.93}},
+            diagnosis=DIAGNOSIS,
             settings={"command": "concent fit <demo.h5>", "versions": {"mujoco": "3"}, "settings": {"seed": 7}},
         )
 

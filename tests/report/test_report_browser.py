@@ -48,10 +48,38 @@ def test_charts_are_drawn_with_phases_noise_floor_and_every_model(opened, case):
     for path in re.findall(r'class="line \w+" d="([^"]*)"', chart):
         assert path.count("L") > 50
         assert "NaN" not in path
+    assert 'class="place"' in chart
     schedule = re.search(r'id="schedule".*?</svg>', dom, re.S)[0]
     assert "block · stop" in schedule
     assert 'class="target"' in schedule
     assert 'class="line held"' in re.search(r'id="fit-chart".*?</svg>', dom, re.S)[0]
+
+
+def test_the_timeline_has_a_strip_for_each_channel_and_model_and_marks_the_worst_places(opened, case):
+    dom, _ = opened
+    timeline = re.search(r'id="timeline".*?</svg>', dom, re.S)[0]
+    channels = [c for c in case.comparison.channels if case.comparison.summarise("after", c).noise]
+    assert timeline.count('class="strip"') == 2 * len(channels)
+    assert len(set(re.findall(r'class="(heat\d)"', timeline))) >= 4
+    assert timeline.count('class="place"') == timeline.count('class="badge-mark"') >= 1
+    levels = [int(level) for level in re.findall(r'class="heat(\d)"', timeline)]
+    assert max(levels) == 6
+    assert "NaN" not in timeline
+
+
+def test_the_bars_of_a_diagnosis_stand_at_their_gains(case, tmp_path):
+    probe = """<script>
+    document.title = JSON.stringify([...document.querySelectorAll("#diagnosis .effect")].map((row) => {
+      const box = (kind) => row.querySelector(kind).getBoundingClientRect(), zero = box(".zero").left;
+      return [box(".gain").left - zero, box(".gain").right - zero, box(".track").width]; }))</script>"""
+    page = tmp_path / "bars.html"
+    page.write_text(case.path.read_text().replace("</body>", probe + "</body>"))
+    dom, messages = browse(page, tmp_path, "--window-size=1200,2600", "--dump-dom")
+    assert messages == []
+    rows = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
+    scale = 0.72 / rows[0][2]
+    assert [right * scale for _, right, _ in rows[:2]] == pytest.approx([0.5, 0.48], abs=0.01)
+    assert rows[2][0] * scale == pytest.approx(-0.02, abs=0.005)
 
 
 @pytest.mark.parametrize("dark", [False, True])
@@ -96,15 +124,22 @@ fire(canvas, "pointerdown", { pointerId: 2, clientX: 260, clientY: 120 });
 fire(canvas, "pointermove", { pointerId: 2, clientX: 360, clientY: 120 });
 const zoomed = replayCamera.distance < distance;
 fire(canvas, "pointerup", { pointerId: 1 }); fire(canvas, "pointerup", { pointerId: 2 });
+const place = data.places[data.places.length - 1], button = document.querySelector(`[data-place="${place.number}"]`);
+button.click();
+const went = state.demonstration.name === place.demonstration && state.time === place.peak;
+const red = replayViews.map((view) => view.draw().filter((item) => item.colour[0] === COLOURS.place[0]).length);
+const strip = document.querySelectorAll("#timeline .hit")[1], box = strip.getBoundingClientRect();
+fire(strip, "pointerdown", { clientX: box.left + box.width / 2 });
+const halfway = Math.abs(state.time - state.demonstration.duration / 2) < 0.02;
 choose("demonstration", "demo_1"); choose("channel", "rail"); choose("follow", ""); choose("body", "stop");
-["log", "ghost", "spheres", "arrows", "hull"].forEach(tick);
+["log", "ghost", "spheres", "arrows", "hull", "mark"].forEach(tick);
 const slider = document.getElementById("time"); slider.value = 0.3; fire(slider, "input");
 const [clock, title] = ["clock", "errors-title"].map((id) => document.getElementById(id).textContent);
 const chart = document.getElementById("errors"), left = chart.getBoundingClientRect().left;
 fire(chart, "pointermove", { clientX: left + 300 });
 const tip = !document.querySelector("#errors .tip").hidden;
 document.getElementById("play").click();
-const tell = () => JSON.stringify({ turned, zoomed, clock, title, tip, later: state.time > 0.3 });
+const tell = () => JSON.stringify({ turned, zoomed, clock, title, tip, went, red, halfway, later: state.time > 0.3 });
 setInterval(() => { document.title = tell(); }, 100);
 }</script>"""
 
@@ -117,4 +152,7 @@ def test_controls_turn_zoom_choose_and_play(case, tmp_path):
     found = json.loads(re.search(r"<title>(.*?)</title>", dom)[1])
     assert found.pop("clock").startswith("0.30 s")
     assert found.pop("title") == "Error of rail [mm]"
-    assert found == {"turned": True, "zoomed": True, "tip": True, "later": True}
+    before, after = found.pop("red")
+    assert (before, after > 0) == (0, True)
+    assert all(found.values())
+    assert set(found) == {"turned", "zoomed", "tip", "later", "went", "halfway"}

@@ -1,17 +1,31 @@
 import base64
 import json
 import re
+from html import escape
 from itertools import pairwise
 
+import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.units import shown
 from concent_warp.model import Model
+from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.report.report import filled, write_report
 from concent_warp.report.scene_data import scene_bodies
+from concent_warp.report.where import numbered
 from concent_warp.scene.scene import Scene
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body><joint name="hinge" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/></body>
+  </worldbody>
+  <sensor><jointpos name="angle" joint="hinge"/></sensor>
+</mujoco>
+"""
 
 
 def embedded(path):
@@ -122,8 +136,59 @@ def test_tracked_points_stand_in_for_a_pose_that_was_not_measured(case, tmp_path
     path = tmp_path / "r.html"
     write_report(path, blind, models, compare(models, blind, "mujoco"))
     motion = embedded(path)["demonstrations"][0]["motion"]
-    assert motion["measured"] == {}
+    assert set(motion["measured"]) == {"pusher"}
     assert motion["points"]["block"]["count"] == 8
+
+
+def test_bodies_that_measured_joints_move_are_shown_where_the_joints_put_them(case, data):
+    motion = data["demonstrations"][0]["motion"]
+    time = unpacked(motion["time"])
+    pusher = unpacked(motion["measured"]["pusher"]).reshape(len(time), 7)
+    rail = case.recording["demo_0"].measured["rail"]
+    assert pusher[:, 0] == pytest.approx(-0.13 + np.interp(time, rail.time, rail.value[:, 0]), abs=1e-5)
+    assert pusher[:, 2] == pytest.approx(0.04)
+
+
+def test_the_worst_places_stand_in_the_page_and_can_be_clicked(case, text, data):
+    places = [place for _, place in numbered(case.comparison)]
+    assert places
+    for number, place in enumerate(places, 1):
+        assert escape(place.sentence(demonstration=True)) in text
+        assert f'data-place="{number}"' in text
+    first = data["places"][0]
+    assert (first["number"], first["channels"]) == (1, list(places[0].channels))
+    assert first["start"] <= first["peak"] <= first["end"]
+    assert {p["demonstration"] for p in data["places"]} <= {d["name"] for d in data["demonstrations"]}
+
+
+def test_a_place_points_from_the_model_to_the_measurement(case, data):
+    arrows = [p for p in data["places"] if p["arrow"]]
+    assert arrows
+    for p in arrows:
+        assert "block_position" in p["channels"] or "block points" in p["channels"]
+        r = case.comparison.residual("after", p["demonstration"], "block_position")
+        rows = (r.time >= p["start"]) & (r.time <= p["end"])
+        assert p["arrow"] == pytest.approx(r.value[rows].mean(axis=0), abs=5e-4)
+
+
+def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
+    m = Scene(PENDULUM).model
+    d = mujoco.MjData(m)
+    d.qpos[0] = 1
+    time, angle = np.arange(0, 2, 0.01), np.zeros(200)
+    for i in range(200):
+        angle[i] = d.qpos[0]
+        mujoco.mj_step(m, d, nstep=2)
+    noisy = Channel(time, (angle + np.random.default_rng(0).normal(0, 1e-3, 200))[:, None], 1e-3)
+    swing = Demonstration("demo_0", qpos=np.array([1.0]), qvel=np.zeros(1), measured={"angle": noisy})
+    recording = Recording(PENDULUM, (swing,))
+    models = {"model": Model(Scene(PENDULUM))}
+    write_report(tmp_path / "r.html", recording, models, compare(models, recording, "mujoco"))
+    text = (tmp_path / "r.html").read_text()
+    assert "as much as the measurement noise alone would leave" in text
+    assert "Nowhere does the error stand above 3 times the noise" in text
+    assert "Noise of angle: stated in the recording." in text
+    assert embedded(tmp_path / "r.html")["places"] == []
 
 
 def test_spheres_are_told_apart_by_what_became_of_them(case, data):

@@ -11,23 +11,48 @@ function numbers(packed) {
 }
 const meshes = Object.fromEntries(Object.entries(data.meshes).map(([name, m]) => [name, { vertices: numbers(m.vertices), faces: numbers(m.faces) }]));
 const shown = data.shown;
-const state = { demonstration: data.demonstrations[0], time: 0, playing: false, spheres: false, log: false, ghost: true };
+const state = { demonstration: data.demonstrations[0], time: 0, playing: false, spheres: false, log: false, ghost: true, mark: true };
 
 // ---- charts --------------------------------------------------------------------------------------------------------
 const narrow = () => document.body.clientWidth < 640;
 const errors = new LineChart($("errors"), (t) => setTime(t));
 const schedule = $("schedule") ? new Schedule($("schedule"), (t) => setTime(t)) : null;
 
+const timeline = new Timeline($("timeline"), (t, row) => { $("channel").value = stripChannels()[row].name; drawErrors(); setTime(t); });
+const MOST_STRIPS = 12;
+
 function leftMargin() {
-  if (narrow() || !schedule) return 46;
-  return 18 + 7 * Math.max(5, ...(state.demonstration.schedule?.rows || []).map((r) => r.label.length));
+  if (narrow()) return 46;
+  const labels = [...(state.demonstration.schedule?.rows || []).map((r) => r.label), ...stripChannels().map((c) => c.words)];
+  return 18 + 7 * Math.max(5, ...labels.map((label) => label.length));
+}
+const placesHere = (channel) => data.places.filter((p) => p.demonstration === state.demonstration.name && (!channel || p.channels.includes(channel)));
+/** Channels whose noise is known, those with the worst places and the largest error first. */
+function stripChannels() {
+  const d = state.demonstration, last = data.models[data.models.length - 1].name;
+  if (!d.strips) {
+    const worst = (c) => Math.min(99, ...placesHere(c.name).map((p) => p.number));
+    const size = (c) => { const v = numbers(c.errors[last]); return Math.sqrt(v.reduce((a, e) => a + (Number.isFinite(e) ? e * e : 0), 0) / v.length) / c.noise; };
+    d.strips = d.channels.filter((c) => c.noise).map((c) => [c, worst(c), size(c)]).sort((a, b) => a[1] - b[1] || b[2] - a[2]).slice(0, MOST_STRIPS).map((entry) => entry[0]);
+  }
+  return d.strips;
+}
+function drawTimeline() {
+  const d = state.demonstration;
+  timeline.show({
+    x: [0, d.duration], phases: d.phases, left: leftMargin(), narrow: narrow(),
+    rows: stripChannels().map((c) => ({
+      label: c.words, places: placesHere(c.name),
+      strips: shown.map((name) => ({ name, time: numbers(c.time), ratio: numbers(c.errors[name]).map((e) => e / c.noise) })),
+    })),
+  });
 }
 function drawErrors() {
   const d = state.demonstration, channel = d.channels.find((c) => c.name === $("channel").value) || d.channels[0];
   const time = numbers(channel.time);
   errors.show({
     x: [0, d.duration], xlabel: "time [s]", unit: channel.unit, left: leftMargin(), log: state.log, noise: channel.noise && channel.noise * channel.factor,
-    label: `error of ${channel.name} over time`, phases: d.phases, at: (t) => `${t.toFixed(2)} s`,
+    label: `error of ${channel.name} over time`, phases: d.phases, places: placesHere(channel.name), at: (t) => `${t.toFixed(2)} s`,
     series: data.models.map((m) => ({ name: m.name, kind: m.kind, time, value: numbers(channel.errors[m.name]).map((v) => v * channel.factor) })),
   });
   $("errors-title").textContent = `Error of ${channel.name} [${channel.unit}]`;
@@ -63,7 +88,7 @@ function geomItems(geom, position, quaternion, colour) {
     default: return [item("box", [a, b, c])];
   }
 }
-const COLOURS = { moved: [0.90, 0.32, 0.17], touched: [0.95, 0.70, 0.20], gripped: [0.36, 0.42, 0.78], other: [0.60, 0.66, 0.72], measured: [0.13, 0.68, 0.40] };
+const COLOURS = { moved: [0.90, 0.32, 0.17], touched: [0.95, 0.70, 0.20], gripped: [0.36, 0.42, 0.78], other: [0.60, 0.66, 0.72], measured: [0.13, 0.68, 0.40], place: [0.86, 0.08, 0.24] };
 const ARROW = window.matchMedia("(prefers-color-scheme: dark)").matches ? [1, 1, 1, 1] : [0.1, 0.1, 0.12, 1];
 const ball = (position, r, colour) => ({ shape: "sphere", position, quaternion: IDENTITY, scale: [r, r, r], colour });
 
@@ -99,7 +124,7 @@ function replayItems(model) {
     const ghost = state.ghost && m.measured[body.name];
     if (ghost) {
       const [gp, gq] = pose(ghost, frame);
-      for (const geom of body.geoms) items.push(...geomItems(geom, gp, gq, [...COLOURS.measured, 0.45]));
+      if (Number.isFinite(gp[0])) for (const geom of body.geoms) items.push(...geomItems(geom, gp, gq, [...COLOURS.measured, 0.45]));
     }
     const points = state.ghost && m.points[body.name];
     if (points) {
@@ -112,13 +137,30 @@ function replayItems(model) {
   });
   return items;
 }
+/** Where a place is: the point of contact, and an arrow from the model towards the measurement. */
+function placeItems(model) {
+  const m = motionOf(state.demonstration), frame = nearest(m.time, state.time), items = [], size = replayCamera.distance;
+  for (const place of placesHere()) {
+    const row = data.bodies.findIndex((b) => b.name === place.body);
+    if (row < 0 || state.time < place.start - 0.02 || state.time > place.end + 0.02) continue;
+    const [p, q] = pose(m.poses[model], frame * data.bodies.length + row);
+    if (!Number.isFinite(p[0])) continue;
+    if (place.point) items.push({ ...ball(Vec.plus(p, turned(q, place.point)), 0.008 * size, [...COLOURS.place, 1]), above: true });
+    if (!place.arrow) continue;
+    const way = Vec.unit(place.arrow), length = 0.1 * size, along = alongZ(way);
+    items.push({ shape: "cylinder", position: Vec.plus(p, way, length / 2), quaternion: along, scale: [0.003 * size, 0.003 * size, length / 2], colour: [...COLOURS.place, 1], above: true });
+    items.push({ shape: "cone", position: Vec.plus(p, way, length), quaternion: along, scale: [0.009 * size, 0.009 * size, 0.012 * size], colour: [...COLOURS.place, 1], above: true });
+  }
+  return items;
+}
 const replayCamera = new Camera(data.view.scene.target, data.view.scene.distance, data.view.azimuth, data.view.elevation);
-const replayViews = shown.map((model, i) => new View($(`replay-${i}`), replayCamera, meshes, () => replayItems(model)));
+const replayViews = shown.map((model, i) => new View($(`replay-${i}`), replayCamera, meshes, () => [...replayItems(model), ...(state.mark && i === shown.length - 1 ? placeItems(model) : [])]));
 
 /** Where the followed body is: as measured, else as the last model has it. */
 function followed() {
   const m = motionOf(state.demonstration), name = $("follow").value, frame = nearest(m.time, state.time);
-  if (m.measured[name]) return pose(m.measured[name], frame)[0];
+  const seen = m.measured[name] && pose(m.measured[name], frame)[0];
+  if (seen && Number.isFinite(seen[0])) return seen;
   const row = data.bodies.findIndex((b) => b.name === name), at = pose(m.poses[shown[shown.length - 1]], frame * data.bodies.length + row)[0];
   return Number.isFinite(at[0]) ? at : state.at || data.view.scene.target;
 }
@@ -133,7 +175,7 @@ function setTime(t) {
   $("time").value = state.time;
   const phase = d.phases.find((p) => state.time >= p.start && state.time < p.end);
   $("clock").textContent = `${state.time.toFixed(2)} s${phase ? " · " + phase.name : ""}`;
-  errors.setCursor(state.time); schedule?.setCursor(state.time);
+  errors.setCursor(state.time); schedule?.setCursor(state.time); timeline.setCursor(state.time);
   if (state.at) { const at = followed(); replayCamera.shift(Vec.minus(at, state.at)); state.at = at; }
   replayViews.forEach((v) => v.refresh());
 }
@@ -209,8 +251,21 @@ function drawFit() {
 function setDemonstration(name) {
   state.demonstration = data.demonstrations.find((d) => d.name === name);
   $("time").max = state.demonstration.duration;
-  drawErrors(); drawSchedule(); setTime(state.demonstration.duration); aimReplay();
+  const worst = placesHere()[0];
+  const main = state.demonstration.channels[0].name;
+  if (worst) $("channel").value = worst.channels.includes(main) ? main : worst.channels[0];
+  drawTimeline(); drawErrors(); drawSchedule(); setTime(worst ? worst.peak : state.demonstration.measured_until); aimReplay();
 }
+function showPlace(place) {
+  setPlaying(false);
+  $("demonstration").value = place.demonstration;
+  setDemonstration(place.demonstration);
+  $("channel").value = place.channels[0];
+  if (data.view.bodies[place.body]) $("follow").value = place.body;
+  drawErrors(); setTime(place.peak); aimReplay();
+  $("replay").scrollIntoView({ behavior: "smooth", block: "nearest" });
+}
+for (const button of document.querySelectorAll("[data-place]")) button.addEventListener("click", () => showPlace(data.places.find((p) => p.number === Number(button.dataset.place))));
 $("demonstration").addEventListener("change", (e) => { setPlaying(false); setDemonstration(e.target.value); });
 $("channel").addEventListener("change", drawErrors);
 $("log").addEventListener("change", (e) => { state.log = e.target.checked; drawErrors(); });
@@ -219,9 +274,12 @@ $("follow").addEventListener("change", aimReplay);
 $("play").addEventListener("click", () => setPlaying(!state.playing));
 $("spheres")?.addEventListener("change", (e) => { state.spheres = e.target.checked; replayViews.forEach((v) => v.refresh()); });
 $("ghost").addEventListener("change", (e) => { state.ghost = e.target.checked; replayViews.forEach((v) => v.refresh()); });
-window.addEventListener("resize", () => { drawErrors(); drawSchedule(); });
+$("mark")?.addEventListener("change", (e) => { state.mark = e.target.checked; replayViews.forEach((v) => v.refresh()); });
+window.addEventListener("resize", () => { drawTimeline(); drawErrors(); drawSchedule(); });
 setUpGeometry();
 drawFit();
 state.log = $("log").checked;
-setDemonstration(data.demonstrations[0].name);
+const first = data.demonstrations.find((d) => d.name === data.places[0]?.demonstration) || data.demonstrations[0];
+$("demonstration").value = first.name;
+setDemonstration(first.name);
 document.documentElement.dataset.ready = "yes";

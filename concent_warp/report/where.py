@@ -1,0 +1,52 @@
+"""The section of a report that says where the model fails: a timeline of all channels, the worst places in words."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from html import escape
+
+from concent_warp.diagnose.comparison import Comparison
+from concent_warp.diagnose.noise import WORDS
+from concent_warp.diagnose.places import LEAST, Place, alike
+from concent_warp.diagnose.units import words
+
+MOST_PLACES = 6
+"""Places in the list."""
+
+
+def numbered(comparison: Comparison) -> list[tuple[int, Place]]:
+    """Return the places that the page names, numbered from 1: the worst of each kind."""
+    found, seen = [], set()
+    for place in comparison.places:
+        if alike(place) not in seen and len(found) < MOST_PLACES:
+            seen.add(alike(place))
+            found.append((len(found) + 1, place))
+    return found
+
+
+def place_list(comparison: Comparison, shown: Collection[str]) -> str:
+    """Return the worst places as a list; those in a demonstration that is `shown` can be clicked."""
+    places = numbered(comparison)
+    if not places:
+        return f"<p>Nowhere does the error stand above {LEAST:g} times the noise for long.</p>"
+    several = len(comparison.demonstrations) > 1
+    items = []
+    for number, place in places:
+        text = escape(place.sentence(demonstration=several))
+        if place.recurs > 1:
+            text += f' <span class="quiet">(alike in {place.recurs} demonstrations)</span>'
+        badge = f'<span class="badge">{number}</span>'
+        if place.demonstration in shown:
+            items.append(f'<li><button type="button" data-place="{number}">{badge}<span>{text}</span></button></li>')
+        else:
+            items.append(f"<li>{badge}<span>{text}</span></li>")
+    return f'<ol class="places">{"".join(items)}</ol>'
+
+
+def noise_words(comparison: Comparison) -> str:
+    """Return where the noise floors are from, in one sentence for each way."""
+    found: dict[str, list[str]] = {}
+    for channel in comparison.channels:
+        source = comparison.summarise(comparison.after, channel).source
+        found.setdefault(WORDS[source], []).append(words(channel))
+    return " ".join(f"Noise of {', '.join(channels)}: {how}." for how, channels in found.items())

@@ -1,0 +1,120 @@
+import re
+from html import unescape
+
+import pytest
+
+from concent_warp.diagnose.compare import compare
+from concent_warp.report.diagnosis import accepted, bars, diagnosis_section, headline
+from concent_warp.report.report import write_report
+
+
+def effect(name, gain, p, **rest):
+    low, high = gain - 0.1, gain + 0.1
+    parameter = {"name": "torque[hinge]", "value": 0.02134, "interval": [0.0195, 0.0231], "unit": "N m"}
+    return {
+        "name": name,
+        "family": "joints",
+        "gain": {"value": gain, "interval": [low, high]},
+        "p": p,
+        "parameters": [parameter],
+        **rest,
+    }
+
+
+NAMED = {
+    "verdict": "effect",
+    "effects": [effect("joint_friction", 0.62, 0.0004), effect("armature", 0.04, 0.4)],
+    "groups": [],
+    "where": [{"channel": "hinge_position", "phase": "free", "start": 1.2, "end": 2.5, "direction": "against motion"}],
+    "unexplained": 0.043,
+    "detectable": {"armature": {"value": 2e-4, "unit": "kg m^2"}},
+    "next_experiment": None,
+}
+
+
+def words_of(section):
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", section)).split())
+
+
+def test_an_effect_is_named_with_its_gain_interval_p_and_parameter():
+    text = words_of(diagnosis_section(NAMED))
+    assert "The model lacks joint friction (joints and drives)." in text
+    assert "it takes away 62 % [52, 72] of the error (p < 0.001)" in text
+    assert "4 % of the error stays unexplained" in text
+    assert "torque[hinge] 0.02134 0.0195 to 0.0231 N m" in text
+    assert "hinge position, free phase, 1.20-2.50 s, against motion" in text
+    assert "armature 0.0002 kg m^2" in text
+    assert "Next experiment" not in text
+
+
+def test_several_accepted_effects_are_all_named():
+    both = {**NAMED, "effects": [effect("joint_friction", 0.4, 0.001), effect("load_friction", 0.3, 0.01)]}
+    text = headline(both)
+    assert "lacks joint friction (joints and drives) and load friction (joints and drives)." in text
+    assert "joint friction takes away 40 % [30, 50] of the error (p = 0.001), load friction takes away 30 %" in text
+
+
+def test_a_group_is_never_told_as_one_winner():
+    tied = {**NAMED, "verdict": "group", "groups": [["sliding_friction", "mass"]]}
+    tied["next_experiment"] = {"sentence": "Push the block empty and loaded."}
+    text = words_of(diagnosis_section(tied))
+    assert "cannot tell whether it is sliding friction or mass" in text
+    assert "These data cannot tell sliding friction from mass apart." in text
+    assert "Next experiment Push the block empty and loaded." in text
+    assert "The model lacks joint friction" not in text
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"), [("none_needed", "No discrepancy was detected"), ("none_of_these", "none of the effects")]
+)
+def test_no_effect_is_said_in_words(verdict, said):
+    section = diagnosis_section({"verdict": verdict, "effects": [], "detectable": NAMED["detectable"]})
+    assert said in words_of(section)
+    assert ("<details open>" in section) == (verdict == "none_needed")
+
+
+def test_bars_span_from_zero_to_the_gain_and_whiskers_the_interval():
+    drawn = bars([effect("joint_friction", 0.8, 0.001), effect("drag", -0.1, 1.0)])
+    first, second = re.findall(r'class="effect (\w+)"(.*?)</div>', drawn)
+    assert (first[0], second[0]) == ("accepted", "rejected")
+    low, span = -0.2, 1.1
+    zero, gain, whisker = re.findall(r"left:([\d.]+)%", first[1])
+    assert float(zero) == float(gain) == pytest.approx(100 * -low / span, abs=0.01)
+    assert float(whisker) == pytest.approx(100 * (0.7 - low) / span, abs=0.01)
+    assert float(re.search(r'class="gain"[^>]*width:([\d.]+)%', first[1])[1]) == pytest.approx(80 / span, abs=0.01)
+    assert float(re.search(r'class="gain" style="left:([\d.]+)%', second[1])[1]) == pytest.approx(10 / span, abs=0.01)
+
+
+def test_what_the_diagnosis_says_of_acceptance_counts_more_than_p():
+    assert accepted(effect("a", 0.3, 0.01))
+    assert not accepted(effect("a", 0.3, 0.2))
+    assert not accepted(effect("a", 0.05, 0.01))
+    assert not accepted(effect("a", 0.3, 0.01, accepted=False))
+
+
+def test_missing_entries_and_flat_forms_are_taken():
+    flat = {"verdict": "effect", "effects": [{"name": "mass", "gain": 0.2, "gain_interval": [0.1, 0.3], "p": 0.01}]}
+    flat["effects"][0]["parameters"] = {"scale": {"value": 1.2, "interval": [1.1, 1.3], "unit": "-"}}
+    text = words_of(diagnosis_section(flat))
+    assert "it takes away 20 % [10, 30] of the error" in text
+    assert "scale 1.2 1.1 to 1.3" in text
+    assert diagnosis_section(None) == ""
+    assert "ended with" in words_of(diagnosis_section({"verdict": "odd"}))
+
+
+def test_names_of_a_diagnosis_cannot_become_markup():
+    bad = effect("<b>x</b>", 0.5, 0.001)
+    bad["parameters"][0]["name"] = "<i>"
+    section = diagnosis_section({**NAMED, "effects": [bad], "where": ["<u>"], "next_experiment": "<s>"})
+    for tag in ("<b>x", "<i>", "<u>", "<s>"):
+        assert tag not in section.replace('<i class="', "")
+
+
+def test_the_section_stands_in_the_report(case, tmp_path):
+    models = {"model": case.after}
+    path = tmp_path / "r.html"
+    found = compare(models, case.recording, "mujoco")
+    write_report(path, case.recording, models, found, diagnosis=NAMED)
+    assert "The model lacks joint friction" in path.read_text()
+    write_report(path, case.recording, models, found)
+    assert 'id="diagnosis"' not in path.read_text()
