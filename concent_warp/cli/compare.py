@@ -22,6 +22,7 @@ from concent_warp.errors import EventsError
 from concent_warp.ground import extract_all
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
+from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import EngineName
 
 
@@ -33,8 +34,8 @@ class Arguments:
 
     recording: tyro.conf.Positional[Path]
     """Recording."""
-    model: Path
-    """Model (.toml) or MJCF (.xml)."""
+    model: Path | None = None
+    """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     baseline: Path | None = None
     """Model to compare it with."""
     demonstrations: tuple[str, ...] = ()
@@ -61,7 +62,8 @@ def run(arguments: Arguments) -> Comparison:
     """Compare, and print or write what was asked for."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     models = {} if arguments.baseline is None else {"baseline": Model.load(arguments.baseline)}
-    models["model"] = Model.load(arguments.model)
+    own = Scene(recording.scene, source=recording.source)
+    models["model"] = Model(own) if arguments.model is None else Model.load(arguments.model)
     if arguments.html is not None:
         claim_file(arguments.html, overwrite=arguments.overwrite)
     events = {}
@@ -100,7 +102,8 @@ def say_noise(comparison: Comparison) -> None:
     for channel in comparison.channels:
         found.setdefault(WORDS[comparison.summarise(comparison.after, channel).source], []).append(channel)
     for words, channels in found.items():
-        say(escape(f"noise of {', '.join(channels)}: {words}"))
+        of = f" of {', '.join(channels)}" if len(found) > 1 else ""
+        say(escape(f"noise{of}: {words}"))
 
 
 def say_places(comparison: Comparison, most: int) -> None:

@@ -12,7 +12,7 @@ from concent_warp.diagnose.partners import Partners
 from concent_warp.diagnose.phases import Phase, StageLike, phases_by_body, stage_phases
 from concent_warp.diagnose.places import ranked, worst_places
 from concent_warp.diagnose.residuals import instrument_noise, residuals
-from concent_warp.errors import ModelError
+from concent_warp.errors import ModelError, RecordingError
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -46,7 +46,7 @@ def compare(
 
     Raises:
         ModelError: There is no model.
-        RecordingError: There is no such demonstration, or it measures what a model does not.
+        RecordingError: There is no such demonstration, or it measures nothing, or what a model does not.
         EngineError: A model cannot be simulated.
     """
     if not models:
@@ -68,6 +68,8 @@ def compare(
             if name == last:
                 partners[d.name] = Partners.of_replay(model, compiled, rollout)
                 moving[d.name] = phases_by_body(model, compiled, rollout)
+    if not any(found.values()):
+        raise RecordingError("nothing was measured that could be compared with a model", where=recording.source)
     staged = phases or {}
     if any(map(len, staged.values())):
         moving = {d.name: {None: stage_phases(staged[d.name], d.duration)} for d in chosen if d.name in staged}

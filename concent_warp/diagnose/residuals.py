@@ -159,7 +159,10 @@ def sensor_residual(
     if row < 0:
         names = [compiled.sensor(i).name for i in range(compiled.nsensor)]
         raise RecordingError(
-            f"a measurement of a sensor {name!r} that the model lacks", where=where, expected=f"one of {names}"
+            f"a measurement of a sensor {name!r} that the model lacks",
+            where=where,
+            expected=f"one of {names}",
+            fix="add that sensor to the model's MJCF, or leave the channel out",
         )
     if channel.value.shape[1] != compiled.sensor_dim[row]:
         raise RecordingError(

@@ -78,15 +78,15 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
         return np.array(demonstration.qpos, dtype=float), qvel
     qpos = model.qpos0.copy()
     for name, channel in demonstration.measured.items():
-        sensor = model.sensor(name)
+        row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
         first = channel.value[np.isfinite(channel.value).all(axis=1)]
-        if not len(first):
+        if row < 0 or not len(first):
             continue
-        kind, target = model.sensor_type[sensor.id], model.sensor_objid[sensor.id]
+        kind, target = model.sensor_type[row], model.sensor_objid[row]
         if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
             qpos[model.jnt_qposadr[target]] = first[0, 0]
             continue
-        if int(model.sensor_objtype[sensor.id]) not in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
+        if int(model.sensor_objtype[row]) not in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
             continue
         joint = model.body_jntadr[target]
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:

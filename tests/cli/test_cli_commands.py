@@ -80,6 +80,24 @@ def test_compare_shows_a_table_and_writes_a_report(bench, tmp_path, capsys):
     assert main([*arguments, "--overwrite"]) == 0
 
 
+def test_compare_names_the_worst_places(bench, capsys):
+    arguments = ["compare", str(bench / "demo.h5"), "--model", str(bench / "surface.toml")]
+    assert main([*arguments, "--places", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "\n1. " in out
+    assert "\n3. " not in out
+    assert " x noise (" in out
+    assert main([*arguments, "--markdown", "--places", "0"]) == 0
+    assert "\n1. " not in capsys.readouterr().out
+
+
+def test_compare_takes_the_scene_of_the_recording_by_default(bench, capsys):
+    assert main(["compare", str(bench / "demo.h5")]) == 0
+    out = capsys.readouterr().out
+    assert "noise: stated in the recording" in out
+    assert "Nowhere above 3 x noise." in out
+
+
 @pytest.mark.parametrize("command", ["replay", "events"])
 def test_files_are_not_overwritten_unasked(command, bench, tmp_path, capsys):
     out = tmp_path / "r.npz" if command == "replay" else tmp_path

@@ -185,6 +185,16 @@ def test_nothing_to_compare_is_an_error():
         compare({"m": model(2)}, recorded(model(2)), "mujoco").summarise("m", "elbow")
 
 
+def test_a_recording_that_measures_nothing_or_what_the_model_lacks_is_an_error():
+    recording = recorded(model(2))
+    d = replace(recording[0], qpos=None, qvel=None)
+    with pytest.raises(RecordingError, match="nothing was measured"):
+        compare({"m": model(2)}, replace(recording, demonstrations=(replace(d, measured={}),)), "mujoco")
+    bare = Model(Scene(model(2).scene.xml.replace('<jointpos name="rail" joint="rail"/>', "")))
+    with pytest.raises(RecordingError, match="add that sensor"):
+        compare({"m": bare}, replace(recording, demonstrations=(d,)), "mujoco")
+
+
 def test_a_summary_can_be_of_some_demonstrations(comparison):
     one = comparison.summarise("wrong", "rail", (), ("demo_1",))
     assert one.count == len(TIME)
