@@ -1,0 +1,197 @@
+"""What unexplained forces depend on: correlations with p-values by sign flips of blocks.
+
+If the model lacks nothing, what remains is noise that is as likely to be there with the other sign, independently from
+one block of windows to the next. So the signs of whole blocks are flipped at random, and a correlation is as
+significant as few flipped ones exceed it; taking the largest over all features (Westfall and Young's max-T) corrects
+for having looked at several. Features are then taken in one by one, each tested with the ones before projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+FLIPS = 999
+EXACT_BLOCKS = 11
+"""With no more blocks than this all flips are gone through."""
+BLOCK = 4
+"""Windows in a block; they overlap by half."""
+FEWEST_BLOCKS = 5
+"""Fewer blocks test nothing: 2^-5 is the smallest p-value that they can give, both signs counted."""
+MOST_PATTERNS = 2
+LEAST_SHARE = 0.1
+"""A pattern explains at least this share of a force: less, of what is mostly noise, may be what the linearisation of a
+window leaves."""
+LEVEL = 0.05
+ALIKE = 2.0
+"""Features whose shares differ by less than this many standard errors cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """How an unexplained force goes with one feature."""
+
+    feature: str
+    correlation: float
+    """-1..1, of the values as they are, about 0 rather than about their means."""
+    slope: float
+    """Least-squares factor: force over the feature's unit."""
+    slope_std: float
+    """Its standard deviation, from the scatter between blocks."""
+    p: float
+    """Of the correlation, corrected for the number of features."""
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A feature that explains a significant part of a force, after the patterns before it."""
+
+    feature: str
+    slope: float
+    slope_std: float
+    share: float
+    """Share of the force's weighted square that it explains in addition, 0..1."""
+    p: float
+    alternatives: tuple[str, ...]
+    """Features that explain as much, as far as these data tell."""
+
+
+@dataclass(frozen=True)
+class Dependences:
+    """What one force depends on."""
+
+    all: tuple[Dependence, ...]
+    """Every feature tried, the largest correlation first; empty where there were too few blocks."""
+    patterns: tuple[Pattern, ...]
+    """What explains it, the most important first; empty where nothing is significant."""
+
+    @property
+    def p(self) -> float:
+        """Corrected p-value of the strongest dependence; 1 where nothing could be tested."""
+        return min((d.p for d in self.all), default=1.0)
+
+
+def dependences(
+    force: np.ndarray,
+    std: np.ndarray,
+    features: Mapping[str, np.ndarray],
+    blocks: np.ndarray,
+    seed: int = 0,
+) -> Dependences:
+    """Test what a force depends on.
+
+    Args:
+        force: Unexplained force, shape (K, d): one component, or a vector with features along it.
+        std: Its standard deviation, shape (K,).
+        features: Values of the features, shape (K, d) each.
+        blocks: Block of each window, shape (K,) int; see `blocks_of`.
+        seed: Seed of the flips.
+    """
+    valid = np.isfinite(force).all(axis=1) & (std > 0)
+    kept = {n: f[valid] for n, f in features.items() if np.isfinite(f[valid]).all() and np.any(f[valid])}
+    labels, block = np.unique(blocks[valid], return_inverse=True)
+    if len(labels) < FEWEST_BLOCKS or not kept:
+        return Dependences((), ())
+    weight = 1 / std[valid][:, None]
+    y = (force[valid] * weight).ravel()
+    names = list(kept)
+    x = np.stack([(kept[n] * weight).ravel() for n in names])
+    block = np.repeat(block, force.shape[1])
+    signs = flips(len(labels), np.random.default_rng(seed))
+    p = max_p(y, x, block, signs)
+    found = []
+    for i, name in enumerate(names):
+        slope, slope_std = slope_of(y, x[i], block)
+        found.append(Dependence(name, correlation(y, x[i]), slope, slope_std, float(p[i])))
+    found.sort(key=lambda d: -abs(d.correlation))
+    return Dependences(tuple(found), patterns(y, x, names, block, signs))
+
+
+def patterns(
+    y: np.ndarray, x: np.ndarray, names: Sequence[str], block: np.ndarray, signs: np.ndarray
+) -> tuple[Pattern, ...]:
+    """Return the features that explain `y` (n,), one after the other, of candidates `x` (F, n)."""
+    found: list[Pattern] = []
+    total = float(y @ y)
+    left, candidates, chosen = y, x, np.zeros((0, len(y)))
+    for _ in range(MOST_PATTERNS):
+        p = max_p(left, candidates, block, signs)
+        strength = np.abs([correlation(left, c) for c in candidates])
+        best = int(np.argmax(strength))
+        if p[best] > LEVEL:
+            break
+        share = strength[best] ** 2 * float(left @ left) / total
+        if share < LEAST_SHARE and not found:
+            break
+        slope, slope_std = slope_of(left, candidates[best], block)
+        alternatives = tuple(
+            str(names[i])
+            for i in np.argsort(-strength)
+            if i != best
+            and names[i] not in {f.feature for f in found}
+            and alike(left, candidates[best], candidates[i], block)
+        )
+        found.append(Pattern(names[best], slope, slope_std, share, float(p[best]), alternatives))
+        chosen = np.concatenate([chosen, x[best][None]])
+        left, candidates = without(y, chosen), np.stack([without(c, chosen) for c in x])
+        small = (candidates**2).sum(axis=1) < 1e-3 * (x**2).sum(axis=1)
+        candidates[small] = 0
+    return tuple(found)
+
+
+def blocks_of(counts: Sequence[int], size: int = BLOCK) -> np.ndarray:
+    """Return the block of each window of demonstrations with `counts` windows, shape (sum,); none spans two."""
+    labels, first = [], 0
+    for count in counts:
+        number = max(round(count / size), 1)
+        labels.append(first + np.minimum(np.arange(count) * number // max(count, 1), number - 1))
+        first += number
+    return np.concatenate(labels) if labels else np.zeros(0, dtype=int)
+
+
+def flips(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return signs of `count` blocks, shape (n, count): all combinations where they are few, the given one first."""
+    if count <= EXACT_BLOCKS:
+        bits = (np.arange(2 ** (count - 1))[:, None] >> np.arange(count)) & 1
+        return 1.0 - 2.0 * bits
+    return np.concatenate([np.ones((1, count)), rng.choice([-1.0, 1.0], size=(FLIPS, count))])
+
+
+def max_p(y: np.ndarray, x: np.ndarray, block: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """Return the p-value of the correlation of `y` (n,) with each of `x` (F, n), corrected for their number."""
+    size = np.sqrt((x**2).sum(axis=1))
+    product = np.stack([np.bincount(block, weights=c * y, minlength=signs.shape[1]) for c in x])
+    statistic = np.abs(signs @ product.T) / np.where(size > 0, size, np.inf)
+    highest = statistic.max(axis=1)
+    return (highest[:, None] >= statistic[0] * (1 - 1e-12)).mean(axis=0)
+
+
+def correlation(y: np.ndarray, x: np.ndarray) -> float:
+    """Return the correlation of `y` and `x` (n,) about 0."""
+    size = np.sqrt((y @ y) * (x @ x))
+    return float(y @ x / size) if size > 0 else 0.0
+
+
+def slope_of(y: np.ndarray, x: np.ndarray, block: np.ndarray) -> tuple[float, float]:
+    """Return the least-squares slope of `y` on `x` (n,) and its standard deviation from the scatter between blocks."""
+    square = float(x @ x)
+    slope = float(x @ y) / square
+    score = np.bincount(block, weights=x * (y - slope * x))
+    count = len(score)
+    return slope, float(np.sqrt((score**2).sum() * count / max(count - 1, 1)) / square)
+
+
+def alike(y: np.ndarray, best: np.ndarray, other: np.ndarray, block: np.ndarray) -> bool:
+    """Return whether `other` explains `y` as well as `best` within the scatter between blocks, (n,) each."""
+    if not np.any(other):
+        return False
+    explained = [x * (x @ y) / (x @ x) for x in (best, other)]
+    gain = np.bincount(block, weights=(y - explained[1]) ** 2 - (y - explained[0]) ** 2)
+    return bool(gain.sum() <= ALIKE * np.sqrt(len(gain)) * gain.std(ddof=1)) if len(gain) > 1 else True
+
+
+def without(y: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return `y` (n,) with its part along the rows of `chosen` (F, n) taken out."""
+    return y - chosen.T @ np.linalg.lstsq(chosen.T, y, rcond=None)[0]

@@ -1,0 +1,138 @@
+"""What unexplained forces are tested against: features of the motion in each window, averaged as the forces are."""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    from concent_warp.diagnose.contact_state import BodyWindows
+    from concent_warp.diagnose.measured_motion import Motion
+    from concent_warp.diagnose.shooting import Windows
+
+DIRECTION, SPEED, ACCELERATION = "direction of motion", "velocity", "acceleration"
+LOADED, GRAVITY, DRIVE = "direction of motion x load", "weight on it", "drive force"
+COMMAND_RATE, POSITION, CONSTANT, CONTACT = "rate of the command", "position", "a constant", "contact"
+SLIDING, DRAG = "direction of sliding", "velocity x speed"
+AXES = ("x", "y", "z")
+
+SHARES = (np.arange(5) + 0.5) / 5
+"""Instants within a window, as shares of its length, at which features are taken."""
+RATE_STEP = 0.01
+"""Time over which the rate of a command is taken [s]."""
+
+
+def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.ndarray]]:
+    """Return the features of each measured joint, by its name, shape (K, 1) each.
+
+    Units: "velocity" rad/s (m/s), "acceleration" rad/s^2, "direction of motion" -1..1, "position" rad about its mean,
+    "weight on it" and "drive force" N m (N), "rate of the command" N m/s (N/s), "contact" 0..1.
+    """
+    m = copy.copy(motion.compiled)
+    m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    d = mujoco.MjData(m)
+    count = len(windows.start)
+    time = (windows.start[:, None] + windows.length * SHARES).ravel()
+    weight = 30 * SHARES**2 * (1 - SHARES) ** 2
+    weight /= weight.sum()
+    qpos, qvel = motion.states(time)
+    qacc = motion.acceleration(time)
+    dt = m.opt.timestep
+    back = max(round(RATE_STEP / dt), 1)
+    now = np.clip((time / dt).astype(int), 0, len(motion.ctrl) - 1)
+    load, drive, before = (np.empty((len(time), m.nv)) for _ in range(3))
+    for i in range(len(time)):
+        d.qpos[:], d.qvel[:] = qpos[i], qvel[i]
+        forces = []
+        for row in (max(now[i] - back, 0), now[i]):
+            if m.nu:
+                d.ctrl[:] = motion.ctrl[row]
+            mujoco.mj_forward(m, d)
+            forces.append(d.qfrc_actuator.copy())
+        before[i], drive[i] = forces
+        d.qvel[:] = 0
+        mujoco.mj_fwdVelocity(m, d)
+        load[i] = d.qfrc_bias - d.qfrc_gravcomp
+    touching = contact_shares(motion.compiled, windows)
+    found = {}
+    for joint in motion.joints:
+        v = qvel[:, joint.dof]
+        std = np.sqrt(joint.position.smooth.covariance(time)[:, 1, 1])
+        direction = v / np.sqrt(v**2 + (2 * std) ** 2)
+        raw = {
+            DIRECTION: direction,
+            SPEED: v,
+            ACCELERATION: qacc[:, joint.dof],
+            LOADED: direction * np.abs(load[:, joint.dof]),
+            GRAVITY: load[:, joint.dof],
+            DRIVE: drive[:, joint.dof],
+            COMMAND_RATE: (drive[:, joint.dof] - before[:, joint.dof]) / (back * dt),
+            POSITION: qpos[:, joint.qpos] - qpos[:, joint.qpos].mean(),
+            CONSTANT: np.ones(len(time)),
+        }
+        mean = {name: value.reshape(count, -1) @ weight for name, value in raw.items()}
+        mean[CONTACT] = touching[:, joint.dof]
+        found[joint.name] = {name: value[:, None] for name, value in mean.items() if varies(name, value)}
+    return found
+
+
+def varies(name: str, value: np.ndarray) -> bool:
+    """Return whether a feature says more than a constant does."""
+    size = float(np.abs(value).max(initial=0))
+    return name == CONSTANT or (size > 0 and float(np.ptp(value)) > 1e-6 * size)
+
+
+def contact_shares(m: mujoco.MjModel, windows: Windows) -> np.ndarray:
+    """Return in which share of the steps of a window something beyond a degree of freedom touches, shape (K, nv)."""
+    count, steps = windows.path.shape[0], windows.path.shape[1] - 1
+    log = windows.contacts
+    shares = np.zeros((count, m.nv))
+    moves = np.zeros((m.nbody, m.nv), dtype=bool)
+    for b in range(1, m.nbody):
+        moves[b] = moves[m.body_parentid[b]]
+        start, size = int(m.body_dofadr[b]), int(m.body_dofnum[b])
+        moves[b, start : start + size] = True
+    bodies = m.geom_bodyid[log.geom]
+    for dof in range(m.nv):
+        beyond = moves[bodies, dof]
+        rows = np.asarray(beyond.any(axis=1))
+        pairs = np.unique(np.stack([log.variant[rows], log.step[rows]], axis=1), axis=0)
+        shares[:, dof] = np.bincount(pairs[:, 0], minlength=count)[:count] / steps if len(pairs) else 0
+    return shares
+
+
+def body_force_features(state: BodyWindows, acceleration: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """Return the features of the force on a free body, vectors in the world frame, shape (K, 3) each.
+
+    Args:
+        state: Its windows.
+        acceleration: Of its origin [m/s^2], shape (K, 3).
+        name: Of the body.
+    """
+    speed = np.linalg.norm(state.velocity, axis=1, keepdims=True)
+    slip = np.linalg.norm(state.sliding, axis=1, keepdims=True)
+    features = {
+        SLIDING: np.where(slip > 0, state.sliding / np.maximum(np.hypot(slip, 0.01), 1e-9), 0),
+        SPEED: state.velocity,
+        DRAG: state.velocity * speed,
+        ACCELERATION: acceleration,
+    }
+    for i, axis in enumerate(AXES):
+        features[f"world {axis}"] = np.tile(np.eye(3)[i], (len(speed), 1))
+    for i, axis in enumerate(AXES):
+        features[f"{name} {axis}"] = state.rotation[:, :, i]
+    return features
+
+
+def body_torque_features(state: BodyWindows, name: str) -> dict[str, np.ndarray]:
+    """Return the features of the torque on a free body, vectors in the world frame, shape (K, 3) each."""
+    rate = np.linalg.norm(state.spin, axis=1, keepdims=True)
+    features = {"direction of turning": state.spin / np.hypot(rate, 0.1), "angular velocity": state.spin}
+    for i, axis in enumerate(AXES):
+        features[f"world {axis}"] = np.tile(np.eye(3)[i], (len(rate), 1))
+    for i, axis in enumerate(AXES):
+        features[f"{name} {axis}"] = state.rotation[:, :, i]
+    return features

@@ -1,0 +1,214 @@
+"""Where unexplained forces act: by degree of freedom, and on which place of which object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from concent_warp.diagnose.comparison import finite
+from concent_warp.diagnose.dependence import LEVEL, Dependences
+from concent_warp.diagnose.force_place import ForcePlace
+from concent_warp.diagnose.location_words import body_sentence, joint_sentence, pattern_sentence
+
+DETECTABLE = 3.0
+"""Standard errors above which a steady force is seen."""
+
+
+@dataclass(frozen=True)
+class ForceSeries:
+    """An unexplained force over time, one value a window; windows overlap by half."""
+
+    demonstration: str
+    time: np.ndarray
+    """Middles of the windows [s], shape (K,)."""
+    force: np.ndarray
+    """Shape (K,) of a joint, (K, 3) of a body (world frame); NaN where it cannot be told."""
+    std: np.ndarray
+    """Standard deviation, shape (K,)."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        arrays = {name: getattr(self, name).tolist() for name in ("time", "force", "std")}
+        return {"demonstration": self.demonstration, **arrays}
+
+
+@dataclass(frozen=True)
+class JointForce:
+    """The unexplained force of one joint, over all demonstrations."""
+
+    joint: str
+    unit: str
+    """"N m" or "N"."""
+    rms: float
+    noise: float
+    """RMS that the measurement noise alone leaves."""
+    detectable: float
+    """Smallest steady force that would have been seen."""
+    p: float
+    """Probability of such a dependence on any of the features by chance."""
+    significant: bool
+    """After correction for the number of joints and bodies (Holm)."""
+    dependences: Dependences
+    series: tuple[ForceSeries, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON, SI units."""
+        names = ("joint", "unit", "rms", "noise", "detectable", "p", "significant")
+        return {
+            **{name: getattr(self, name) for name in names},
+            **dependences_json(self.dependences),
+            "series": [s.to_json() for s in self.series],
+        }
+
+
+@dataclass(frozen=True)
+class PhaseForce:
+    """The unexplained force on a free body in one phase."""
+
+    phase: str
+    spans: tuple[tuple[str, float, float], ...]
+    """Demonstration, start and end [s]."""
+    frame: str
+    """Frame in which the force is steadiest: "world", the body's name, or "sliding"."""
+    vector: np.ndarray
+    """Steady force [N] in that frame, shape (3,); in "sliding" the first component is along the velocity."""
+    std: np.ndarray
+    """Its standard deviation [N], shape (3,)."""
+    share: float
+    """Share of the unexplained force that is steady in that sense."""
+    impulse: np.ndarray
+    """Time integral of the unexplained force [N s], world frame, mean over the spans, shape (3,)."""
+    torque: np.ndarray
+    """Mean unexplained torque about the body's origin [N m], body frame, shape (3,)."""
+    p: float
+    test: str
+    significant: bool
+    place: ForcePlace | None
+    """Where it acts; None where that was not measured, or where nothing significant acts."""
+    arrow: np.ndarray
+    """Mean force [N], body frame, shape (3,), for drawing."""
+
+    @property
+    def size(self) -> float:
+        """How large the steady force is [N]."""
+        return float(np.linalg.norm(self.vector))
+
+    @property
+    def size_std(self) -> float:
+        """Standard deviation of `size` [N]."""
+        unit = self.vector / max(self.size, 1e-12)
+        return float(np.sqrt((unit**2 * self.std**2).sum()))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON, SI units."""
+        values = {name: plain(value) for name, value in vars(self).items() if name not in ("place", "spans")}
+        spans = [{"demonstration": d, "start": a, "end": b} for d, a, b in self.spans]
+        place = None if self.place is None else self.place.to_json()
+        return {**values, "size": self.size, "size_std": self.size_std, "spans": spans, "place": place}
+
+
+@dataclass(frozen=True)
+class BodyForce:
+    """The unexplained force and torque on one free body."""
+
+    body: str
+    rms: float
+    """Of the force [N]."""
+    noise: float
+    """RMS that the measurement noise alone leaves [N]."""
+    p: float
+    """Smallest p-value of its phases and dependences, corrected for their number."""
+    significant: bool
+    """After correction for the number of joints and bodies (Holm)."""
+    force: Dependences
+    torque: Dependences
+    phases: tuple[PhaseForce, ...]
+    """The most significant first."""
+    series: tuple[ForceSeries, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON, SI units."""
+        names = ("body", "rms", "noise", "p", "significant")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "force": dependences_json(self.force),
+            "torque": dependences_json(self.torque),
+            "phases": [phase.to_json() for phase in self.phases],
+            "series": [s.to_json() for s in self.series],
+        }
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where the model lacks forces."""
+
+    window: float
+    """Time over which forces are averaged [s]."""
+    joints: tuple[JointForce, ...]
+    """Most significant first."""
+    bodies: tuple[BodyForce, ...]
+    """Most significant first."""
+
+    def arrows(self) -> list[dict[str, Any]]:
+        """Return what to draw on the objects: significant forces that have a place, in the frame of their body.
+
+        Each with `body`, `phase`, `point` [m], `vector` [N], `std` [m] of the point, and a `label`.
+        """
+        return [
+            {
+                "body": body.body,
+                "phase": phase.phase,
+                "point": phase.place.point.tolist(),
+                "vector": phase.arrow.tolist(),
+                "std": phase.place.std.tolist(),
+                "label": f"{phase.size:.3g} N, {phase.phase}",
+            }
+            for body in self.bodies
+            for phase in body.phases
+            if phase.significant and phase.place is not None
+        ]
+
+    def sentences(self) -> list[str]:
+        """Return what was found, a sentence for each force."""
+        found = []
+        for joint in self.joints:
+            found.append(joint_sentence(joint))
+        for body in self.bodies:
+            shown = [phase for phase in body.phases if phase.significant]
+            found += [body_sentence(body.body, phase) for phase in shown]
+            for what, dependences, unit in (("force", body.force, "N"), ("torque", body.torque, "N m")):
+                if body.significant and dependences.patterns:
+                    found.append(pattern_sentence(f"{body.body}, {what}", dependences, unit))
+            if not shown and not body.significant:
+                found.append(
+                    f"{body.body}: nothing beyond noise (force {body.rms:.2g} N rms, noise {body.noise:.2g} N)."
+                )
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as one JSON object, SI units; numbers that are not finite are null."""
+        return finite(
+            {
+                "window": self.window,
+                "level": LEVEL,
+                "sentences": self.sentences(),
+                "joints": [joint.to_json() for joint in self.joints],
+                "bodies": [body.to_json() for body in self.bodies],
+                "arrows": self.arrows(),
+            }
+        )
+
+
+def dependences_json(found: Dependences) -> dict[str, Any]:
+    """Return dependences as JSON."""
+    return {
+        "dependences": [vars(d) for d in found.all],
+        "patterns": [{**vars(p), "alternatives": list(p.alternatives)} for p in found.patterns],
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return an array as a list, anything else as it is."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
