@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import mujoco
 import numpy as np
 
+from concent_warp.reality.expert import ExpertCfg
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.reality.rig import Rig, Trial
+from concent_warp.reality.rig import Rig, Trial, of_coarser_step
 from concent_warp.reality.sensing import SensingCfg
-from concent_warp.reality.world import HiddenEffect
-from concent_warp.recording.recording import Recording
+from concent_warp.reality.world import HiddenEffect, WorldCfg
+from concent_warp.recording.recording import Channel, Recording
+from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 TASK = ShapeSorterCfg(timestep=0.002)
+
+
+def drawing() -> Scene:
+    """Return the scene with objects as hard as time steps allow."""
+    spec = TASK.build().spec()
+    for body in ("block", "box"):
+        for geom in spec.body(body).geoms:
+            geom.solref = [2 * TASK.timestep, 1.0]
+    return Scene.from_spec(spec, source="insertion rig")
 
 
 def unplanned(rng: np.random.Generator, k: int) -> Trial:
@@ -24,15 +37,38 @@ def unplanned(rng: np.random.Generator, k: int) -> Trial:
 
 def record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed: int) -> Recording:
     """Record the expert; one seed of his own for each demonstration."""
-    cfg = RealityCfg(task=TASK, sensing=SensingCfg(encoder_std=5e-4))
-    recording, _ = record(cfg, [1000 * seed + k for k in range(demonstrations)], effects=tuple(effects))
-    return recording
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for joint, armature in PHYSICS.armature.items():
+            spec.joint(joint).armature += armature
+
+    cfg = RealityCfg(
+        task=TASK,
+        expert=ExpertCfg(speed=0.7),
+        world=WorldCfg(timestep=PHYSICS.timestep, solref=(0.003, 1.0)),
+        sensing=SensingCfg(encoder_std=5e-4, point_rate=5.0, point_count=16, tracking_std=5e-5),
+    )
+    seeds = [1000 * seed + k for k in range(demonstrations)]
+    recording, _ = record(cfg, seeds, effects=(HiddenEffect("finer step", edit=edit), *effects))
+    told = [
+        replace(d, measured={name: later(channel) for name, channel in d.measured.items()}, points={}, success=None)
+        for d in recording.demonstrations
+    ]
+    return Recording(SCENE.xml, tuple(told), source="reality rig insertion")
 
 
+def later(channel: Channel) -> Channel:
+    """Return measurements on the clock of the commands, which act earlier than told by the lead of coarser steps."""
+    return replace(channel, time=channel.time + PHYSICS.lead)
+
+
+SCENE = drawing()
+PHYSICS = of_coarser_step(SCENE)
 INSERTION = Rig(
     "insertion",
-    TASK.build(),
+    SCENE,
     unplanned,
+    PHYSICS,
     start="resting",
     body="block",
     surface="table",

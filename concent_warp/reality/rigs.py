@@ -13,6 +13,4 @@ from concent_warp.reality.rig_slide import SLIDE
 from concent_warp.reality.rig_spin import SPIN
 from concent_warp.reality.rig_tumble import TUMBLE
 
-RIGS: dict[str, Rig] = {
-    rig.name: rig for rig in (PENDULUM, ARM, SLIDE, SPIN, PUSH, DROP, TUMBLE, GRASP, INSERTION)
-}
+RIGS: dict[str, Rig] = {rig.name: rig for rig in (PENDULUM, ARM, SLIDE, SPIN, PUSH, DROP, TUMBLE, GRASP, INSERTION)}
