@@ -18,10 +18,24 @@ if TYPE_CHECKING:
 
 
 class Law:
-    """A force law with P parameters; what it acts on is fixed when it is made."""
+    """A force law with P parameters; what it acts on is fixed when it is made.
+
+    Two laws are equal where they are of one class and act on the same, so that what was captured for one serves both.
+    """
 
     edits: ClassVar[tuple[str, ...]] = ()
     """Fields of the compiled model that it overwrites."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self._acts_on() == other._acts_on()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __hash__(self) -> int:
+        return hash((type(self), self._acts_on()))
+
+    def _acts_on(self) -> tuple[tuple[str, Any], ...]:
+        """Return the public attributes, arrays as bytes."""
+        rows = sorted((name, value) for name, value in vars(self).items() if not name.startswith("_"))
+        return tuple((name, value.tobytes() if isinstance(value, np.ndarray) else value) for name, value in rows)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """Apply it in C MuJoCo.

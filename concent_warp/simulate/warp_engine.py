@@ -16,9 +16,9 @@ import warp as wp
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
-from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model
+from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, with_laws
 from concent_warp.simulate.mujoco_engine import quiet_warnings
-from concent_warp.simulate.warp_model import batchable, is_switch
+from concent_warp.simulate.warp_model import batchable, check_drag, is_switch
 from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, world_bytes
 
 if TYPE_CHECKING:
@@ -77,7 +77,12 @@ class WarpEngine:
             max_memory: Memory that the data of all worlds may take [bytes]; by default 40 % of what is free on a GPU,
                 2 GiB on a CPU.
             max_worlds: Worlds simulated at a time; by default what fits the memory.
+
+        Raises:
+            EngineError: The model holds an effect that needs the other engine.
         """
+        if foreign := sorted({a.effect.name for a in model.effects if "warp" not in a.effect.engines}):
+            raise EngineError(f"{', '.join(foreign)} cannot run on MuJoCo-Warp", fix="use MujocoEngine")
         self.model = model
         self.device = str(wp.get_device(device if device is not None else preferred_device()))
         self._compiled, self._sphere_geom = compile_model(model, collidable)
@@ -127,9 +132,12 @@ class WarpEngine:
         velocity or acceleration is not finite or beyond 1e10 is `diverged`, and its records are NaN from then on.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
+        variants = with_edited_fields(self._compiled, with_laws(self.model, self._compiled, variants))
+        run = replace(run, variants=variants)
         for name in variants.fields:
             if not batchable(name):
                 raise EngineError(f"{name} cannot vary between the worlds of MuJoCo-Warp", fix="use MujocoEngine")
+        check_drag(self._compiled, variants.fields)
         if self._buffers is None:
             self._buffers = self._first_buffers(run)
         self.repeats = self.limited = 0
@@ -152,9 +160,10 @@ class WarpEngine:
         program = self._program(run, len(rows))
         spheres = {name: pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
         fields = {name: pick(value, rows) for name, value in run.variants.fields.items()}
+        laws = [pick(values, rows) for _, values in run.variants.laws or ()]
         ctrl = run.ctrl[rows[: program.plan.commands] % len(run.ctrl)]
         qpos, qvel = pick(run.variants.qpos, rows), pick(run.variants.qvel, rows)
-        program.load(spheres, fields, qpos, qvel, ctrl, run.record)
+        program.load(spheres, fields, laws, qpos, qvel, ctrl, run.record)
         demand = program.run()
         if (grown := self._grown(self._buffers, demand, program)) is not None:
             self._buffers = grown
@@ -177,7 +186,8 @@ class WarpEngine:
     def _program(self, run: Run, worlds: int) -> Program:
         """Return a program for a run, a kept one if there is one."""
         assert self._buffers is not None
-        fields = run.variants.fields
+        fields, laws = run.variants.fields, run.variants.laws or ()
+        edited = edited_fields(run.variants)
         plan = Plan(
             worlds=worlds,
             steps=run.steps,
@@ -186,14 +196,18 @@ class WarpEngine:
             bodies=tuple(run.body_ids.tolist()),
             contacts=run.contacts,
             spheres=tuple(name for name in SPHERE_FIELDS if getattr(run.variants, name) is not None),
-            fields=tuple((name, is_switch(name) and bool((fields[name] != 0).any())) for name in sorted(fields)),
+            fields=tuple(
+                (name, is_switch(name) and (name in edited or bool((fields[name] != 0).any())))
+                for name in sorted(fields)
+            ),
+            laws=tuple((law, np.shape(values)[1]) for law, values in laws),
         )
         if plan in self._programs:
             self._programs.move_to_end(plan)
             return self._programs[plan]
         while len(self._programs) >= PROGRAMS:
             self._programs.popitem(last=False)
-        typical = {name: largest(value) for name, value in fields.items()}
+        typical = {name: largest(value) + (name in edited) for name, value in fields.items()}
         try:
             program = Program(self._compiled, self._sphere_geom, plan, self._buffers, typical, self.device)
         except RuntimeError as error:
@@ -307,6 +321,18 @@ def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
             contacts, constraints = max(contacts, d.ncon), max(constraints, d.nefc)
             total += d.ncon
     return contacts, constraints, total
+
+
+def edited_fields(variants: Variants) -> set[str]:
+    """Return the names of the model fields that force laws edit."""
+    return {name for law, _ in variants.laws or () for name in law.edits}
+
+
+def with_edited_fields(compiled: mujoco.MjModel, variants: Variants) -> Variants:
+    """Return the variants with a row a world of each field that force laws edit."""
+    shared = {name: getattr(compiled, name) for name in edited_fields(variants) - set(variants.fields)}
+    rows = {name: np.tile(value, (variants.count, *[1] * value.ndim)) for name, value in shared.items()}
+    return replace(variants, fields={**variants.fields, **rows})
 
 
 def rung(size: float) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.errors import EngineError
 from concent_warp.kernels import rollout as kernels
 from concent_warp.simulate.fields import CONSTANTS, SOURCES_OF_CONSTANTS, apply_fields, derived_constants
 from concent_warp.simulate.inputs import host
@@ -39,6 +40,9 @@ SWITCHES = (
 )
 SWITCHES = (*SWITCHES, "armature", "density", "viscosity", "wind")
 """Endings of field names whose physics MuJoCo-Warp compiles away where the model's values are all zero."""
+
+DRY = 1e-4
+"""Lengths [m] that drag does not notice."""
 
 FOLDED = ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly")
 """Fields to which MuJoCo-Warp adds the damping of actuators."""
@@ -170,6 +174,25 @@ def typical_model(compiled: mujoco.MjModel, fields: Mapping[str, np.ndarray]) ->
 def is_switch(name: str) -> bool:
     """Return whether physics may be switched off where all values of a field are zero."""
     return name.split("_")[-1].split(".")[-1] in SWITCHES
+
+
+def check_drag(compiled: mujoco.MjModel, fields: Mapping[str, Any]) -> None:
+    """Check that MuJoCo-Warp's drag of ellipsoids holds: it forgets the torque of shapes off their centre of mass.
+
+    Raises:
+        EngineError: A body meets a medium with such a shape, or with a centre of mass that varies.
+    """
+    if max(compiled.opt.density, compiled.opt.viscosity) <= 0 and not {"opt.density", "opt.viscosity"} & set(fields):
+        return
+    wet = np.flatnonzero((compiled.geom_fluid[:, 0] > 0) & (compiled.geom_rbound > DRY))
+    body = compiled.geom_bodyid[wet]
+    centred = np.abs(compiled.geom_pos[wet] - compiled.body_ipos[body]).max(axis=1, initial=0) < DRY
+    moving = compiled.body_weldid[body] != 0
+    if (moving & (~centred | ("body_ipos" in fields))).any():
+        names = sorted({compiled.body(b).name for b in body[moving]})
+        raise EngineError(
+            "MuJoCo-Warp's drag is wrong on shapes off their centre of mass", found=names, fix="use MujocoEngine"
+        )
 
 
 def batchable(name: str) -> bool:

@@ -7,8 +7,9 @@ belongs to the instant before the step, and that is where records and contacts a
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -20,6 +21,9 @@ from concent_warp.errors import EngineError
 from concent_warp.kernels import rollout as kernels
 from concent_warp.simulate.engine import Contacts
 from concent_warp.simulate.warp_model import WorldModel
+
+if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
 
 INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER: mjw.euler,
@@ -48,7 +52,9 @@ class Plan:
     spheres: tuple[str, ...]
     """Properties of the spheres that vary, `sphere_position` and so on."""
     fields: tuple[tuple[str, bool], ...]
-    """Model fields that vary, each with whether any value is not zero."""
+    """Model fields that vary, each with whether any value is not zero; those that laws edit are among them."""
+    laws: tuple[tuple[Law, int], ...] = ()
+    """Force laws, each with how many parameters it has."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +128,14 @@ class Program:
                     njmax_nnz=buffers.nonzeros,
                 )
                 self._make_records()
+                self._laws = [(law, wp.zeros((plan.worlds, count), dtype=float)) for law, count in plan.laws]
+                edited = sorted({name for law, _ in plan.laws for name in law.edits})
+                self._unedited = [(getattr(self.model, name), wp.clone(getattr(self.model, name))) for name in edited]
                 self._integrate = INTEGRATORS[mujoco.mjtIntegrator(compiled.opt.integrator)]
                 for part in (self._begin, self._step, self._begin, self._end):
                     part()
+            except EngineError:
+                raise
             except (NotImplementedError, ValueError) as error:
                 raise EngineError(
                     "MuJoCo-Warp cannot simulate this model", found=error, fix="use MujocoEngine"
@@ -159,13 +170,21 @@ class Program:
             self._value = wp.zeros((self.buffers.log_rows, 10), dtype=float)
 
     def load(
-        self, spheres: dict[str, Any], fields: dict[str, Any], qpos: Any, qvel: Any, ctrl: Any, record: np.ndarray
+        self,
+        spheres: dict[str, Any],
+        fields: dict[str, Any],
+        laws: Sequence[Any],
+        qpos: Any,
+        qvel: Any,
+        ctrl: Any,
+        record: np.ndarray,
     ) -> None:
         """Set the values of the next run.
 
         Args:
             spheres: The properties that the plan names, shape (N, S, ...).
             fields: The fields that the plan names, shape (N, ...).
+            laws: Parameters of the laws that the plan names, shape (N, P) each.
             qpos: Shape (N, nq) or None for the model's own.
             qvel: Shape (N, nv) or None for zero.
             ctrl: Shape (n, K, nu).
@@ -173,6 +192,10 @@ class Program:
         """
         m, tensor = self.model, self._world_model.tensor
         self._world_model.load(spheres, fields)
+        for field, unedited in self._unedited:
+            wp.copy(unedited, field)
+        for (_, values), given in zip(self._laws, laws, strict=True):
+            wp.to_torch(values).copy_(tensor(given))
         initial = wp.to_torch(m.qpos0) if qpos is None else tensor(qpos)
         wp.to_torch(self._qpos).copy_(initial.expand(self.plan.worlds, -1))
         if qvel is None:
@@ -240,6 +263,9 @@ class Program:
         wp.copy(d.qpos, self._qpos)
         wp.copy(d.qvel, self._qvel)
         self._world_model.place(d)
+        if self._laws:
+            d.qfrc_actuator.zero_()
+            d.qfrc_bias.zero_()
         self._clock.zero_()
         self._peak.zero_()
         self._unstable.fill_(self.plan.steps + 1)
@@ -265,6 +291,7 @@ class Program:
             inputs=[plan.steps, self._commands, self._clock],
             outputs=[d.ctrl],
         )
+        self._apply_laws()
         mjw.forward(m, d)
         widest = max(m.nq, m.nv, m.nsensordata, len(plan.bodies), 1)
         wp.launch(
@@ -288,6 +315,18 @@ class Program:
             ],
             outputs=self._records,
         )
+
+    def _apply_laws(self) -> None:
+        """Let force laws act on the coming step, from fields as they were loaded and no applied force."""
+        if not self._laws:
+            return
+        m, d = self.model, self.data
+        for field, unedited in self._unedited:
+            wp.copy(field, unedited)
+        d.qfrc_applied.zero_()
+        d.xfrc_applied.zero_()
+        for law, values in self._laws:
+            law.launch(m, d, values)
 
     def _take_contacts(self) -> None:
         """Keep what the plan asks for of this step's contacts."""
