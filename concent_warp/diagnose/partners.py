@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 MOST = 2
 """Things named at a time."""
 SHARE = 0.1
-"""What carries less than this share of the forces on a body is not named."""
+"""What carries less than this share of the forces on a body is not named, unless it is another object: what holds a
+body presses harder than what it is brought against."""
 LASTING = 0.15
 """What a body touches for less than this share of a span is not named."""
 SIDE = 0.85
@@ -84,8 +85,15 @@ class Partners:
         for e in np.unique(entity):
             name = self.name(int(e))
             found[name] = found.get(name, np.zeros(len(entity), dtype=bool)) | (entity == e)
-        strong = [name for name, mask in found.items() if force[mask].sum() >= SHARE * force.sum()]
-        strong.sort(key=lambda name: (ORDER[self.roles.body_role[other[found[name]][0]]], -force[found[name]].sum()))
+        role = {name: self.roles.body_role[other[mask][0]] for name, mask in found.items()}
+        lasting = {name: len(np.unique(rows.step[mask])) * self.motion.timestep for name, mask in found.items()}
+        strong = [
+            name
+            for name, mask in found.items()
+            if force[mask].sum() >= SHARE * force.sum()
+            or (role[name] == "object" and lasting[name] >= LASTING * (end - start))
+        ]
+        strong.sort(key=lambda name: (ORDER[role[name]], -force[found[name]].sum()))
         names = []
         for name in strong[:MOST]:
             mask = found[name]
@@ -101,7 +109,9 @@ class Partners:
         found = self.roles.entities[entity]
         own = mujoco.mj_name2id(self.compiled, mujoco.mjtObj.mjOBJ_GEOM, found.name) >= 0
         if own and found.name not in self.spheres and found.name != found.body:
-            return found.name if found.body == "world" else f"{found.body}'s {found.name}"
+            return (
+                found.name if found.body == "world" else f"{found.body}'s {found.name.removeprefix(f'{found.body}_')}"
+            )
         return "the surroundings" if found.body == "world" else found.body
 
     def spot(self, body: int, rows: Touches, force: np.ndarray) -> str:

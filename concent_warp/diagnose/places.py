@@ -27,7 +27,7 @@ LEAST = 3.0
 SLACK = 0.5
 """Rises of the error by less than this many times the noise count as falling on [-]."""
 EACH = 3
-"""Places of one channel in one demonstration."""
+"""Places of one channel in one demonstration, and places that are alike in several of them."""
 MOST = 20
 """Places kept in all."""
 QUIET = 0.01
@@ -119,12 +119,20 @@ def worst_places(
 
 
 def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
-    """Return the worst of the places of all demonstrations, the worst first, each with how often it recurs."""
+    """Return the worst of the places of all demonstrations, the worst first, each with how often it recurs.
+
+    Of places that are alike in many demonstrations the worst few are kept, so that there is room for others.
+    """
     seen: dict[tuple, set[str]] = {}
     for place in places:
         seen.setdefault(alike(place), set()).add(place.demonstration)
-    order = sorted(places, key=severity, reverse=True)[:most]
-    return tuple(replace(place, recurs=len(seen[alike(place)])) for place in order)
+    kept: list[Place] = []
+    count: dict[tuple, int] = {}
+    for place in sorted(places, key=severity, reverse=True):
+        count[alike(place)] = count.get(alike(place), 0) + 1
+        if count[alike(place)] <= EACH and len(kept) < most:
+            kept.append(replace(place, recurs=len(seen[alike(place)])))
+    return tuple(kept)
 
 
 def alike(place: Place) -> tuple:

@@ -19,7 +19,7 @@ from concent_warp.report.diagnosis import diagnosis_section
 from concent_warp.report.headline import cards, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
-from concent_warp.report.where import noise_words, place_list
+from concent_warp.report.where import noise_words, place_list, shown_demonstrations
 
 if TYPE_CHECKING:
     from concent_warp.fit.geometry import FitResult
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Recording
 
 MOST_DEMONSTRATIONS = 6
-"""Demonstrations with charts and replay; further ones are in the tables alone, so that the page stays small."""
+"""Demonstrations with charts and replay, those with the worst places before others; further ones are in the tables
+alone, so that the page stays small."""
 
 
 def write_report(
@@ -59,21 +60,21 @@ def write_report(
     """
     events, overlap = events or {}, overlap or {}
     shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
-    shown_demonstrations = [recording[name] for name in comparison.demonstrations[:MOST_DEMONSTRATIONS]]
-    data = page_data(shown_models, shown_demonstrations, comparison, events, fit)
+    chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
+    data = page_data(shown_models, chosen, comparison, events, fit)
     parts = {
         "title": escape(title(recording, fit)),
         "subtitle": escape(subtitle(recording, comparison, fitted)),
         "verdict": escape(verdict(comparison, fitted, overlap)),
         "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap)),
-        "demonstration_options": options([d.name for d in shown_demonstrations]),
+        "demonstration_options": options([d.name for d in chosen]),
         "channel_options": options(ordered_channels(comparison)),
         "model_keys": "".join(
             f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
         )
         + '<span class="key noise"></span>noise floor',
         "diagnosis": diagnosis_section(diagnosis),
-        "where": where_section(comparison, [d.name for d in shown_demonstrations]),
+        "where": where_section(comparison, [d.name for d in chosen]),
         "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (
             "How far the simulation is from the measurement at each instant of the replay. The bands are "
@@ -190,7 +191,11 @@ def subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]
 def left_out(comparison: Comparison) -> str:
     """Return which demonstrations have no charts."""
     more = len(comparison.demonstrations) - MOST_DEMONSTRATIONS
-    return f"Charts and replay show the first {MOST_DEMONSTRATIONS}; {more} more are in the tables." if more > 0 else ""
+    return (
+        f"Charts and replay show {MOST_DEMONSTRATIONS} demonstrations; {more} more are in the tables."
+        if more > 0
+        else ""
+    )
 
 
 def options(names: Sequence[str]) -> str:

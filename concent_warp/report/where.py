@@ -24,6 +24,13 @@ def numbered(comparison: Comparison) -> list[tuple[int, Place]]:
     return found
 
 
+def shown_demonstrations(comparison: Comparison, most: int) -> tuple[str, ...]:
+    """Return the demonstrations to show, in their order: those with the worst places, then the first ones."""
+    worst = [place.demonstration for _, place in numbered(comparison)]
+    chosen = list(dict.fromkeys([*worst, *comparison.demonstrations]))[:most]
+    return tuple(d for d in comparison.demonstrations if d in chosen)
+
+
 def place_list(comparison: Comparison, shown: Collection[str]) -> str:
     """Return the worst places as a list; those in a demonstration that is `shown` can be clicked."""
     places = numbered(comparison)
@@ -49,4 +56,6 @@ def noise_words(comparison: Comparison) -> str:
     for channel in comparison.channels:
         source = comparison.summarise(comparison.after, channel).source
         found.setdefault(WORDS[source], []).append(words(channel))
+    if len(found) == 1:
+        return f"Noise: {next(iter(found))}."
     return " ".join(f"Noise of {', '.join(channels)}: {how}." for how, channels in found.items())

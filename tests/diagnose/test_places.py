@@ -8,7 +8,7 @@ import pytest
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.noise import Kind
 from concent_warp.diagnose.phases import Phase
-from concent_warp.diagnose.places import LEAST, channel_places, smoothed, worst_places
+from concent_warp.diagnose.places import LEAST, channel_places, ranked, smoothed, worst_places
 from concent_warp.diagnose.residuals import Residual
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -174,3 +174,12 @@ def test_places_are_in_the_json_with_their_sentence(pushed):
     assert [p["sentence"] for p in document["places"]] == [p.sentence(demonstration=True) for p in pushed.places]
     assert document["phases_are"] == "ways of moving"
     assert document["summaries"][0]["ratio"] > 3
+
+
+def test_places_alike_in_many_demonstrations_leave_room_for_others():
+    place = next(channel_places(residual(bump(1, 0.1, 4e-3)), PHASES, None, "d"))
+    many = [replace(place, demonstration=f"demo_{i}", ratio=50.0 + i) for i in range(30)]
+    other = replace(place, channels=("lid_position",), demonstration="demo_3", ratio=5.0)
+    found = ranked([other, *many])
+    assert [p.ratio for p in found] == [79, 78, 77, 5]
+    assert [p.recurs for p in found] == [30, 30, 30, 1]

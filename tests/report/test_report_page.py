@@ -14,7 +14,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.report.report import filled, write_report
 from concent_warp.report.scene_data import scene_bodies
-from concent_warp.report.where import numbered
+from concent_warp.report.where import numbered, shown_demonstrations
 from concent_warp.scene.scene import Scene
 
 PENDULUM = """
@@ -161,6 +161,15 @@ def test_the_worst_places_stand_in_the_page_and_can_be_clicked(case, text, data)
     assert {p["demonstration"] for p in data["places"]} <= {d["name"] for d in data["demonstrations"]}
 
 
+def test_demonstrations_with_the_worst_places_are_shown_before_others(case):
+    from dataclasses import replace
+
+    names = tuple(f"demo_{i}" for i in range(9))
+    place = case.comparison.places[0]
+    many = replace(case.comparison, demonstrations=names, places=(replace(place, demonstration="demo_7"),))
+    assert shown_demonstrations(many, 3) == ("demo_0", "demo_1", "demo_7")
+
+
 def test_a_place_points_from_the_model_to_the_measurement(case, data):
     arrows = [p for p in data["places"] if p["arrow"]]
     assert arrows
@@ -187,7 +196,7 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     text = (tmp_path / "r.html").read_text()
     assert "as much as the measurement noise alone would leave" in text
     assert "Nowhere does the error stand above 3 times the noise" in text
-    assert "Noise of angle: stated in the recording." in text
+    assert "Noise: stated in the recording." in text
     assert embedded(tmp_path / "r.html")["places"] == []
 
 
