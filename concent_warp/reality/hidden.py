@@ -1,12 +1,9 @@
-"""Every hidden effect by name, single or several at once, and of three sizes on each rig that shows it.
+"""Every hidden effect by name.
 
 Each is made by means of its own, so that finding it is not reading the same code backwards.
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from dataclasses import dataclass
 
 from concent_warp.reality.hidden_case import Builder, Hidden
 from concent_warp.reality.hidden_contact import CONTACT
@@ -35,16 +32,3 @@ def hidden(name: str, magnitude: float, rig: Rig) -> Hidden:
         KeyError: There is no such effect.
     """
     return EVERY[name](rig, magnitude)
-
-
-@dataclass(frozen=True)
-class Case:
-    """Effects hidden in a rig."""
-
-    rig: str
-    magnitudes: Mapping[str, float]
-    """Value of the main parameter of each effect, by name; none where nothing is hidden."""
-
-    def build(self, rig: Rig) -> tuple[Hidden, ...]:
-        """Return the effects."""
-        return tuple(hidden(name, magnitude, rig) for name, magnitude in self.magnitudes.items())

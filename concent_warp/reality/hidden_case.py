@@ -39,14 +39,16 @@ class Drive:
     """Stiffness [N m/rad or N/m]."""
     kv: float
     """Damping [N m s/rad or N s/m]."""
+    limit: float
+    """Largest force [N m or N]."""
     weight: float
     """Strength against that of the strongest drive [-]: what friction and inertia of a size are for one of them."""
 
     def error_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
-        """Return the force that the servo commands at this state, unlimited [N m or N]."""
+        """Return the force that the servo exerts at this state [N m or N]."""
         joint = model.joint(self.joint)
         error = data.ctrl[model.actuator(self.actuator).id] - data.qpos[joint.qposadr[0]]
-        return float(self.kp * error - self.kv * data.qvel[joint.dofadr[0]])
+        return float(np.clip(self.kp * error - self.kv * data.qvel[joint.dofadr[0]], -self.limit, self.limit))
 
 
 def drives(rig: Rig) -> tuple[Drive, ...]:
@@ -60,7 +62,7 @@ def drives(rig: Rig) -> tuple[Drive, ...]:
         kp, kv = m.actuator_gainprm[a, 0], -m.actuator_biasprm[a, 2]
         found.append((m.actuator(a).name, joint, float(kp), float(kv), float(m.actuator_forcerange[a, 1])))
     top = max((f[-1] for f in found), default=1.0)
-    return tuple(Drive(*f[:4], weight=f[-1] / top) for f in found)
+    return tuple(Drive(*f, weight=f[-1] / top) for f in found)
 
 
 class Fresh:

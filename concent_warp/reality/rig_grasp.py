@@ -12,6 +12,8 @@ HALF = 0.02
 """Half size of the block [m]."""
 OPEN = 0.035
 """Commanded opening of each finger before the grasp [m]."""
+CLOSED = 0.011
+"""And in it: less than the block's half size, so that stiffness times the difference holds it."""
 XML = f"""
 <mujoco model="grasp">
   <compiler angle="radian"/>
@@ -87,9 +89,9 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
     z += [hold(high, 0.5), glide(high, LOW + 0.0005, 1.0), hold(LOW + 0.0005, 1.0)]
     command = {"drive_x": np.concatenate(x), "drive_z": np.concatenate(z)}
     count = len(command["drive_x"])
-    grip = [hold(OPEN, 0.3), glide(OPEN, 0.004, 0.7)]
+    grip = [hold(OPEN, 0.3), glide(OPEN, CLOSED, 0.7)]
     held = count - sum(map(len, grip)) - round(0.7 * RATE)
-    grip += [hold(0.004, held / RATE), glide(0.004, OPEN, 0.4), hold(OPEN, 0.3)]
+    grip += [hold(CLOSED, held / RATE), glide(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
     command["gripper"] = np.concatenate(grip)
     time = np.arange(count) / RATE
     place = rng.uniform(-0.003, 0.003, 2)
