@@ -15,7 +15,7 @@ from concent_warp.diagnose.bootstrap import RULE
 from concent_warp.diagnose.comparison import Comparison, finite
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import write_text
-from concent_warp.report.diagnosis import diagnosis_section
+from concent_warp.report.diagnosis import bullet_list, diagnosis_section
 from concent_warp.report.headline import cards, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
@@ -43,6 +43,7 @@ def write_report(
     overlap: Mapping[str, Mapping[str, float]] | None = None,
     settings: Mapping[str, Any] | None = None,
     diagnosis: Mapping[str, Any] | None = None,
+    location: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report, in one piece or not at all.
 
@@ -57,11 +58,13 @@ def write_report(
         overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
         settings: ``command``, ``versions`` and ``settings`` to show.
         diagnosis: JSON object of a diagnosis (`concent_warp.report.diagnosis`).
+        location: JSON object of a location (`concent_warp.diagnose.location.Location.to_json`).
     """
     events, overlap = events or {}, overlap or {}
     shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
     chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
     data = page_data(shown_models, chosen, comparison, events, fit)
+    data["forces"] = forces(data, location)
     parts = {
         "title": escape(title(recording, fit)),
         "subtitle": escape(subtitle(recording, comparison, fitted)),
@@ -89,6 +92,7 @@ def write_report(
         "follow_options": options(follow_order(data, comparison)) + '<option value="">the scene</option>',
         "replay_views": views("replay", comparison, shown_models),
         "sphere_switch": SPHERE_SWITCH if data["geometry"] else "",
+        "forces": forces_section(data["forces"], location),
         "geometry": geometry_section(data, comparison, shown_models),
         "fit": fit_section(fit),
         "tables_about": escape(
@@ -127,6 +131,21 @@ def where_section(comparison: Comparison, shown: Sequence[str]) -> str:
 def bands(comparison: Comparison) -> str:
     """Return what the phases of a comparison are."""
     return "the contact stages" if comparison.staged else "the ways of moving"
+
+
+def forces(data: Mapping[str, Any], location: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    """Return the unexplained forces that can be drawn: those on bodies of the scene."""
+    known = {body["name"] for body in data["bodies"]}
+    return [dict(arrow) for arrow in (location or {}).get("arrows", ()) if arrow["body"] in known]
+
+
+def forces_section(arrows: Sequence[Mapping[str, Any]], location: Mapping[str, Any] | None) -> str:
+    """Return the section of unexplained forces, empty where they were not looked for."""
+    if not location:
+        return ""
+    bodies = list(dict.fromkeys(arrow["body"] for arrow in arrows))
+    view = filled(page_file("forces_view.html"), {"bodies": options(bodies)}) if bodies else ""
+    return filled(page_file("forces.html"), {"views": view, "sentences": bullet_list(location.get("sentences", ()))})
 
 
 def geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:

@@ -54,6 +54,21 @@ DIAGNOSIS = {
 }
 
 
+LOCATION = {
+    "arrows": [
+        {
+            "body": "block",
+            "phase": "slide",
+            "point": [-0.03, 0.02, 0.0],
+            "vector": [0.4, 0.0, 0.1],
+            "std": [0.002, 0.001, 0.003],
+            "label": "0.412 N, slide",
+        }
+    ],
+    "sentences": ["block: 0.4 N along +x during slide, at its <-x> face"],
+}
+
+
 def push(name, far):
     """The pusher drives the block against the stop; measured with exact boxes."""
     m = mujoco.MjModel.from_xml_string(XML)
@@ -119,6 +134,7 @@ class Case:
             fitted=("demo_0",),
             overlap={"before": {"demo_0": 0.41}, "after": {"demo_0": 0.93}},
             diagnosis=DIAGNOSIS,
+            location=LOCATION,
             settings={"command": "concent fit <demo.h5>", "versions": {"mujoco": "3"}, "settings": {"seed": 7}},
         )
 

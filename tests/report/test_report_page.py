@@ -200,6 +200,20 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     assert embedded(tmp_path / "r.html")["places"] == []
 
 
+def test_unexplained_forces_are_told_and_drawn_where_there_are_any(case, text, data, tmp_path):
+    assert "at its &lt;-x&gt; face" in text
+    assert [f["label"] for f in data["forces"]] == ["0.412 N, slide"]
+    assert 'id="forces-view"' in text
+    models = {"model": case.after}
+    found = compare(models, case.recording, "mujoco")
+    write_report(tmp_path / "r.html", case.recording, models, found, location={"arrows": [], "sentences": ["nothing"]})
+    page = (tmp_path / "r.html").read_text()
+    assert "<li>nothing</li>" in page
+    assert 'id="forces-view"' not in page
+    write_report(tmp_path / "r.html", case.recording, models, found)
+    assert 'id="lacking"' not in (tmp_path / "r.html").read_text()
+
+
 def test_spheres_are_told_apart_by_what_became_of_them(case, data):
     geometry = data["geometry"]
     state = np.array(geometry["state"])

@@ -232,6 +232,33 @@ function setUpGeometry() {
   aim();
 }
 
+// ---- unexplained forces --------------------------------------------------------------------------------------------
+function forceItems() {
+  const name = $("forces-body").value, body = data.bodies.find((b) => b.name === name), items = [], reach = data.view.bodies[name]?.distance / 10 || 0.05;
+  for (const geom of body.geoms) items.push(...geomItems(geom, [0, 0, 0], IDENTITY, [...geom.colour.slice(0, 3), 0.5]));
+  const most = Math.max(...data.forces.map((f) => Vec.length(f.vector)), 1e-12), colour = [...COLOURS.place, 1];
+  for (const f of data.forces.filter((f) => f.body === name)) {
+    const way = Vec.unit(f.vector), length = reach * (0.4 + 0.6 * Vec.length(f.vector) / most), q = alongZ(way);
+    const spread = Math.min(0.25 * reach, Math.max(0.02 * reach, ...f.std.map((s) => s || 0)));
+    items.push({ ...ball(f.point, spread, [...COLOURS.place, 0.999]), above: true });
+    items.push({ shape: "cylinder", position: Vec.plus(f.point, way, length / 2), quaternion: q, scale: [0.02 * reach, 0.02 * reach, length / 2], colour, above: true });
+    items.push({ shape: "cone", position: Vec.plus(f.point, way, length), quaternion: q, scale: [0.06 * reach, 0.06 * reach, 0.08 * reach], colour, above: true });
+  }
+  return items;
+}
+function setUpForces() {
+  if (!$("forces-view")) return;
+  const camera = new Camera([0, 0, 0], 0.2, -0.9, 0.5);
+  const aim = () => {
+    const name = $("forces-body").value;
+    $("forces-labels").textContent = data.forces.filter((f) => f.body === name).map((f) => f.label).join(" · ");
+    camera.aim([0, 0, 0], 5 * (data.view.bodies[name]?.distance / 10 || 0.05));
+  };
+  new View($("forces-view"), camera, meshes, forceItems);
+  $("forces-body").addEventListener("change", aim);
+  aim();
+}
+
 // ---- fit -----------------------------------------------------------------------------------------------------------
 function drawFit() {
   if (!data.history.length) return;
@@ -277,6 +304,7 @@ $("ghost").addEventListener("change", (e) => { state.ghost = e.target.checked; r
 $("mark")?.addEventListener("change", (e) => { state.mark = e.target.checked; replayViews.forEach((v) => v.refresh()); });
 window.addEventListener("resize", () => { drawTimeline(); drawErrors(); drawSchedule(); });
 setUpGeometry();
+setUpForces();
 drawFit();
 state.log = $("log").checked;
 const first = data.demonstrations.find((d) => d.name === data.places[0]?.demonstration) || data.demonstrations[0];
