@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
+from concent_warp.fit.faces import Faces
 from concent_warp.fit.objective import Candidates
 from concent_warp.fit.perturbation import Noise, Perturbation, smoothed
 from concent_warp.scene.contact_geometry import ContactGeometry
@@ -23,19 +23,23 @@ class EvolutionCfg:
     Chamfer distance (both directions together), at most `max_sigma`: far from the goal large steps, near it small."""
     max_sigma: float = 3e-3
     """Largest standard deviation that is chosen by itself [m]."""
-    sigma_decay: float = 0.98
+    sigma_decay: float = 0.975
     """Factor on sigma from one generation to the next."""
     length: float = 0.03
     """Length scale of the RBF kernel [m]: how far a dent reaches."""
     noise: Noise = "gaussian_process"
     """Gaussian-process samples; "centroid" is the paper's wording taken literally; "independent" for comparison."""
     swelling: float = 1.0
-    """Displacement along the outward normals, common to a region, relative to sigma; 0 for none."""
+    """Displacement outward, of all faces of a region by the same distance, relative to sigma; 0 for none."""
     swelling_length: float = 0.1
     """Length over which the swelling varies [m]."""
-    swelling_along: Literal["normals", "faces"] = "faces"
-    """Swell along outward unit vectors averaged over neighbours, or so that all faces of a body move by the same
-    distance, which keeps edges sharp and faces flat where the size is wrong."""
+    flat_start: bool = True
+    """Flatten the faces of the starting geometry unless that makes the replay worse: noise of single spheres, which
+    one demonstration cannot tell from the truth, goes."""
+    flattening: float = 0.1
+    """Share by which each generation takes the roughness out of the faces inside the mask; 0 for none."""
+    face_length: float = 0.03
+    """Length over which a face is flat [m]: its distance from the nominal surface varies linearly."""
     antithetic: bool = True
     """Draw candidates in pairs of opposite displacement."""
     elite_share: float = 0.25
@@ -59,6 +63,11 @@ class EvolutionCfg:
     friction_sigma: float = 0.1
     """Standard deviation of the logarithm of a friction coefficient."""
 
+    @property
+    def flattens(self) -> bool:
+        """Whether faces matter."""
+        return self.flat_start or self.flattening > 0
+
     def scales(self, sigma: float) -> np.ndarray:
         """Return the standard deviation of each channel in the first generation, shape (C,); `sigma` is in m."""
         radius = [self.radius_sigma] if self.fit_radius else []
@@ -76,9 +85,14 @@ class Evolution:
     Channels are x, y, z [m], then the logarithms of radius and friction where these are fitted.
     """
 
-    def __init__(self, start: ContactGeometry, normals: np.ndarray, cfg: EvolutionCfg) -> None:
-        """Start at the given geometry, whose spheres' outward unit vectors are `normals` (S, 3)."""
-        self.start, self.normals, self.cfg = start, normals, cfg
+    def __init__(
+        self, start: ContactGeometry, growth: np.ndarray, cfg: EvolutionCfg, faces: Faces | None = None
+    ) -> None:
+        """Start at the given geometry, whose spheres move by `growth` (S, 3) where their body grows by one.
+
+        `faces` are those of the starting geometry; without them the estimate is not flattened.
+        """
+        self.start, self.growth, self.cfg, self.faces = start, growth, cfg, faces
         self.sigma = cfg.max_sigma if cfg.sigma is None else cfg.sigma
         self.mean = np.zeros((len(start), len(cfg.scales(self.sigma))))
         self.generation = 0
@@ -101,7 +115,7 @@ class Evolution:
             mask,
             cfg.noise,
             cfg.length,
-            normals=self.normals,
+            growth=self.growth,
             swelling=cfg.swelling,
             swelling_length=cfg.swelling_length,
         )
@@ -122,6 +136,10 @@ class Evolution:
             if cfg.mean_smoothing > 0:
                 step = smoothed(self.geometry(self.mean), mask, step, cfg.mean_smoothing)
             self.mean = self.bounded(self.mean + step)
+        if self.faces is not None and cfg.flattening > 0:
+            flatter = self.mean.copy()
+            flatter[mask, :3] += cfg.flattening * self.faces.flattening(self.mean[:, :3])[mask]
+            self.mean = self.bounded(flatter)
         self.generation += 1
 
     def bounded(self, values: np.ndarray) -> np.ndarray:

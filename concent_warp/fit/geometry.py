@@ -14,10 +14,10 @@ import numpy as np
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
+from concent_warp.fit.faces import Faces, flattened
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
 from concent_warp.fit.offset import offset_directions
-from concent_warp.fit.perturbation import outward
 from concent_warp.fit.target import Segment, observed_states, whole
 from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
@@ -30,6 +30,8 @@ GRIP = 5e-4
 """A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
 GAIN = 1e-3
 """Relative fall of the distance below which an estimate does not count as better."""
+WORSE = 0.1
+"""Share by which flattening may raise the distance; where it raises it by more, the faces stay as they are."""
 TURN = np.radians(1.0) / 1e-3
 """Turn of a jittered body relative to its displacement [rad/m]."""
 
@@ -39,9 +41,9 @@ class FitCfg:
     """Settings of a fit."""
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
-    generations: int = 90
+    generations: int = 70
     """Generations at most."""
-    patience: int = 20
+    patience: int = 12
     """Generations without a better estimate, on the frames of the fit or on the held-out ones, after which it ends."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
@@ -60,7 +62,7 @@ class FitCfg:
     turns of 1 degree a millimetre. All candidates share them; they keep the fit from what works on one path only."""
     squared: bool = False
     """Squared form of the Chamfer distance."""
-    reach: float = 0.006
+    reach: float = 0.004
     """Spheres that stay farther than this from everything else [m] are left out of the collisions of the search."""
     seed: int = 0
     """Seed of all random draws."""
@@ -95,6 +97,20 @@ class FitResult:
     """Spheres that have moved, shape (S,) bool."""
     stopped: str
     """Why the fit ended."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a replay of an estimate with all spheres shows."""
+
+    mask: np.ndarray
+    """Spheres that may move, shape (S,) bool."""
+    reachable: np.ndarray
+    """Spheres that may come into contact, shape (S,) bool."""
+    loss: float
+    """Chamfer distance over what the fit may use [m]."""
+    held_out: float
+    """Chamfer distance over what it is kept from [m]."""
 
 
 def fit_geometry(
@@ -169,11 +185,9 @@ class Search:
         assert model.geometry is not None
         self.model, self.segments, self.cfg = model, segments, cfg
         self.engine_name: EngineName = engine
-        if cfg.evolution.swelling_along == "faces":
-            normals = offset_directions(model.geometry, model.scene)
-        else:
-            normals = outward(model.geometry, model.scene, cfg.evolution.length / 2)
-        self.evolution = Evolution(model.geometry, normals, cfg.evolution)
+        growth = offset_directions(model.geometry, model.scene)
+        faces = Faces(model.geometry, model.scene, cfg.evolution.face_length) if cfg.evolution.flattens else None
+        self.evolution = Evolution(model.geometry, growth, cfg.evolution, faces)
         self.rng = np.random.default_rng(cfg.seed)
         self.robot = robot_bodies(model.scene.model)
         weld = np.array([model.scene.model.body(name).weldid[0] for name in model.geometry.bodies])
@@ -196,18 +210,16 @@ class Search:
         start = time.perf_counter()
         cfg, evolution = self.cfg, self.evolution
         segments = self.draw()
-        mask, reachable, loss, held_out = self.survey([*segments, *self.held_out])
+        survey = self.survey([*segments, *self.held_out])
         if evolution.generation == 0:
-            evolution.scale_to(np.sqrt(loss) if cfg.squared else loss)
-        if held_out < (1 - GAIN) * self.best or loss < (1 - GAIN) * self.lowest:
-            self.last_gain = evolution.generation
-        self.lowest = min(loss, self.lowest)
-        if held_out < self.best:
-            self.best, self.best_mean = held_out, evolution.mean.copy()
+            survey = self.flattened(survey, [*segments, *self.held_out])
+            evolution.scale_to(np.sqrt(survey.loss) if cfg.squared else survey.loss)
+        self.note(survey)
+        mask, loss, held_out = survey.mask, survey.loss, survey.held_out
         values = evolution.ask(mask, self.rng)
-        objective = self.objective(self.prepared(reachable | mask), self.jittered(segments))
+        objective = self.objective(self.prepared(survey.reachable | mask), self.jittered(segments))
         losses = objective(evolution.candidates(values))
-        self.simulations += (1 + len(values)) * len(segments) + len(self.held_out)
+        self.simulations += len(values) * len(segments)
         sigma = evolution.sigma * evolution.shrink
         evolution.tell(values, losses.fit, mask)
         self.seconds += time.perf_counter() - start
@@ -229,6 +241,35 @@ class Search:
             self.stopped = f"all {cfg.generations} generations done"
         elif evolution.generation - self.last_gain > cfg.patience:
             self.stopped = f"no better estimate for {cfg.patience} generations"
+        if self.stopped is not None:
+            self.note(self.survey([*segments, *self.held_out]))
+            self.history[-1]["best"] = self.best
+
+    def note(self, survey: Survey) -> None:
+        """Keep the estimate if it is the best so far."""
+        if survey.held_out < (1 - GAIN) * self.best or survey.loss < (1 - GAIN) * self.lowest:
+            self.last_gain = self.evolution.generation
+        self.lowest = min(survey.loss, self.lowest)
+        if survey.held_out < self.best:
+            self.best, self.best_mean = survey.held_out, self.evolution.mean.copy()
+
+    def flattened(self, rough: Survey, segments: list[Segment]) -> Survey:
+        """Flatten the faces of the starting geometry, unless what was observed speaks against it.
+
+        Args:
+            rough: What the geometry does as it is.
+            segments: Segments of this generation, then those held out.
+        """
+        evolution = self.evolution
+        if evolution.faces is None or not self.cfg.evolution.flat_start:
+            return rough
+        before, flat = evolution.mean.copy(), flattened(evolution.start, evolution.faces)
+        evolution.mean[:, :3] = flat.position - evolution.start.position
+        survey = self.survey(segments)
+        if survey.loss <= (1 + WORSE) * rough.loss and survey.held_out <= (1 + WORSE) * rough.held_out:
+            return survey
+        evolution.mean = before
+        return rough
 
     def draw(self) -> list[Segment]:
         """Return the segments that the candidates of this generation are tried on."""
@@ -256,15 +297,11 @@ class Search:
             result.append(replace(segment, qpos=qpos))
         return result
 
-    def survey(self, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray, float, float]:
+    def survey(self, segments: list[Segment]) -> Survey:
         """Replay the estimate with all spheres.
 
         Args:
             segments: Segments of this generation, then those held out.
-
-        Returns:
-            Spheres that may move and spheres that may come into contact, each (S,) bool; the estimate's Chamfer
-            distance over what the fit may use, and over what it is kept from [m].
         """
         values = self.evolution.mean[None]
         geometry = self.evolution.geometry(values[0])
@@ -289,7 +326,8 @@ class Search:
             self.frozen |= spheres_near(current, seen, GRIP)[:, self.robot].any(axis=1) & self.movable
         mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
         reachable = spheres_near(current, states, self.cfg.reach).any(axis=1)
-        return mask, reachable | touched | gripped, loss, held_out
+        self.simulations += len(segments)
+        return Survey(mask, reachable | touched | gripped, loss, held_out)
 
     def prepared(self, needed: np.ndarray) -> Engine:
         """Return an engine with at least the needed spheres collidable."""

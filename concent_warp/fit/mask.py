@@ -76,7 +76,7 @@ def spheres_near(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
     spheres = set(names)
     for geom in spec.geoms:
         if geom.name in spheres:
-            geom.gap = reach  # contacts within margin + gap are found; those beyond the margin carry no force
+            geom.gap = reach  # contacts within margin + gap are found, which add up over the two geoms of a pair
     compiled = spec.compile()
     sphere = np.full(compiled.ngeom, -1)
     sphere[[compiled.geom(name).id for name in names]] = np.arange(len(names))
@@ -86,7 +86,8 @@ def spheres_near(model: Model, states: np.ndarray, reach: float) -> np.ndarray:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(compiled, data)
         mujoco.mj_collision(compiled, data)
-        for one, other in (data.contact.geom.T, data.contact.geom.T[::-1]):
+        pairs = data.contact.geom[data.contact.dist <= reach].T
+        for one, other in (pairs, pairs[::-1]):
             is_sphere = sphere[one] >= 0
             result[sphere[one[is_sphere]], compiled.geom_bodyid[other[is_sphere]]] = True
     return result

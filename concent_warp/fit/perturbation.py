@@ -5,8 +5,8 @@ that is one translation of each object; what deforms surfaces smoothly is a samp
 covariance is the same RBF kernel. Both are here, and independent noise for comparison.
 
 A third of the matter is size: spheres centred on a surface inflate the object everywhere, and undoing this takes a
-motion of all spheres along their outward normals that random dents seldom add up to. So each sample may also hold a
-swelling: a displacement along the normals whose size varies over a longer distance.
+motion of all spheres inward that random dents seldom add up to. So each sample may also hold a swelling: a displacement
+of all faces by the same distance (`offset`), which varies over a longer length.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from typing import Literal
 import numpy as np
 
 from concent_warp.scene.contact_geometry import ContactGeometry
-from concent_warp.scene.scene import Scene
-from concent_warp.scene.surface import Surface
 
 Noise = Literal["gaussian_process", "centroid", "independent"]
 JITTER = 1e-6
@@ -33,7 +31,7 @@ class Perturbation:
         kind: Noise,
         length: float,
         *,
-        normals: np.ndarray | None = None,
+        growth: np.ndarray | None = None,
         swelling: float = 0.0,
         swelling_length: float = 0.05,
     ) -> None:
@@ -44,12 +42,12 @@ class Perturbation:
             mask: Spheres that may move, shape (S,) bool.
             kind: Gaussian-process sample, the paper's literal reading, or independent noise.
             length: Length scale of the RBF kernel [m].
-            normals: Outward unit vectors of the spheres, shape (S, 3); needed for swelling.
+            growth: Displacement of each sphere where its body grows by one, shape (S, 3); needed for swelling.
             swelling: Standard deviation of the swelling, relative to that of the rest.
             swelling_length: Length scale over which the swelling varies [m].
         """
         self.shape = len(geometry)
-        self.normals, self.swelling = normals, swelling
+        self.growth, self.swelling = growth, swelling
         self.blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for body in geometry.bodies:
             rows = geometry.of(body)
@@ -71,31 +69,15 @@ class Perturbation:
         result = np.zeros((count, self.shape, channels))
         for rows, factor, slow in self.blocks:
             result[:, rows] = np.einsum("rk,ckd->crd", factor, rng.normal(size=(count, factor.shape[1], channels)))
-            if self.swelling > 0 and self.normals is not None:
+            if self.swelling > 0 and self.growth is not None:
                 size = self.swelling * rng.normal(size=(count, len(rows))) @ slow.T
-                result[:, rows, :3] += size[:, :, None] * self.normals[rows]
+                result[:, rows, :3] += size[:, :, None] * self.growth[rows]
         return result
 
 
 def root(points: np.ndarray, length: float) -> np.ndarray:
     """Return the Cholesky factor of the RBF kernel over points (n, 3), shape (n, n)."""
     return np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(points)))
-
-
-def outward(geometry: ContactGeometry, scene: Scene, reach: float) -> np.ndarray:
-    """Return the outward unit vector of each sphere, shape (S, 3).
-
-    It is the gradient of the signed distance to the body's surface, averaged over neighbours within about `reach` [m],
-    so that it points diagonally at edges.
-    """
-    normals = np.zeros((len(geometry), 3))
-    for body in geometry.bodies:
-        rows = geometry.of(body)
-        _, gradient = Surface.of_body(scene, body).distance(geometry.position[rows])
-        mean = rbf(geometry.position[rows], geometry.position[rows], reach) @ gradient
-        length = np.linalg.norm(mean, axis=1, keepdims=True)
-        normals[rows] = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), gradient)
-    return normals
 
 
 def rbf(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:

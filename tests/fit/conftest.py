@@ -39,8 +39,11 @@ def corner_spheres(half: float) -> ContactGeometry:
 @pytest.fixture(scope="session")
 def drop() -> Recording:
     """Points on an exact box that drops, 60 frames a second, one of them hidden now and then."""
-    scene = Scene(DROP)
-    m = scene.model
+    return dropped(Scene(DROP).model)
+
+
+def dropped(m: mujoco.MjModel) -> Recording:
+    """Return what is seen of a block that drops."""
     d = mujoco.MjData(m)
     local = np.random.default_rng(0).uniform(-HALF, HALF, (24, 3))
     times, points = [], []

@@ -8,8 +8,12 @@ from concent_warp.errors import ModelError, RecordingError
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
+from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
-from tests.fit.conftest import HALF, RADIUS, corner_spheres
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.disturb import disturb
+from concent_warp.scene.scene import Scene
+from tests.fit.conftest import DROP, HALF, RADIUS, corner_spheres, dropped
 
 CFG = FitCfg(
     evolution=EvolutionCfg(population=12, length=0.015, neighbours=2), generations=14, held_out=0.2, block=0.05
@@ -32,6 +36,41 @@ def test_without_neighbours_only_touched_spheres_move(drop, swollen):
     cfg = replace(CFG, evolution=replace(CFG.evolution, neighbours=0), generations=4)
     result = fit_geometry(swollen, drop, cfg, engine="mujoco")
     np.testing.assert_array_equal(result.mask, swollen.geometry.position[:, 2] < 0)
+
+
+def test_the_estimate_of_the_last_generation_counts(drop, swollen):
+    result = fit_geometry(swollen, drop, replace(CFG, generations=1), engine="mujoco")
+    assert result.mask.any()
+    assert result.history[-1]["best"] < result.history[-1]["held_out"]
+
+
+@pytest.fixture(scope="module")
+def rough() -> Model:
+    """A model of the block whose spheres are off by 1 mm each."""
+    scene = Scene(DROP)
+    geometry = ContactGeometryCfg(count=80).build(scene)
+    return Model(scene, disturb(geometry, position_std=1e-3, rng=np.random.default_rng(2)))
+
+
+def bottom_roughness(model: Model) -> float:
+    lowest = model.geometry.position[:, 2] < -0.0135
+    return float(model.geometry.position[lowest, 2].std())
+
+
+def test_rough_faces_are_flat_before_the_first_generation(drop, rough):
+    cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), generations=1)
+    result = fit_geometry(rough, drop, cfg, engine="mujoco")
+    assert bottom_roughness(result.model) < 0.6 * bottom_roughness(rough)
+    as_is = replace(cfg, evolution=replace(cfg.evolution, flat_start=False, flattening=0.0))
+    kept = fit_geometry(rough, drop, as_is, engine="mujoco")
+    np.testing.assert_allclose(kept.model.geometry.position, rough.geometry.position, atol=1e-7)
+
+
+def test_faces_that_were_observed_to_be_rough_stay_rough(rough):
+    seen = dropped(rough.spec().compile())
+    cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9, flattening=0.0), generations=1)
+    result = fit_geometry(rough, seen, cfg, engine="mujoco")
+    assert bottom_roughness(result.model) == pytest.approx(bottom_roughness(rough), rel=1e-6)
 
 
 def test_an_interrupted_fit_resumes_to_the_same_result(drop, swollen, fitted, tmp_path):

@@ -3,6 +3,7 @@ import numpy as np
 
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.model import Model
+from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from tests.fit.conftest import DROP, corner_spheres
@@ -54,3 +55,18 @@ def test_spheres_near_the_floor_are_found_at_their_distance():
     near = spheres_near(model, state[None], 0.006)
     np.testing.assert_array_equal(near[:, 0], bottom)
     assert not near[:, 1:].any()
+
+
+def test_two_spheres_are_near_within_the_reach_and_not_within_its_double():
+    xml = """<mujoco><worldbody>
+      <body name="fixed"><geom name="fixed" type="sphere" size="0.01" mass="1"/></body>
+      <body name="free" pos="0 0 0.1"><freejoint/><geom name="free" type="sphere" size="0.01" mass="1"/></body>
+    </worldbody></mujoco>"""
+    two = np.arange(2)
+    geometry = ContactGeometry(
+        ("fixed", "free"), two, np.zeros((2, 3)), np.full(2, 0.01), np.full(2, 1.0), np.full(2, 0.5)
+    )
+    model = Model(Scene(xml), geometry)
+    states = np.array([[0, 0, 0.02 + gap, 1, 0, 0, 0] for gap in (0.007, 0.005)])
+    assert not spheres_near(model, states[:1], 0.006).any()
+    np.testing.assert_array_equal(spheres_near(model, states[1:], 0.006)[:, 1:], [[False, True], [True, False]])

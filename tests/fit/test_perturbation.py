@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from concent_warp.fit.perturbation import Perturbation, outward, rbf, smoothed
+from concent_warp.fit.offset import offset_directions
+from concent_warp.fit.perturbation import Perturbation, rbf, smoothed
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 from tests.fit.conftest import DROP
@@ -35,19 +36,13 @@ def test_nothing_outside_the_mask_moves(geometry):
         assert (draw[:, mask] != 0).all()
 
 
-def test_swelling_moves_spheres_outward_together(geometry):
+def test_swelling_moves_faces_outward_together(geometry):
     mask = np.ones(len(geometry), dtype=bool)
-    normals = outward(geometry, Scene(DROP), 0.008)
-    swell = Perturbation(geometry, mask, "gaussian_process", 0.015, normals=normals, swelling=50.0, swelling_length=1.0)
+    growth = offset_directions(geometry, Scene(DROP))
+    swell = Perturbation(geometry, mask, "gaussian_process", 0.015, growth=growth, swelling=50.0, swelling_length=1.0)
     draw = swell.draw(200, 3, np.random.default_rng(0))
-    along = (draw * normals).sum(axis=2)
+    along = (draw * growth).sum(axis=2)
     assert np.corrcoef(along[:, 0], along[:, -1])[0, 1] > 0.99
-
-
-def test_outward_points_away_from_the_middle_of_a_convex_object(geometry):
-    normals = outward(geometry, Scene(DROP), 0.008)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
-    assert ((normals * geometry.position).sum(axis=1) > 0).all()
 
 
 def test_smoothing_keeps_a_constant_and_damps_a_spike(geometry):

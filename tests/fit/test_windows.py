@@ -203,9 +203,7 @@ def test_a_length_that_is_no_time_is_refused(scene, recording):
 def test_a_fit_to_tosses_recovers_the_edge_of_a_cube_whose_size_is_wrong(recording, factor):
     scene = Scene(toss_scene(factor * EDGE))
     start = Model(scene, ContactGeometryCfg(count=40, radius=0.0015).build(scene))
-    evolution = EvolutionCfg(
-        population=12, sigma=2e-4, swelling=5, length=0.03, swelling_length=2 * EDGE, swelling_along="faces"
-    )
+    evolution = EvolutionCfg(population=12, sigma=2e-4, swelling=5, length=0.03, swelling_length=2 * EDGE)
     cfg = FitCfg(evolution, generations=10, window=LENGTH, batch=16)
     fitted = fit_geometry(start, recording, cfg, engine="mujoco")
     geometry = fitted.model.geometry
