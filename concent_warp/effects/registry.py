@@ -56,11 +56,16 @@ def effects() -> dict[str, type[Effect]]:
     """Return all effects by name.
 
     Raises:
-        ModelError: A package registers something else than an effect, or a name that is taken.
+        ModelError: A package registers what cannot be imported, something else than an effect, or a name that is taken.
     """
     found: dict[str, type[Effect]] = {effect.name: effect for effect in OURS}
     for entry in entry_points(group=GROUP):
-        loaded = entry.load()
+        try:
+            loaded = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise ModelError(
+                "the effect cannot be imported", where=f"entry point {entry.name} = {entry.value}", found=error
+            ) from error
         if not (isinstance(loaded, type) and issubclass(loaded, Effect)):
             raise ModelError(
                 "not an effect", where=f"entry point {entry.name} = {entry.value}", expected="a subclass of Effect"

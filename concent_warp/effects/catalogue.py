@@ -1,0 +1,74 @@
+"""The list of effects as the documentation has it: ``python -m concent_warp.effects.catalogue`` prints it."""
+
+from __future__ import annotations
+
+import re
+from typing import get_args
+
+import mujoco
+
+from concent_warp.effects.effect import Effect, Family
+from concent_warp.effects.registry import OURS, effects
+
+TITLES = {
+    "joints": "Joints and drives",
+    "objects": "Objects",
+    "contact": "Contact",
+    "world": "World",
+    "measurement": "Measurement",
+}
+ACTS_ON = {"none": "the world", "joint": "joints", "actuator": "actuators", "body": "bodies", "sensor": "sensors"}
+
+
+def catalogue(m: mujoco.MjModel) -> str:
+    """Return a Markdown table for each family of this library's effects.
+
+    Args:
+        m: A model on which each of them can act: units are those on its joints and sensors.
+    """
+    parts = []
+    for family in get_args(Family):
+        rows = [row(effect, m) for effect in OURS if effect.family == family]
+        head = "| effect | what it does | parameters | signature | taken for | source |\n|---|---|---|---|---|---|"
+        parts.append(f"### {TITLES[family]}\n" + "\n".join([head, *rows]))
+    return "\n\n".join(parts) + "\n"
+
+
+def row(effect: type[Effect], m: mujoco.MjModel) -> str:
+    """Return a row of the table."""
+    known = [f"`{name}`" for name in effect.confusions if name in effects()]
+    others = [name.replace("_", " ") for name in effect.confusions if name not in effects()]
+    cells = [
+        f"`{effect.name}` on {ACTS_ON[effect.kind]}",
+        effect.summary,
+        parameters(effect, m),
+        effect.signature,
+        ", ".join([*known, *others]),
+        effect.source,
+    ]
+    if effect.engines != Effect.engines:
+        cells[1] += f" Engine: {', '.join(effect.engines)}."
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
+    """Return names and units; several parameters of one kind as one, with what they belong to in brackets."""
+    units: dict[str, list[str]] = {}
+    for target in effect.targets(m):
+        for parameter in effect(*target).parameters(m):
+            found = units.setdefault(re.sub(r"\[.*\]", f"[{effect.kind}]", parameter.name), [])
+            if parameter.unit not in found:
+                found.append(parameter.unit)
+    return ", ".join(f"`{name}`" + unit(found) for name, found in units.items())
+
+
+def unit(found: list[str]) -> str:
+    """Return units in words, with what separates them from the name."""
+    words = " or ".join(found)
+    return "" if words == "-" else f" {words}"
+
+
+if __name__ == "__main__":
+    from concent_warp.scene.shape_sorter import ShapeSorterCfg
+
+    print(catalogue(ShapeSorterCfg().build().model), end="")
