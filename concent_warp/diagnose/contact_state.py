@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnose.phases import FREE, GRASPED, IMPACT, REST, SLIDE, SLIDING, STICK
+from concent_warp.diagnose.shooting import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
-    from concent_warp.diagnose.measured_motion import BodyMotion
+    from concent_warp.diagnose.measured_motion import BodyMotion, Motion
     from concent_warp.diagnose.shooting import Windows
 
-BETWEEN = "between"
-"""Windows in which a body sets out or comes to rest."""
+PUSHED, BETWEEN = "pushed", "between"
+"""Further phases: the robot presses on it from one side; it sets out or comes to rest."""
 LASTING = 0.8
 """Share of a window from which on a contact lasts through it."""
 HOP = 0.02
@@ -55,6 +56,8 @@ class BodyWindows:
     """Radius that makes angles comparable with lengths [m]."""
     sliding: np.ndarray
     """Velocity at the contact, without what is along its normal [m/s], world frame, shape (K, 3); 0 without contact."""
+    heading: np.ndarray
+    """Direction of sliding, averaged over the window as forces are, shape (K, 3); shorter where it comes to rest."""
     velocity: np.ndarray
     """Of the body's origin [m/s], world frame, shape (K, 3)."""
     spin: np.ndarray
@@ -63,8 +66,9 @@ class BodyWindows:
     """Body to world, shape (K, 3, 3)."""
 
 
-def body_windows(m: mujoco.MjModel, windows: Windows, body: BodyMotion) -> BodyWindows:
+def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWindows:
     """Return what a body touches in the model's simulation of each window, and what follows from it."""
+    m = motion.compiled
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1
     rotation = Rotation.from_quat(windows.qpos[:, body.qpos + 3 : body.qpos + 7], scalar_first=True)
     velocity = windows.qvel[:, body.dof : body.dof + 3]
@@ -76,7 +80,9 @@ def body_windows(m: mujoco.MjModel, windows: Windows, body: BodyMotion) -> BodyW
     phase = np.full(count, FREE, dtype=object)
     touches: list[dict[str, Touch]] = [{} for _ in range(count)]
     free = np.tile(np.eye(6), (count, 1, 1))
-    sliding = np.zeros((count, 3))
+    sliding, heading = np.zeros((count, 3)), np.zeros((count, 3))
+    instants = windows.start[:, None] + windows.length * SHARES
+    passing = motion.states(instants.ravel())[1].reshape(count, len(SHARES), -1)
     for k in range(count):
         rows = np.flatnonzero((log.variant == k) & (first ^ second))
         if not len(rows):
@@ -107,10 +113,16 @@ def body_windows(m: mujoco.MjModel, windows: Windows, body: BodyMotion) -> BodyW
         up /= max(float(np.linalg.norm(up)), 1e-9)
         slip = velocity[k] + np.cross(spin[k], centre)
         sliding[k] = slip - up * (up @ slip)
+        along = passing[k, :, body.dof : body.dof + 3] + np.cross(
+            passing[k, :, body.dof + 3 : body.dof + 6] @ matrix.T, centre
+        )
+        along -= np.outer(along @ up, up)
+        blur = 2 * float(speed_std[k])
+        heading[k] = share * WEIGHTS @ (along / np.hypot(np.linalg.norm(along, axis=1), blur)[:, None])
         if share < LASTING:
             phase[k] = IMPACT
-        elif len(movers) > 1:
-            phase[k] = GRASPED
+        elif movers:
+            phase[k] = GRASPED if len(movers) > 1 else PUSHED
         else:
             limit = max(SLIDING, 3 * float(speed_std[k]))
             speeds = windows.edge_qvel[:, k, body.dof : body.dof + 6]
@@ -127,7 +139,7 @@ def body_windows(m: mujoco.MjModel, windows: Windows, body: BodyMotion) -> BodyW
             push = np.concatenate([normal, np.cross(point, normal) / size], axis=1)
             both = np.kron(np.eye(2), matrix)
             free[k] = both @ free_motions(push, len(np.unique(log.step[rows]))) @ both.T
-    return BodyWindows(phase, tuple(touches), free, size, sliding, velocity, spin, rotation.as_matrix())
+    return BodyWindows(phase, tuple(touches), free, size, sliding, heading, velocity, spin, rotation.as_matrix())
 
 
 def speed_at(

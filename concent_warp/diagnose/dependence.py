@@ -21,9 +21,9 @@ BLOCK = 4
 FEWEST_BLOCKS = 5
 """Fewer blocks test nothing: 2^-5 is the smallest p-value that they can give, both signs counted."""
 MOST_PATTERNS = 2
-LEAST_SHARE = 0.1
-"""A pattern explains at least this share of a force: less, of what is mostly noise, may be what the linearisation of a
-window leaves."""
+LEAST_SHARE, LEAST_SHARE_IN_CONTACT = 0.1, 0.25
+"""What explains less than this share of a force that is mostly noise may be what the linearisation of windows leaves;
+it leaves more where a gap smaller than the noise decides over contact."""
 LEVEL = 0.05
 ALIKE = 2.0
 """Features whose shares differ by less than this many standard errors cannot be told apart."""
@@ -79,6 +79,7 @@ def dependences(
     features: Mapping[str, np.ndarray],
     blocks: np.ndarray,
     seed: int = 0,
+    least_share: float = LEAST_SHARE,
 ) -> Dependences:
     """Test what a force depends on.
 
@@ -88,6 +89,7 @@ def dependences(
         features: Values of the features, shape (K, d) each.
         blocks: Block of each window, shape (K,) int; see `blocks_of`.
         seed: Seed of the flips.
+        least_share: Share of the force that a pattern explains at least.
     """
     valid = np.isfinite(force).all(axis=1) & (std > 0)
     kept = {n: f[valid] for n, f in features.items() if np.isfinite(f[valid]).all() and np.any(f[valid])}
@@ -106,11 +108,11 @@ def dependences(
         slope, slope_std = slope_of(y, x[i], block)
         found.append(Dependence(name, correlation(y, x[i]), slope, slope_std, float(p[i])))
     found.sort(key=lambda d: -abs(d.correlation))
-    return Dependences(tuple(found), patterns(y, x, names, block, signs))
+    return Dependences(tuple(found), patterns(y, x, names, block, signs, least_share))
 
 
 def patterns(
-    y: np.ndarray, x: np.ndarray, names: Sequence[str], block: np.ndarray, signs: np.ndarray
+    y: np.ndarray, x: np.ndarray, names: Sequence[str], block: np.ndarray, signs: np.ndarray, least_share: float
 ) -> tuple[Pattern, ...]:
     """Return the features that explain `y` (n,), one after the other, of candidates `x` (F, n)."""
     found: list[Pattern] = []
@@ -123,7 +125,7 @@ def patterns(
         if p[best] > LEVEL:
             break
         share = strength[best] ** 2 * float(left @ left) / total
-        if share < LEAST_SHARE and not found:
+        if share < least_share and not found:
             break
         slope, slope_std = slope_of(left, candidates[best], block)
         alternatives = tuple(

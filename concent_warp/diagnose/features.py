@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.diagnose.contact_state import PUSHED
+from concent_warp.diagnose.phases import GRASPED
+from concent_warp.diagnose.shooting import SHARES, WEIGHTS
+
 if TYPE_CHECKING:
     from concent_warp.diagnose.contact_state import BodyWindows
     from concent_warp.diagnose.measured_motion import Motion
@@ -19,8 +23,6 @@ COMMAND_RATE, POSITION, CONSTANT, CONTACT = "rate of the command", "position", "
 SLIDING, DRAG = "direction of sliding", "velocity x speed"
 AXES = ("x", "y", "z")
 
-SHARES = (np.arange(5) + 0.5) / 5
-"""Instants within a window, as shares of its length, at which features are taken."""
 RATE_STEP = 0.01
 """Time over which the rate of a command is taken [s]."""
 
@@ -36,8 +38,6 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
     d = mujoco.MjData(m)
     count = len(windows.start)
     time = (windows.start[:, None] + windows.length * SHARES).ravel()
-    weight = 30 * SHARES**2 * (1 - SHARES) ** 2
-    weight /= weight.sum()
     qpos, qvel = motion.states(time)
     qacc = motion.acceleration(time)
     dt = m.opt.timestep
@@ -60,7 +60,7 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
     found = {}
     for joint in motion.joints:
         v = qvel[:, joint.dof]
-        std = np.sqrt(joint.position.smooth.covariance(time)[:, 1, 1])
+        std = np.sqrt(joint.position.smooth.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
         direction = v / np.sqrt(v**2 + (2 * std) ** 2)
         raw = {
             DIRECTION: direction,
@@ -73,7 +73,7 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
             POSITION: qpos[:, joint.qpos] - qpos[:, joint.qpos].mean(),
             CONSTANT: np.ones(len(time)),
         }
-        mean = {name: value.reshape(count, -1) @ weight for name, value in raw.items()}
+        mean = {name: value.reshape(count, -1) @ WEIGHTS for name, value in raw.items()}
         mean[CONTACT] = touching[:, joint.dof]
         found[joint.name] = {name: value[:, None] for name, value in mean.items() if varies(name, value)}
     return found
@@ -113,12 +113,13 @@ def body_force_features(state: BodyWindows, acceleration: np.ndarray, name: str)
         name: Of the body.
     """
     speed = np.linalg.norm(state.velocity, axis=1, keepdims=True)
-    slip = np.linalg.norm(state.sliding, axis=1, keepdims=True)
+    # Weight and friction grow with the mass as inertia does, so that a wrong one shows where the robot moves the body.
+    driven = np.isin(state.phase.astype(str), [PUSHED, GRASPED])
     features = {
-        SLIDING: np.where(slip > 0, state.sliding / np.maximum(np.hypot(slip, 0.01), 1e-9), 0),
+        SLIDING: state.heading,
         SPEED: state.velocity,
         DRAG: state.velocity * speed,
-        ACCELERATION: acceleration,
+        ACCELERATION: np.where(driven[:, None], acceleration, 0),
     }
     for i, axis in enumerate(AXES):
         features[f"world {axis}"] = np.tile(np.eye(3)[i], (len(speed), 1))

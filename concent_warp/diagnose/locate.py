@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 
 from concent_warp.diagnose.contact_state import BETWEEN, BodyWindows, body_windows
-from concent_warp.diagnose.dependence import LEAST_SHARE, LEVEL, blocks_of, dependences
-from concent_warp.diagnose.features import body_force_features, body_torque_features, joint_features
+from concent_warp.diagnose.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
+from concent_warp.diagnose.features import CONTACT, body_force_features, body_torque_features, joint_features
 from concent_warp.diagnose.force_place import force_place
 from concent_warp.diagnose.location import DETECTABLE, BodyForce, ForceSeries, JointForce, Location, PhaseForce
 from concent_warp.diagnose.measured_motion import BodyMotion, Motion, measured_motion
-from concent_warp.diagnose.phases import REST
+from concent_warp.diagnose.phases import FREE, REST
 from concent_warp.diagnose.shooting import WindowCfg, Windows, window_forces
 from concent_warp.diagnose.wrench import Wrenches, joined, steady_force, wrenches
 from concent_warp.simulate.select import EngineName, make_engine
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 FEWEST_WINDOWS = 3
 """Windows that make a phase."""
+SELDOM = 0.05
+"""Share of the time below which a joint's contact is neglected."""
 SHORT_BLOCK, LONG_PHASE = 2, 48
 """Windows in a block of a phase with fewer windows than the second number."""
 
@@ -101,14 +103,16 @@ def joint_force(
     names = [n for n in parts[0][1] if all(n in f for _, f in parts)]
     table = {n: np.concatenate([f[n] for _, f in parts]) for n in names}
     block = blocks_of([len(w.start) for w, _ in parts])
-    found = dependences(force[:, None], std, table, block, cfg.seed)
+    touches = float(np.mean(table.get(CONTACT, 0.0))) > SELDOM
+    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
+    found = dependences(force[:, None], std, table, block, cfg.seed, least)
     valid = np.isfinite(force) & (std > 0)
     return JointForce(
         joint=name,
         unit=unit,
         rms=root_mean_square(force[valid]),
         noise=root_mean_square(std[valid]),
-        detectable=detectable(std[valid]),
+        detectable=detectable(std[valid], least),
         p=found.p,
         significant=False,
         dependences=found,
@@ -116,12 +120,15 @@ def joint_force(
     )
 
 
-def detectable(std: np.ndarray) -> float:
-    """Return the smallest steady force that would be seen in windows with errors `std` (n,); NaN without any."""
+def detectable(std: np.ndarray, share: float) -> float:
+    """Return the smallest steady force that would be seen in windows with errors `std` (n,); NaN without any.
+
+    It stands out from their mean's error, and makes a `share` of all forces.
+    """
     if not len(std):
         return np.nan
     precision = float((1 / std**2).sum())
-    return max(DETECTABLE, float(np.sqrt(LEAST_SHARE / (1 - LEAST_SHARE) * len(std)))) / float(np.sqrt(precision))
+    return max(DETECTABLE, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
 
 
 def body_force(
@@ -137,7 +144,7 @@ def body_force(
     for motion, window in zip(motions, windows, strict=True):
         for body in motion.bodies:
             if body.name == name:
-                parts.append((motion, window, body, body_windows(compiled, window, body)))
+                parts.append((motion, window, body, body_windows(motion, window, body)))
     counts = [len(window.start) for _, window, _, _ in parts]
     block = np.split(blocks_of(counts), np.cumsum(counts)[:-1])
     turned = all(body.orientation is not None for _, _, body, _ in parts)
@@ -154,16 +161,15 @@ def body_force(
         acceleration = motion.acceleration(window.time)[:, body.dof : body.dof + 3]
         force_features.append({n: f[ok] for n, f in body_force_features(state, acceleration, name).items()})
         torque_features.append({n: f[ok] for n, f in body_torque_features(state, name).items()})
-    along = dependences(
-        everything.force,
-        everything.std,
-        projected(everything.free[:, :3, :3], force_features),
-        everything.block,
-        cfg.seed,
-    )
     spread = np.sqrt(np.einsum("nii->n", everything.covariance[:, 3:, 3:]) / 3) * everything.size
-    about = dependences(
-        everything.torque, spread, projected(everything.free[:, 3:, 3:], torque_features), everything.block, cfg.seed
+    touches = any(len(state.touches[k]) for _, _, _, state in parts for k in range(len(state.touches)))
+    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
+    along, about = (
+        dependences(values, std, projected(sight, tables), everything.block, cfg.seed, least)
+        for values, std, sight, tables in (
+            (everything.force, everything.std, everything.free[:, :3, :3], force_features),
+            (everything.torque, spread, everything.free[:, 3:, 3:], torque_features),
+        )
     )
     phases = body_phases(model, compiled, parts, seen, valid, cfg)
     values = [along.p, about.p, *(phase.p for phase in phases)]
@@ -212,6 +218,8 @@ def body_phases(
         if not (w.std > 0).all():
             continue
         steady = steady_force(w, cfg.seed)
+        if steady is None:
+            continue
         touches = [
             state.touches[k]
             for (_, _, _, state), c, ok in zip(parts, chosen, valid, strict=True)
@@ -255,7 +263,11 @@ def judged(found: BodyForce, accepted: bool) -> BodyForce:
     bound = LEVEL / max(len(found.phases), 1)
     phases = []
     for phase in found.phases:
-        ok = accepted and phase.p <= bound and phase.share >= LEAST_SHARE
+        ok = (
+            accepted
+            and phase.p <= bound
+            and phase.share >= (LEAST_SHARE if phase.phase == FREE else LEAST_SHARE_IN_CONTACT)
+        )
         phases.append(replace(phase, significant=ok, place=phase.place if ok else None))
     shown = any(phase.significant for phase in phases) or bool(found.force.patterns or found.torque.patterns)
     return replace(found, significant=accepted and shown, phases=tuple(phases))

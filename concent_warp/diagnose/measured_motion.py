@@ -102,8 +102,16 @@ class Motion:
         found = [j.position for j in self.joints] + [b.position for b in self.bodies]
         return found + [b.orientation for b in self.bodies if b.orientation is not None]
 
-    def states(self, time: np.ndarray, rng: np.random.Generator | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return smoothed states at `time` (T,), qpos (T, nq) and qvel (T, nv); with `rng` drawn from their errors."""
+    def states(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smoothed states at `time` (T,), qpos (T, nq) and qvel (T, nv)."""
+        qpos, qvel = self.draws(time, 0, None)
+        return qpos[0], qvel[0]
+
+    def draws(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smoothed states at `time` (T,), and `count` drawn from their errors after them.
+
+        Shapes (1 + count, T, nq) and (1 + count, T, nv).
+        """
         m = self.compiled
         qpos = interpolate(self.base_time, self.base_qpos, time)
         for j in range(m.njnt):
@@ -111,18 +119,18 @@ class Motion:
                 start = m.jnt_qposadr[j] + (3 if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else 0)
                 qpos[:, start : start + 4] /= np.linalg.norm(qpos[:, start : start + 4], axis=1, keepdims=True)
         qvel = interpolate(self.base_time, self.base_qvel, time)
+        qpos, qvel = np.tile(qpos, (1 + count, 1, 1)), np.tile(qvel, (1 + count, 1, 1))
         for joint in self.joints:
-            position, velocity = drawn(joint.position.smooth, time, rng)
-            qpos[:, joint.qpos], qvel[:, joint.dof] = position[:, 0], velocity[:, 0]
+            position, velocity = drawn(joint.position.smooth, time, count, rng)
+            qpos[:, :, joint.qpos], qvel[:, :, joint.dof] = position[..., 0], velocity[..., 0]
         for body in self.bodies:
-            position, velocity = drawn(body.position.smooth, time, rng)
-            qpos[:, body.qpos : body.qpos + 3], qvel[:, body.dof : body.dof + 3] = position, velocity
+            position, velocity = drawn(body.position.smooth, time, count, rng)
+            qpos[:, :, body.qpos : body.qpos + 3], qvel[:, :, body.dof : body.dof + 3] = position, velocity
             if body.orientation is not None:
-                quaternion, rate = drawn(body.orientation.smooth, time, rng)
-                spin = turning(quaternion, rate)
-                quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-                qpos[:, body.qpos + 3 : body.qpos + 7] = quaternion
-                qvel[:, body.dof + 3 : body.dof + 6] = spin
+                quaternion, rate = drawn(body.orientation.smooth, time, count, rng)
+                qvel[:, :, body.dof + 3 : body.dof + 6] = turning(quaternion, rate)
+                quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+                qpos[:, :, body.qpos + 3 : body.qpos + 7] = quaternion
         return qpos, qvel
 
     def acceleration(self, time: np.ndarray) -> np.ndarray:
@@ -135,26 +143,31 @@ class Motion:
         return qacc
 
 
-def drawn(signal: Smooth, time: np.ndarray, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return a signal and its velocity at `time` (T,), (T, dim) each; with `rng` drawn from their joint error."""
-    value, velocity = signal.at(time), signal.at(time, 1)
-    if rng is None:
-        return value, velocity
-    covariance = signal.covariance(time)[:, :2, :2]
-    spread, axes = np.linalg.eigh(covariance)
+def drawn(
+    signal: Smooth, time: np.ndarray, count: int, rng: np.random.Generator | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a signal and its velocity at `time` (T,), and `count` drawn from their joint error after them.
+
+    Shapes (1 + count, T, dim).
+    """
+    both = np.stack([signal.at(time), signal.at(time, 1)], axis=1)
+    if rng is None or not count:
+        return both[None, :, 0], both[None, :, 1]
+    spread, axes = np.linalg.eigh(signal.covariance(time)[:, :2, :2])
     root = axes * np.sqrt(np.maximum(spread, 0))[:, None]
-    error = np.einsum("tij,tjd->tid", root, rng.standard_normal((len(time), 2, value.shape[1])))
-    return value + error[:, 0], velocity + error[:, 1]
+    error = np.einsum("tij,ntjd->ntid", root, rng.standard_normal((count, *both.shape)))
+    both = np.concatenate([both[None], both + error])
+    return both[:, :, 0], both[:, :, 1]
 
 
 def turning(quaternion: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return angular velocities in the body frame [rad/s], (T, 3), of quaternions (T, 4) and their rates (T, 4).
+    """Return angular velocities in the body frame [rad/s], (..., 3), of quaternions (..., 4) and their rates (..., 4).
 
     omega = 2 conj(q) dq / |q|^2, vector part.
     """
-    w, v = quaternion[:, :1], quaternion[:, 1:]
-    vector = w * rate[:, 1:] - rate[:, :1] * v - np.cross(v, rate[:, 1:])
-    return 2 * vector / (quaternion**2).sum(axis=1, keepdims=True)
+    w, v = quaternion[..., :1], quaternion[..., 1:]
+    vector = w * rate[..., 1:] - rate[..., :1] * v - np.cross(v, rate[..., 1:])
+    return 2 * vector / (quaternion**2).sum(axis=-1, keepdims=True)
 
 
 def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) -> Motion:

@@ -25,6 +25,11 @@ from concent_warp.simulate.engine import ContactLog, Engine, Variants
 if TYPE_CHECKING:
     from concent_warp.diagnose.measured_motion import Motion
 
+SHARES = (np.arange(5) + 0.5) / 5
+"""Instants within a window, as shares of its length, at which what forces depend on is taken."""
+WEIGHTS = 30 * SHARES**2 * (1 - SHARES) ** 2 / np.sum(30 * SHARES**2 * (1 - SHARES) ** 2)
+"""Their weights: those with which forces are averaged, shape (5,)."""
+
 
 @dataclass(frozen=True)
 class WindowCfg:
@@ -103,20 +108,16 @@ def window_forces(name: str, engine: Engine, motion: Motion, cfg: WindowCfg) -> 
     start = step * engine.timestep
     ctrl = motion.ctrl[np.minimum(step[:, None] + np.arange(steps), len(motion.ctrl) - 1)]
     rng = np.random.default_rng(cfg.seed)
-    qpos, qvel = motion.states(start)
-    nominal = engine.run(Variants(len(start), qpos=qpos, qvel=qvel), ctrl, bodies=(), contacts="all").numpy()
+    qpos, qvel = motion.draws(start, cfg.draws, rng)
+    first_run = Variants(len(start), qpos=qpos[0], qvel=qvel[0])
+    nominal = engine.run(first_run, ctrl, bodies=(), contacts="all").numpy()
     assert nominal.contacts is not None
-    paths = [np.asarray(nominal.qpos, dtype=float)]
+    path = np.asarray(nominal.qpos, dtype=float)[None]
     if cfg.draws:
-        states = [motion.states(start, rng) for _ in range(cfg.draws)]
-        several = Variants(
-            cfg.draws * len(start),
-            qpos=np.concatenate([q for q, _ in states]),
-            qvel=np.concatenate([v for _, v in states]),
-        )
-        drawn = engine.run(several, ctrl, bodies=()).numpy()
-        paths += list(np.asarray(drawn.qpos, dtype=float).reshape(cfg.draws, len(start), steps + 1, m.nq))
-    path = np.stack(paths)
+        count = cfg.draws * len(start)
+        further = Variants(count, qpos=qpos[1:].reshape(count, m.nq), qvel=qvel[1:].reshape(count, m.nv))
+        drawn = engine.run(further, ctrl, bodies=()).numpy()
+        path = np.concatenate([path, np.asarray(drawn.qpos, dtype=float).reshape(cfg.draws, *path.shape[1:])])
     speed = np.asarray(nominal.qvel, dtype=float)
     middle = start + length / 2
     mid_qpos, mid_qvel = motion.states(middle)

@@ -127,8 +127,8 @@ class SteadyForce:
     """"sign flips", or "known noise" where there are too few blocks for them."""
 
 
-def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce:
-    """Return the steady force of a phase and whether it is significant: force in the world, in the body, or along slip.
+def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
+    """Return the force of a phase that is steady in the world, in the body or along the slip; None where all is hidden.
 
     The significance is that of the largest of the shares explained in the three frames.
     """
@@ -146,7 +146,8 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce:
     for frame, basis in bases.items():
         x = (basis * weight[:, None, None]).reshape(len(y), -1)
         left, value, right = np.linalg.svd(x, full_matrices=False)
-        kept = value > 0.05 * max(float(value.max(initial=0)), 1e-12)
+        # What contacts hide nearly always is not extrapolated from the rest.
+        kept = np.einsum("ri,nji,njk,rk->r", right, basis, basis, right) > SIGHT**2 * len(basis)
         left, value, right = left[:, kept], value[kept], right[kept]
         if not kept.any():
             continue
@@ -156,6 +157,8 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce:
         std = np.sqrt(((right.T / value) ** 2).sum(axis=1))
         fits[frame] = float(statistics[-1][0]), basis, vector, std, len(value)
     # A direction costs: a frame with more freedom must explain that much more.
+    if not fits:
+        return None
     frame = max(fits, key=lambda f: fits[f][0] - 2 * fits[f][4])
     explained, basis, vector, std, freedom = fits[frame]
     scale = float(np.sqrt(max(1.0, (total - explained) / max(float(np.einsum("nii->", sight)) - freedom, 1.0))))
