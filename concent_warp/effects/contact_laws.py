@@ -40,7 +40,8 @@ class AnisotropicForce(Law):
         contact = d.contact
         first, second = contact.geom.T
         backward = self.moving[first] & self.still[second]
-        active = np.flatnonzero((backward | (self.moving[second] & self.still[first])) & (contact.efc_address >= 0))
+        mine = (backward | (self.moving[second] & self.still[first])) & (contact.dim >= 3)
+        active = np.flatnonzero(mine & (contact.efc_address >= 0))
         if not len(active):
             return
         body = m.geom_bodyid[np.where(backward, first, second)[active]]

@@ -38,6 +38,12 @@ def test_grain_holds_less_along_y_where_its_ratio_is_below_one():
     assert block.qpos[-1, 1] == pytest.approx(0.8**2 / (2 * 0.5 * 0.3 * G), rel=0.02)
 
 
+def test_grain_of_a_contact_without_friction_does_nothing():
+    slippery = BLOCK.replace('friction="0.3"', 'friction="0.3" condim="1"')
+    block = move(world(slippery, AnisotropicFriction("thing"), 2.0), 0.3, qvel=[0, 0.8, 0, 0, 0, 0])
+    assert block.qvel[-1, 1] == pytest.approx(0.8, abs=1e-6)
+
+
 @pytest.mark.parametrize("mu", [0.002, 0.008])
 def test_spinning_ball_stands_still_once_torsional_friction_has_taken_its_spin(mu):
     inertia = 0.4 * MASS * RADIUS**2
