@@ -90,8 +90,8 @@ OUTSIDE: tuple[tuple[str, str], ...] = (
     ("pendulum", "cable"),
     ("slide", "magnet"),
     ("slide", "patch"),
-    ("push", "slosh"),
-    ("push", "cogging"),
+    ("tumble", "slosh"),
+    ("push", "cable"),
 )
 """Rig and what no library has, at both sizes."""
 PAIRS: tuple[tuple[str, str, str], ...] = (

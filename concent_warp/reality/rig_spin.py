@@ -13,7 +13,7 @@ XML = f"""
   <compiler angle="radian"/>
   <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="3"/>
   <default>
-    <geom solref="0.01 1" friction="0.4 0.003 0.0003" condim="6"/>
+    <geom solref="0.01 1" friction="0.4 0.001 0.0004" condim="6"/>
   </default>
   <worldbody>
     <light pos="0 -0.4 1.5"/>
@@ -35,7 +35,7 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
     """Spin and roll by turns, at several speeds and headings."""
     start = [0.0, 0.0, RADIUS - 1e-4, 1, 0, 0, 0]
     if k % 2 == 0:
-        spin = rng.choice([-1, 1]) * rng.uniform(5, 12)
+        spin = rng.choice([-1, 1]) * rng.uniform(10, 20)
         return Trial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settle=0.2)
     speed, heading = rng.uniform(0.25, 0.6), rng.uniform(-np.pi, np.pi)
     x, y = speed * np.cos(heading), speed * np.sin(heading)
