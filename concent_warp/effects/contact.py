@@ -183,9 +183,9 @@ class ContactCompliance(SurfaceEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Time constant and damping ratio; the null values are the means of body and surroundings."""
         time, ratio = self.mean(m)
-        least = 2 * m.opt.timestep
+        least = min(2 * m.opt.timestep, time)
         return (
-            Parameter("time_constant", "s", float(max(time, least)), least, 0.2, 0.5 * float(time)),
+            Parameter("time_constant", "s", float(time), float(least), 0.2, 0.5 * float(time)),
             Parameter("damping_ratio", "-", float(ratio), 0.02, 5.0, 0.4, scan=(0.1 * ratio, 0.3 * ratio, 0.6 * ratio)),
         )
 

@@ -107,6 +107,13 @@ def test_ball_at_rest_sinks_into_a_softer_contact_by_its_static_sag():
     assert RADIUS - ball.qpos[-1, 2] == pytest.approx((1 - 0.9) * G * 0.05**2, rel=0.01)
 
 
+def test_contacts_stiffer_than_the_time_step_allows_stay_so_at_the_null_value():
+    stiff = BLOCK.replace("<geom ", '<geom solref="0.0005 1" ', 1)
+    start = {"qpos": [0, 0, 0.05, 0.9, 0.3, 0.2, 0.1], "qvel": [0.5, 0, -1, 3, 2, 1]}
+    plain, null = move(world(stiff), 0.3, **start), move(world(stiff).add(ContactCompliance("thing")), 0.3, **start)
+    np.testing.assert_allclose(null.qpos, plain.qpos, atol=1e-9)
+
+
 @pytest.mark.parametrize(("share", "holds"), [(0.9, False), (1.1, True)])
 def test_ball_hangs_from_a_ceiling_that_sticks_with_more_than_its_weight(share, holds):
     ceiling = FLOOR.format(type="sphere", size="0.05", height=-0.0499, floor='euler="180 0 0"', geom="")
