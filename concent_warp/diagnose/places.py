@@ -70,6 +70,8 @@ class Place:
     """Where the measurement lies as seen from the model, in words."""
     vector: tuple[float, ...]
     """The same as a unit vector; shorter where the residual points to and fro."""
+    arose: str | None = None
+    """Phase in which most of the error at the peak has come about; open loop, what is off once stays off."""
     recurs: int = 1
     """Number of demonstrations with a place of the same channel and phase against the same thing."""
 
@@ -92,8 +94,10 @@ class Place:
         parts += [f"{self.start:.2f}-{self.end:.2f} s", self.size]
         parts += [f"against {' and '.join(self.against)}"] if self.against else []
         parts += [self.direction] if self.direction else []
-        parts += [f"off since {self.onset:.2f} s"] if self.start - self.onset > SMOOTHING else []
-        return ", ".join(parts)
+        since = f"off since {self.onset:.2f} s" if self.start - self.onset > SMOOTHING else ""
+        if self.arose != self.phase and self.arose:
+            since = f"{since}, mostly from the {self.arose} phase".removeprefix(", ")
+        return ", ".join([*parts, *([since] if since else [])])
 
 
 def worst_places(
@@ -169,10 +173,10 @@ def channel_places(
         taken[slice(*downhill(level, start, end))] = True
         if end - start < FEWEST:
             continue
-        rows = np.arange(start, end)
-        yield described(
-            residual, rows, float(residual.time[top]), float(residual.time[onset]), phases, partners, demonstration
-        )
+        rows, (at, since) = np.arange(start, end), residual.time[[top, onset]].tolist()
+        place = described(residual, rows, at, since, phases, partners, demonstration)
+        growth = np.diff(np.maximum.accumulate(level[onset : top + 1]), prepend=0.0)
+        yield replace(place, arose=main_phase(residual.time[onset : top + 1], growth, phases))
 
 
 def smoothed(time: np.ndarray, ratio: np.ndarray) -> np.ndarray:

@@ -72,6 +72,16 @@ def test_a_shoulder_of_a_peak_is_no_second_place():
     assert len(list(channel_places(residual(decay), PHASES, None, "d"))) == 1
 
 
+def test_an_error_that_stays_is_traced_to_the_phase_it_arose_in():
+    jump = np.interp(TIME, [2.0, 2.4], [0, 4e-3])[:, None] * [1, 0, 0]
+    place = next(channel_places(residual(jump), PHASES, None, "d"))
+    assert (place.phase, place.arose) == ("insert", "free")
+    assert place.sentence().endswith("mostly from the free phase")
+    late = next(channel_places(residual(bump(3.2, 0.1, 4e-3)), PHASES, None, "d"))
+    assert late.arose == late.phase == "insert"
+    assert "mostly from" not in late.sentence()
+
+
 def test_a_residual_that_swings_points_to_and_fro():
     wave = np.sin(100 * TIME)[:, None] * [0, 2e-3, 0]
     place = next(channel_places(residual(wave), (), None, "d"))
