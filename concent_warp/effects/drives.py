@@ -143,7 +143,8 @@ class ActuatorSaturation(DriveEffect):
         joints = np.array([driven_joints(m, a)[0] for a in self.ids(m)])
         top = float(np.max(20 * m.dof_M0[dof_of(m, joints)]))
         scan = tuple(top * share for share in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2))
-        return (Parameter("limit", "N m", np.inf, 0.0, 100 * top, top, scan=scan),)
+        slide = (m.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)).all()
+        return (Parameter("limit", "N" if slide else "N m", np.inf, 0.0, 100 * top, top, scan=scan),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Limits of the force."""
