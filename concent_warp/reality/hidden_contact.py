@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import mujoco
 import numpy as np
 
@@ -20,19 +22,16 @@ def drawn_friction(rig: Rig) -> float:
 
 
 def instead(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
-    """Return the effect of other coefficients of sliding, which may depend on time and place."""
-    new = rub(coefficients, rig.body, rig.surface)
+    """Return the effect of other coefficients of sliding, which may depend on time and place.
+
+    Where the world rubs by a law of its own, only what is missing is added: friction is linear in the coefficients.
+    """
     if rig.physics.force is None:
         geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in own_geoms(rig)))
-        return HiddenEffect(name, edit=lambda spec: frictionless(spec, *geoms), force=new)
+        edit = partial(frictionless, geoms=geoms)
+        return HiddenEffect(name, edit=edit, force=rub(coefficients, rig.body, rig.surface))
     mu = drawn_friction(rig)
-    old = rub(lambda _t, _p: np.array([mu, mu]), rig.body, rig.surface, share=-1.0)
-
-    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        new(model, data)
-        old(model, data)
-
-    return HiddenEffect(name, force=force)
+    return HiddenEffect(name, force=rub(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
 
 
 def own_geoms(rig: Rig) -> np.ndarray:
@@ -64,11 +63,9 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
             geom.friction = friction
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        normal = sum(n for _, n in normal_forces(model, data, rig.body, rig.surface))
-        if not normal:
-            return
-        velocity = np.zeros(6)
         body = model.body(rig.body).id
+        normal = float(normal_forces(model, data, body, model.geom(rig.surface).id)[1].sum())
+        velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
         spin = velocity[:3] * np.array([rolling, rolling, not rolling])
         data.xfrc_applied[body, 3:] -= magnitude * normal * spin / np.hypot(np.linalg.norm(spin), FADE)

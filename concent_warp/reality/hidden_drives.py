@@ -80,24 +80,26 @@ def actuator_gain(rig: Rig, magnitude: float) -> Hidden:
     """Every drive's force is that of the drawing times a factor [-]."""
     found = drives(rig)
 
-    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def edit(spec: mujoco.MjSpec) -> None:
         for d in found:
-            data.qfrc_applied[model.joint(d.joint).dofadr[0]] += (magnitude - 1) * d.error_force(model, data)
+            actuator = spec.actuator(d.actuator)
+            actuator.gainprm = magnitude * np.array(actuator.gainprm)
+            actuator.biasprm = magnitude * np.array(actuator.biasprm)
 
     truth = each("gain", names(found), np.full(len(found), magnitude))
-    return Hidden("actuator_gain", HiddenEffect("actuator_gain", force=force), truth, names(found))
+    return Hidden("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
 
 
 def actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
     """No drive exceeds a limit [N m or N]."""
     found = drives(rig)
 
-    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def edit(spec: mujoco.MjSpec) -> None:
         for d in found:
-            asked = d.error_force(model, data)
-            data.qfrc_applied[model.joint(d.joint).dofadr[0]] += np.clip(asked, -magnitude, magnitude) - asked
+            limit = min(magnitude, d.limit)
+            spec.actuator(d.actuator).forcerange = [-limit, limit]
 
-    effect = HiddenEffect("actuator_saturation", force=force)
+    effect = HiddenEffect("actuator_saturation", edit=edit)
     return Hidden("actuator_saturation", effect, {"limit": magnitude}, names(found))
 
 

@@ -71,7 +71,8 @@ def frame_offset(rig: Rig, magnitude: float) -> Hidden:
             return time, rotation.apply(value) + shift
         return time, (rotation * Rotation.from_quat(value, scalar_first=True)).as_quat(scalar_first=True)
 
-    truth = dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, (*shift, *turn)), strict=True))
+    axes: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
+    truth = dict(zip(axes, map(float, (*shift, *turn)), strict=True))
     return Hidden("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
 
 

@@ -61,9 +61,9 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "magnet": (0.1, 0.25, 0.6),
     },
     "spin": {
-        "torsional_friction": (0.0032, 0.0035, 0.0045),
-        "rolling_friction": (0.0005, 0.0008, 0.0015),
-        "magnet": (0.01, 0.02, 0.05),
+        "torsional_friction": (0.00107, 0.00115, 0.0014),
+        "rolling_friction": (0.00041, 0.000425, 0.00047),
+        "magnet": (0.003, 0.007, 0.017),
     },
     "push": {
         "sliding_friction": (0.42, 0.54, 0.85),
@@ -117,9 +117,8 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
     },
     "insertion": {
         "joint_friction": (0.5, 1.0, 2.5),
-        "actuator_gain": (0.9, 0.8, 0.6),
-        "frame_offset": (4e-4, 1e-3, 2.5e-3),
-        "mass": (2.0, 4.0, 7.0),
+        "actuator_gain": (0.85, 0.65, 0.4),
+        "frame_offset": (3.5e-4, 8e-4, 2e-3),
     },
 }
 """By rig, by effect."""

@@ -51,15 +51,16 @@ def record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed:
     seeds = [1000 * seed + k for k in range(demonstrations)]
     recording, _ = record(cfg, seeds, effects=(HiddenEffect("finer step", edit=edit), *effects))
     told = [
-        replace(d, measured={name: later(channel) for name, channel in d.measured.items()}, points={}, success=None)
+        replace(d, measured={name: earlier(channel) for name, channel in d.measured.items()}, points={}, success=None)
         for d in recording.demonstrations
     ]
     return Recording(SCENE.xml, tuple(told), source="reality rig insertion")
 
 
-def later(channel: Channel) -> Channel:
-    """Return measurements on the clock of the commands, which act earlier than told by the lead of coarser steps."""
-    return replace(channel, time=channel.time + PHYSICS.lead)
+def earlier(channel: Channel) -> Channel:
+    """Return measurements as if commands had acted early by the lead of coarser steps; the first of them is lost."""
+    time = channel.time - PHYSICS.lead
+    return replace(channel, time=time[time >= 0], value=channel.value[time >= 0])
 
 
 SCENE = drawing()

@@ -56,7 +56,7 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 
 def glossy(spec: mujoco.MjSpec) -> None:
     """Leave friction to `rub`."""
-    frictionless(spec, "table", "block")
+    frictionless(spec, ("table", "block"))
 
 
 def coulomb(time: float, point: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ creep speed it fades, so that a body comes to rest within microns; it does not h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -19,46 +19,42 @@ Coefficients = Callable[[float, np.ndarray], np.ndarray]
 """Given time [s] and a point [m], world frame, returns the coefficients along the world's x and y (2,) [-]."""
 
 
-def frictionless(spec: mujoco.MjSpec, *geoms: str) -> None:
+def frictionless(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
     """Take the simulator's own friction from geoms."""
     for name in geoms:
         spec.geom(name).condim = 1
         spec.geom(name).friction = [1e-6, 1e-6, 1e-6]
 
 
-def normal_forces(
-    model: mujoco.MjModel, data: mujoco.MjData, body: str, surface: str
-) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield place [m], world frame, and normal force [N] of each contact of a body with a geom, of the step before."""
-    b, ground = model.body(body).id, model.geom(surface).id
-    wrench = np.zeros(6)
-    for i in range(data.ncon):
-        contact = data.contact[i]
-        pair = contact.geom
-        if contact.efc_address < 0 or ground not in pair:
-            continue
-        other = pair[0] if pair[1] == ground else pair[1]
-        if model.geom_bodyid[other] == b:
-            mujoco.mj_contactForce(model, data, i, wrench)
-            yield contact.pos, float(wrench[0])
+def normal_forces(model: mujoco.MjModel, data: mujoco.MjData, body: int, surface: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [m], world frame, shape (n, 3), and normal forces [N] (n,) of the contacts of a body with a geom.
+
+    Those of the step before; the world has elliptic cones, whose first force is the normal one.
+    """
+    contact = data.contact
+    geom, address = contact.geom, contact.efc_address
+    if not len(address):
+        return np.zeros((0, 3)), np.zeros(0)
+    other = np.where(geom[:, 0] == surface, geom[:, 1], geom[:, 0])
+    rows = (geom == surface).any(axis=1) & (address >= 0) & (model.geom_bodyid[other] == body)
+    return contact.pos[rows], data.efc_force[address[rows]]
 
 
-def rub(
-    coefficients: Coefficients, body: str, surface: str, share: float = 1.0
-) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
-    """Return the force hook of a body that slides on a level, fixed geom; a share of -1 takes friction back."""
+def rub(coefficients: Coefficients, body: str, surface: str) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
+    """Return the force hook of a body that slides on a level, fixed geom."""
+    velocity = np.zeros(6)
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(body).id
-        velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
-        for place, normal in normal_forces(model, data, body, surface):
-            arm = place - data.xipos[b]
-            slip = (velocity[3:] + np.cross(velocity[:3], arm))[:2]
-            mu = coefficients(data.time, place)
-            along = -share * normal * mu * slip / np.hypot(np.linalg.norm(slip), CREEP)
-            push = np.array([*along, 0.0])
-            data.xfrc_applied[b, :3] += push
-            data.xfrc_applied[b, 3:] += np.cross(arm, push)
+        wx, wy, wz, vx, vy, _ = velocity
+        centre = data.xipos[b]
+        for place, normal in zip(*normal_forces(model, data, b, model.geom(surface).id), strict=True):
+            x, y, z = place - centre
+            slip_x, slip_y = vx + wy * z - wz * y, vy + wz * x - wx * z
+            pressure = normal / (slip_x**2 + slip_y**2 + CREEP**2) ** 0.5
+            mu_x, mu_y = coefficients(data.time, place)
+            push_x, push_y = -pressure * mu_x * slip_x, -pressure * mu_y * slip_y
+            data.xfrc_applied[b] += (push_x, push_y, 0.0, -z * push_y, z * push_x, x * push_y - y * push_x)
 
     return force
