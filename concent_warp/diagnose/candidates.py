@@ -1,0 +1,52 @@
+"""Which effects may be missing from a model, on what."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from concent_warp.effects.effect import Effect
+from concent_warp.effects.registry import effect_class, effects
+from concent_warp.model import Model
+
+
+def candidates(model: Model, channels: Collection[str], names: Sequence[str] = ()) -> list[Effect]:
+    """Return the effects that a model could lack, each on each selection that it may apply to.
+
+    Args:
+        model: The model; what it has already is left out.
+        channels: Sensors that were measured: instruments that recorded nothing lack nothing.
+        names: Effects to take; all where empty.
+
+    Raises:
+        ModelError: There is no such effect.
+    """
+    m = model.compile()
+    chosen = [effect_class(name) for name in names] if names else list(effects().values())
+    found: list[Effect] = []
+    for kind in chosen:
+        for target in kind.targets(m):
+            if kind.kind == "sensor":
+                target = tuple(t for t in target if t in channels)
+                if not target:
+                    continue
+            effect = kind(*target)
+            if not held(model, effect):
+                found.append(effect)
+    return found
+
+
+def held(model: Model, effect: Effect) -> bool:
+    """Return whether a model has an effect already, on some of its target."""
+    return any(
+        a.effect.name == effect.name and (not effect.target or set(a.effect.target) & set(effect.target))
+        for a in model.effects
+    )
+
+
+def label(effect: Effect, among: Sequence[Effect]) -> str:
+    """Return the effect's name, with its target where several candidates share the name."""
+    if sum(e.name == effect.name for e in among) == 1 or not effect.target:
+        return effect.name
+    if len(effect.target) == 1:
+        return f"{effect.name}({effect.target[0]})"
+    return f"{effect.name}({effect.target[0]}, ...)"

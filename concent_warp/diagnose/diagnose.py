@@ -1,0 +1,298 @@
+"""Which physical effect is missing: the procedure from a recording and a model to a verdict.
+
+Cut the recording into windows, fit the model's own parameters and the initial states, screen all candidate effects by
+their sensitivities and a few scanned values, fit the most promising ones, and judge them on held-out blocks of time
+against what chance makes of the whole search. Add the best, and begin again with the model that has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blocks, sign_flip_p
+from concent_warp.diagnose.candidates import candidates, label
+from concent_warp.diagnose.check_data import check_data
+from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
+from concent_warp.diagnose.search import Candidate, Node, Screened, chance, fit_candidate, node, screen
+from concent_warp.errors import ModelError
+from concent_warp.fit.observe import observe
+from concent_warp.fit.prediction import Prediction
+from concent_warp.model import Model
+from concent_warp.recording.recording import Recording
+from concent_warp.simulate.select import EngineName
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DiagnosisCfg:
+    """Settings of a diagnosis."""
+
+    level: float = 0.05
+    """Probability of naming an effect where nothing is missing."""
+    least_gain: float = 0.05
+    """An effect must take away at least this share of the held-out error, unless its gain is beyond doubt."""
+    beyond_doubt: float = 5.0
+    """A gain this many times what chance reaches in `level` of all cases counts, however small a share it is."""
+    survivors: int = 8
+    """Candidates that are fitted, of all that are screened."""
+    additions: int = 3
+    """Most effects that are added."""
+    adequate: float = 1.25
+    """Residual over noise up to which a model counts as explaining the data."""
+    draws: int = 400
+    """Data sets without an effect that tell what chance reaches."""
+    effects: tuple[str, ...] = ()
+    """Names of the effects to consider; all where empty."""
+    window: float | None = None
+    """Length of a window [s]; by default as long as the motion allows."""
+    engine: EngineName = "mujoco"
+    """Engine."""
+    jobs: int = -1
+    """Processes at a time; -1: one a CPU. Others than joblib's own run them with `joblib.parallel_config`."""
+    seed: int = 0
+    """Seed of all that is drawn."""
+
+
+Progress = Callable[[float, str], None]
+"""Called with the share done, 0..1, and what is being done."""
+
+
+def diagnose(
+    model: Model, recording: Recording, cfg: DiagnosisCfg | None = None, progress: Progress | None = None
+) -> Diagnosis:
+    """Find which effect a model lacks to follow a recording.
+
+    Args:
+        model: The model; the parameters of the effects that it has are fitted too.
+        recording: What was commanded and measured.
+        cfg: Settings.
+        progress: See `Progress`.
+
+    Raises:
+        RecordingError: The recording says too little, or does not fit the model.
+        ModelError: The model diverges on all of the recording.
+        EngineError: The model cannot be simulated.
+    """
+    return Procedure(model, recording, cfg or DiagnosisCfg(), progress or silent).run()
+
+
+def silent(share: float, text: str) -> None:
+    """Say nothing, see `Progress`."""
+    del share, text
+
+
+class Procedure:
+    """One diagnosis on its way."""
+
+    def __init__(self, model: Model, recording: Recording, cfg: DiagnosisCfg, progress: Progress) -> None:
+        self.model, self.recording, self.cfg, self.progress = model, recording, cfg, progress
+        self.channels = {c for d in recording.demonstrations for c in d.measured}
+        self.findings: list[Finding] = []
+        self.groups: list[tuple[str, ...]] = []
+        self._done = 0.0
+
+    def run(self) -> Diagnosis:
+        """Go through the procedure."""
+        issues = check_data(self.recording)
+        self.progress(0.0, "cutting windows")
+        windows = observe(
+            self.model, self.recording, length=self.cfg.window, engine=self.cfg.engine, seed=self.cfg.seed
+        )
+        blocks = cut_blocks(windows)
+        self.progress(0.03, "fitting the model as it is")
+        base = node(self.model, windows, blocks, self.cfg.engine, None)
+        if not np.isfinite(base.ratio) or base.ratio > DIVERGED:
+            raise ModelError(
+                "the model does not stay finite on this recording",
+                where=self.model.scene.source,
+                fix="check time step, units and initial state, for instance with `concent compare`",
+            )
+        nodes, detectable = [base], ()
+        for step in range(self.cfg.additions):
+            self._done = 0.1 + 0.85 * step / self.cfg.additions
+            best, smallest = self.addition(nodes[-1], step)
+            detectable = detectable or smallest
+            if best is None:
+                break
+            self.progress(self._done, f"fitting the model with {best.effect.name}")
+            nodes.append(node(best.model, windows, blocks, self.cfg.engine, None))
+        self.progress(1.0, "done")
+        return self.conclude(nodes, detectable, issues)
+
+    def addition(self, base: Node, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
+        """Look for one effect that the node's model lacks; return it, and what could have been seen."""
+        chosen = candidates(base.model, self.channels, self.cfg.effects)
+        span = 0.85 / self.cfg.additions
+        screened = self.parallel(screen, [(base, e) for e in chosen], "screening", 0.4 * span)
+        null = chance(base, screened, self.cfg.draws, self.cfg.seed)
+        critical = float(np.quantile(null, 1 - self.cfg.level))
+        smallest = tuple(found for s in screened if (found := detectable_size(base, s, critical)) is not None)
+        promising = sorted(screened, key=lambda s: -s.promise)
+        survivors = [s for s in promising if s.promise > 0.25 * critical][: self.cfg.survivors]
+        fitted = self.parallel(fit_candidate, [(base, s) for s in survivors], "fitting", 0.6 * span)
+        findings = [self.finding(base, c, null, critical, step, chosen) for c in fitted]
+        good = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
+        if not good:
+            self.findings += sorted(findings, key=lambda f: -f.gain)
+            return None, smallest
+        group = alike(base, good)
+        self.groups.append(tuple(f.name for _, f in group))
+        first = group[0][1]
+        rest = sorted((f for f in findings if f is not first), key=lambda f: -f.gain)
+        self.findings.append(first)
+        self.findings += [replace(f, accepted=False, reason=f.reason or "another one explains more") for f in rest]
+        return group[0][0], smallest
+
+    def finding(
+        self, base: Node, c: Candidate, null: np.ndarray, critical: float, step: int, among: Sequence[Any]
+    ) -> Finding:
+        """Return a fitted candidate with its evidence."""
+        rng = np.random.default_rng(self.cfg.seed)
+        share = c.share(base.errors)
+        low, high = bootstrap_interval(c.gain, base.errors, base.blocks.demonstration, rng)
+        p = float((1 + np.sum(null >= share)) / (len(null) + 1))
+        parameters = fitted_parameters(base, c)
+        reason = ""
+        if p > self.cfg.level:
+            reason = "no better than chance"
+        elif share < self.cfg.least_gain and share < self.cfg.beyond_doubt * critical:
+            reason = f"takes away less than {100 * self.cfg.least_gain:.0f} % of the error"
+        elif low <= 0:
+            reason = "the interval of its gain includes none"
+        elif not any(q.excludes_null for q in parameters):
+            reason = "its parameters may be at their null values"
+        return Finding(
+            label(c.effect, among),
+            c.effect.target,
+            c.effect.family,
+            parameters,
+            share,
+            low,
+            high,
+            p,
+            sign_flip_p(c.gain, rng),
+            not reason,
+            step,
+            removed(base, c),
+            reason,
+        )
+
+    def parallel(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], text: str, span: float) -> list[T]:
+        """Do independent pieces of work, in processes where more than one is allowed; results in the tasks' order."""
+        results: list[T] = []
+        for i, result in enumerate(run_all(work, tasks, self.cfg.jobs)):
+            results.append(result)
+            self.progress(self._done + span * (i + 1) / max(len(tasks), 1), f"{text}, {i + 1} of {len(tasks)}")
+        self._done += span
+        return results
+
+    def conclude(self, nodes: Sequence[Node], detectable: tuple[Detectable, ...], issues: Sequence[str]) -> Diagnosis:
+        """Return the verdict."""
+        first, last = nodes[0].ratio, nodes[-1].ratio
+        beyond = max(first**2 - 1.0, 1e-9)
+        unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > self.cfg.adequate else 0.0
+        verdict: Verdict = "none_needed"
+        if last > self.cfg.adequate:
+            verdict = "none_of_these"
+        elif len(nodes) > 1:
+            verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
+        return Diagnosis(
+            verdict=verdict,
+            effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
+            groups=tuple(self.groups),
+            where=(),
+            unexplained=unexplained,
+            ratio=tuple(n.ratio for n in nodes),
+            detectable=detectable,
+            next_experiment=None,
+            issues=tuple(issues),
+            models=tuple(n.model for n in nodes),
+            seed=self.cfg.seed,
+        )
+
+
+DIVERGED = 300.0
+"""Residual over noise that only a simulation which has diverged reaches."""
+SAME = 0.02
+"""Gains that differ by less than this share of the error are taken for the same."""
+
+
+def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
+    """Yield the results of independent pieces of work in order, by joblib where several may run at a time."""
+    if jobs == 1 or len(tasks) < 2:
+        return (work(*task) for task in tasks)
+    from joblib import Parallel, delayed
+
+    return Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks)
+
+
+def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
+    """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks)."""
+    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
+    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    found = []
+    for k in range(prediction.owned, len(prediction.parameters)):
+        p, value = prediction.parameters[k], float(c.fit.values[k])
+        reach = 1.96 * spread[k] * p.scale
+        low, high = max(value - reach, p.low), min(value + reach, p.high)
+        found.append(FittedParameter(p.name, value, float(low), float(high), p.unit, p.null))
+    return tuple(found)
+
+
+def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
+    """Return by how much the squared residual of each channel falls, as a share, most first."""
+    before: dict[str, float] = {}
+    after: dict[str, float] = {}
+    for window, old, new in zip(base.windows, base.pieces, c.pieces, strict=True):
+        for r in window.readings:
+            before[r.channel] = before.get(r.channel, 0.0) + float(np.sum(old.residual[r.rows] ** 2))
+            after[r.channel] = after.get(r.channel, 0.0) + float(np.sum(new.residual[r.rows] ** 2))
+    shares = {name: 1.0 - after[name] / max(value, 1e-12) for name, value in before.items()}
+    return tuple(sorted(((n, s) for n, s in shares.items() if s > 0), key=lambda pair: -pair[1]))
+
+
+def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[Candidate, Finding]]:
+    """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
+
+    Gains are the same where they differ by less than 2 standard errors over the blocks, or by `SAME` of the error.
+    Among equals those come first that need fewer parameters and smaller values of them.
+    """
+    best = max(good, key=lambda pair: pair[1].gain)
+    group = []
+    for c, f in good:
+        difference = best[0].gain - c.gain
+        error = np.sqrt(len(difference)) * difference.std()
+        if difference.sum() <= max(2 * error, SAME * base.errors.sum()):
+            group.append((c, f))
+    return sorted(group, key=lambda pair: -plausibility(base, *pair))
+
+
+def plausibility(base: Node, c: Candidate, f: Finding) -> float:
+    """Return twice the log posterior, up to a constant: the gain, less Schwarz's cost of parameters and their prior."""
+    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
+    scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
+    away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
+    return float(c.gain.sum() - len(scale) * np.log(base.blocks.count) - away @ away)
+
+
+def detectable_size(base: Node, s: Screened, critical: float) -> Detectable | None:
+    """Return the smallest size of a candidate that the search would have found in half of all cases.
+
+    A parameter off its null value by x adds H x^2 to the error, which must exceed what chance reaches.
+    """
+    prediction = Prediction(base.model, (s.effect,), base.windows, engine=base.engine)
+    normal = sum(piece.jacobian.T @ piece.jacobian for piece in s.pieces)
+    needed = max(critical, 0.0) * base.errors.sum()
+    best = None
+    for k in range(prediction.owned, len(prediction.parameters)):
+        p, curvature = prediction.parameters[k], float(np.asarray(normal)[k, k])
+        if np.isfinite(p.null) and curvature > 1e-12:
+            size = p.scale * np.sqrt(needed / curvature)
+            if size < p.high - p.low and (best is None or size / p.scale < best[0]):
+                best = size / p.scale, Detectable(s.effect.name, p.name, float(size), p.unit)
+    return None if best is None else best[1]

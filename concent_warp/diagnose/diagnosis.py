@@ -1,0 +1,195 @@
+"""What a diagnosis answers: which effect is missing, how sure that is, where it shows, or why none can be named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from concent_warp.model import Model
+
+Verdict = Literal["effect", "group", "none_needed", "none_of_these"]
+VERDICTS: dict[Verdict, str] = {
+    "effect": "an effect is missing, and the data say which",
+    "group": "an effect is missing; the data cannot tell which of a few",
+    "none_needed": "no discrepancy detected",
+    "none_of_these": "something is missing that no effect in the library explains",
+}
+"""Verdicts in words."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter of an effect, fitted."""
+
+    name: str
+    value: float
+    low: float
+    """Lower end of the 95 % interval."""
+    high: float
+    """Upper end."""
+    unit: str
+    null: float
+    """Value at which the effect does nothing."""
+
+    @property
+    def excludes_null(self) -> bool:
+        """Whether the interval excludes the null value; a limit that is infinite by default is excluded if finite."""
+        return bool(np.isfinite(self.high)) if np.isinf(self.null) else not self.low <= self.null <= self.high
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect with its evidence."""
+
+    name: str
+    target: tuple[str, ...]
+    family: str
+    parameters: tuple[FittedParameter, ...]
+    gain: float
+    """Share of the held-out error that it takes away [-]."""
+    low: float
+    """Lower end of the 95 % interval of the gain."""
+    high: float
+    """Upper end."""
+    p: float
+    """Probability that the best of all candidates gains as much where nothing is missing."""
+    sign_p: float
+    """Probability of a gain of this size if the sign of each block's gain were chance; of this effect alone."""
+    accepted: bool
+    step: int
+    """Which addition it is a candidate for: 0 the first, 1 the second after the first was added."""
+    removes: tuple[tuple[str, float], ...]
+    """Channels whose residual falls, with the share of the channel's squared residual that goes, most first."""
+    reason: str = ""
+    """Why it was not accepted, where it was not."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the finding in plain types."""
+        return {
+            "name": self.name,
+            "target": list(self.target),
+            "family": self.family,
+            "parameters": [
+                {
+                    "name": p.name,
+                    "value": number(p.value),
+                    "interval": [number(p.low), number(p.high)],
+                    "unit": p.unit,
+                    "null": number(p.null),
+                }
+                for p in self.parameters
+            ],
+            "gain": {"value": self.gain, "interval": [self.low, self.high]},
+            "p": self.p,
+            "p_sign_flip": self.sign_p,
+            "accepted": self.accepted,
+            "step": self.step,
+            "removes": [{"channel": name, "share": share} for name, share in self.removes],
+            **({"reason": self.reason} if self.reason else {}),
+        }
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """The smallest size of an effect that this recording would have shown."""
+
+    name: str
+    parameter: str
+    size: float
+    """Difference from the null value."""
+    unit: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Which physical effect a model lacks."""
+
+    verdict: Verdict
+    effects: tuple[Finding, ...]
+    """What was accepted, then what else was fitted, best first."""
+    groups: tuple[tuple[str, ...], ...]
+    """Names that the data cannot tell apart, one tuple an addition; the likeliest first."""
+    where: tuple[Mapping[str, Any], ...]
+    """Where the model that was given is farthest off: channel, phase, start and end [s], body, direction, ratio."""
+    unexplained: float
+    """Share of the squared residual beyond the noise that the final model leaves, of that of the first."""
+    ratio: tuple[float, ...]
+    """Residual over noise of the model as given, and after each addition."""
+    detectable: tuple[Detectable, ...]
+    next_experiment: str | None
+    issues: tuple[str, ...]
+    """What is wrong or doubtful with the data themselves."""
+    models: tuple[Model, ...] = field(repr=False)
+    """The model as given, its own parameters fitted, and after each addition."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seed: int = 0
+
+    @property
+    def model(self) -> Model:
+        """The model with all that was accepted."""
+        return self.models[-1]
+
+    @property
+    def accepted(self) -> tuple[Finding, ...]:
+        """The effects that were accepted, in the order of their addition."""
+        return tuple(f for f in self.effects if f.accepted)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the diagnosis in plain types, as documented in ``docs/diagnose.md``."""
+        return {
+            "verdict": self.verdict,
+            "effects": [f.to_json() for f in self.effects],
+            "groups": [list(group) for group in self.groups],
+            "where": [dict(place) for place in self.where],
+            "unexplained": self.unexplained,
+            "ratio": list(self.ratio),
+            "detectable": [
+                {"name": d.name, "parameter": d.parameter, "size": number(d.size), "unit": d.unit}
+                for d in self.detectable
+            ],
+            "next_experiment": self.next_experiment,
+            "issues": list(self.issues),
+            "versions": dict(self.versions),
+            "seed": self.seed,
+        }
+
+    def sentences(self) -> list[str]:
+        """Return the answer in words."""
+        said = []
+        if self.verdict == "none_needed":
+            said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
+            if self.detectable:
+                shown = "; ".join(f"{d.name} {d.size:.2g} {d.unit}" for d in self.detectable[:6])
+                said.append(f"Smallest that would have been seen: {shown}.")
+        for k, finding in enumerate(self.accepted):
+            group = self.groups[k] if k < len(self.groups) else (finding.name,)
+            values = ", ".join(
+                f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}] {p.unit}" for p in finding.parameters[:4]
+            )
+            lead = "Missing" if k == 0 else "Then missing"
+            said.append(
+                f"{lead}: {finding.name} ({values}). Held-out error falls by {100 * finding.gain:.0f} % "
+                f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], p {finding.p:.2g}."
+            )
+            if len(group) > 1:
+                said.append(f"The data cannot tell it from {joined(group[1:])}.")
+        if self.verdict == "none_of_these":
+            said.append(
+                f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
+            )
+        if self.next_experiment:
+            said.append(f"Next: {self.next_experiment}")
+        return [*self.issues, *said]
+
+
+def number(value: float) -> float | None:
+    """Return a number that JSON can hold; None for one that is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
+def joined(names: Sequence[str]) -> str:
+    """Return names as a list in words."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"

@@ -1,0 +1,219 @@
+"""The search for a missing effect: screen all candidates cheaply, fit what survives, judge on held-out data.
+
+Each function here is one step and one unit of parallel work: it takes plain data and returns plain data, so that it
+runs in a thread, a process or on a cluster alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from concent_warp.diagnose.blocks import Blocks, HeldOut, Sums, block_sums
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.least_squares import (
+    HUBER,
+    Fit,
+    FitCfg,
+    Linear,
+    Solver,
+    huber,
+    huber_limit,
+    huber_weight,
+    projected,
+)
+from concent_warp.fit.observation import Window
+from concent_warp.fit.prediction import Prediction
+from concent_warp.model import Model
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class Node:
+    """A model with its own parameters and the initial states fitted: what a candidate has to beat."""
+
+    model: Model
+    windows: tuple[Window, ...]
+    blocks: Blocks
+    fit: Fit
+    pieces: tuple[Linear, ...]
+    """Residuals and sensitivities to the model's own parameters, initial states eliminated."""
+    limit: float
+    """Where the robust loss turns linear."""
+    errors: np.ndarray
+    """Held-out error of each block, shape (B,)."""
+    rows: np.ndarray
+    """Number of residuals in each block, shape (B,)."""
+    engine: EngineName = "mujoco"
+
+    @property
+    def ratio(self) -> float:
+        """Root mean square of the residuals over the noise, robust: 1 where the model explains all but noise."""
+        return noise_ratio(self.pieces)
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What a look at a candidate has shown, without a fit."""
+
+    effect: Effect
+    gain: float
+    """Share of the held-out error that a fit would take away, by linear extrapolation."""
+    scanned: float
+    """Share that the best of the scanned values takes away; 0 where there is none."""
+    start: np.ndarray
+    """Values of all parameters from which a fit is to start, shape (P,)."""
+    pieces: tuple[Linear, ...]
+    """Sensitivities at the null value, initial states eliminated."""
+    simulated: float
+
+    @property
+    def promise(self) -> float:
+        """The larger of the two."""
+        return max(self.gain, self.scanned)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A candidate that was fitted."""
+
+    effect: Effect
+    model: Model
+    """The model with it."""
+    fit: Fit
+    sums: Sums
+    pieces: tuple[Linear, ...]
+    gain: np.ndarray
+    """Fall of the held-out error of each block against the node, shape (B,)."""
+    ratio: float
+    """Residual over noise that is left."""
+    simulated: float
+
+    def share(self, errors: np.ndarray) -> float:
+        """Return the gain as a share of the node's held-out error."""
+        return float(self.gain.sum() / max(errors.sum(), 1e-12))
+
+
+def noise_ratio(pieces: Sequence[Linear]) -> float:
+    """Return the root mean square of residuals in units of noise, rows beyond `HUBER` times it weighed down."""
+    pooled = np.concatenate([piece.residual for piece in pieces])
+    return float(np.sqrt(np.mean(2 * huber(pooled, HUBER))))
+
+
+def node(model: Model, windows: Sequence[Window], blocks: Blocks, engine: EngineName, threads: int | None) -> Node:
+    """Fit a model's own parameters and the initial states."""
+    solver = Solver(Prediction(model, (), windows, engine=engine, threads=threads))
+    fit = solver.fit()
+    if len(fit.values):
+        fit = solver.polish(fit)
+        model = solver.p.model(fit.values)
+    pieces = tuple(projected(fit))
+    limit = huber_limit([piece.residual for piece in pieces])
+    errors = HeldOut(block_sums(pieces, blocks, limit), blocks).own()
+    rows = np.bincount(np.concatenate(blocks.of_row), minlength=blocks.count)
+    return Node(model, tuple(windows), blocks, fit, pieces, limit, errors, rows, engine)
+
+
+def screen(base: Node, effect: Effect) -> Screened:
+    """Look at what a candidate could do, from its sensitivities and a few scanned values."""
+    prediction = Prediction(base.model, (effect,), base.windows, engine=base.engine, threads=1)
+    solver = Solver(prediction)
+    values = prediction.start.copy()
+    pieces = eliminated(solver, base, sensitive_start(solver, values))
+    # What matters is the residual of the node itself; at a start off the null value it is another.
+    pieces = tuple(replace(piece, residual=known.residual) for piece, known in zip(pieces, base.pieces, strict=True))
+    errors = HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
+    gain = float((base.errors.sum() - errors.sum()) / max(base.errors.sum(), 1e-12))
+    scanned, start = scan(solver, base, values)
+    return Screened(effect, gain, scanned, start, pieces, prediction.simulated)
+
+
+def sensitive_start(solver: Solver, values: np.ndarray) -> np.ndarray:
+    """Return where sensitivities are taken: the null values, and finite values for limits that are infinite there."""
+    return np.where(np.isfinite(values), values, solver.scale)
+
+
+def eliminated(solver: Solver, base: Node, values: np.ndarray) -> tuple[Linear, ...]:
+    """Return sensitivities with the initial states eliminated, at the node's initial states."""
+    linear = solver.linearise(values, base.fit.offsets)
+    return tuple(projected(replace(base.fit, linear=linear)))
+
+
+def scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndarray]:
+    """Try the values that parameters name for that; return the best one's gain, and where a fit is to start."""
+    trials = []
+    for k, parameter in enumerate(solver.p.parameters):
+        if k < solver.p.owned:
+            continue
+        for value in parameter.scan:
+            moved = values.copy()
+            moved[k] = value
+            trials.append(moved)
+    finite = np.where(np.isfinite(values), values, solver.high)
+    best, start = 0.0, finite
+    if not trials:
+        return best, start
+    before = total(base, [piece.residual for piece in base.pieces])
+    for moved in trials:
+        residuals = solver.p.residuals(solver.trials(moved, base.fit.offsets))
+        rest = []
+        for r, a, o in zip(residuals, base.fit.starts, base.fit.offsets, strict=True):
+            inner = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ r + o)
+            rest.append(r - a @ inner)
+        gain = (before - total(base, rest)) / max(before, 1e-12)
+        if gain > best:
+            best, start = gain, moved
+    return best, start
+
+
+def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
+    """Return the robust sum of squares of projected residuals."""
+    return float(2 * sum(huber(r, base.limit).sum() for r in residuals))
+
+
+def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> Candidate:
+    """Fit a candidate together with the model's own parameters and the initial states."""
+    prediction = Prediction(base.model, (screened.effect,), base.windows, engine=base.engine, threads=1)
+    solver = Solver(prediction, cfg)
+    fit = solver.fit(screened.start, base.fit.offsets, base.fit.starts)
+    return judged(base, screened.effect, solver, solver.polish(fit))
+
+
+def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
+    """Return a fitted candidate with its held-out gain over the node."""
+    pieces = tuple(projected(fit))
+    sums = block_sums(pieces, base.blocks, base.limit)
+    errors = HeldOut(sums, base.blocks).own()
+    return Candidate(
+        effect,
+        solver.p.model(fit.values),
+        fit,
+        sums,
+        pieces,
+        base.errors - errors,
+        noise_ratio(pieces),
+        solver.p.simulated,
+    )
+
+
+def chance(base: Node, screened: Sequence[Screened], draws: int, seed: int) -> np.ndarray:
+    """Return the largest gain of all candidates on data that lack nothing, as a share of the error, shape (draws,).
+
+    See `concent_warp.diagnose.blocks` for how such data are made.
+    """
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([-1.0, 1.0], size=(draws, base.blocks.count))
+    weight = [np.sqrt(huber_weight(piece.residual, base.limit)) for piece in base.pieces]
+    square = np.zeros(base.blocks.count)
+    for piece, w, rows in zip(base.pieces, weight, base.blocks.of_row, strict=True):
+        square += np.bincount(rows, (piece.residual * w) ** 2, minlength=base.blocks.count)
+    own = HeldOut(block_sums(base.pieces, base.blocks, base.limit), base.blocks)
+    before = own.errors(signs[..., None] * own.sums.slope, square).sum(axis=1)
+    best = np.full(draws, -np.inf)
+    for s in screened:
+        held = HeldOut(block_sums(s.pieces, base.blocks, base.limit), base.blocks)
+        after = held.errors(signs[..., None] * held.sums.slope, square).sum(axis=1)
+        best = np.maximum(best, (before - after) / np.maximum(before, 1e-12))
+    return best

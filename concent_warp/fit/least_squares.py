@@ -1,0 +1,387 @@
+"""Effect parameters and initial states by bounded, robust least squares.
+
+Unknown are P parameters, common to all windows, and for each window the error of its initial state. The initial states
+are eliminated window by window (Schur complement of the arrowhead normal equations: Bock 1983; Golub and Pereyra,
+"Separable nonlinear least squares", Inverse Problems 19, 2003), so that a step costs P + 1 simulations of each window;
+how residuals depend on the initial states is computed once and kept. Steps are damped (Levenberg, Marquardt). Residuals
+count by Huber's loss about their own spread, so that a few outliers do not decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from concent_warp.fit.prediction import Prediction, Trial
+
+HUBER = 4.0
+"""Residuals beyond this many times their spread count linearly."""
+PRIOR = 10.0
+"""Weak prior of a parameter, in units of its typical scale."""
+STEP = 0.1
+"""Step of a finite difference, in units of a parameter's typical scale, at first."""
+WANTED = 3.0
+"""Mean change of the residuals that a finite difference aims at, in units of noise: contacts make motion jump a little
+from value to value, so that smaller steps measure the jumps."""
+
+
+DAMPINGS = (1e-3, 1e-1, 3.0)
+"""Dampings that are tried in turn on initial states."""
+PROBE = 1.0
+"""Step of a finite difference of the initial state, in units of its spread."""
+
+
+@dataclass(frozen=True)
+class FitCfg:
+    """Settings of a fit of effect parameters."""
+
+    iterations: int = 10
+    """Most steps."""
+    tolerance: float = 1e-3
+    """The fit ends when a step lowers the cost by less than this share."""
+    damping: float = 1e-3
+    """Damping at first, relative to the curvature."""
+    refits: int = 3
+    """How often initial states may be fitted anew where a step does not bring what it promised."""
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Residuals of one window about a point, with their dependence on the parameters."""
+
+    residual: np.ndarray
+    """Residuals r in units of noise, shape (n,)."""
+    jacobian: np.ndarray
+    """dr / d(parameter / scale), shape (n, P)."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit."""
+
+    values: np.ndarray
+    """Parameters, shape (P,)."""
+    offsets: tuple[np.ndarray, ...]
+    """Errors of the initial states, one (2 nv,) a window."""
+    cost: float
+    """Robust cost, initial states and priors included."""
+    linear: tuple[Linear, ...]
+    """Residuals and sensitivities at the end, by window."""
+    starts: tuple[np.ndarray, ...]
+    """dr / d(initial state / spread), one (n, 2 nv) a window."""
+    converged: bool
+    simulated: float
+    """Simulated time [s]."""
+
+
+@dataclass(frozen=True)
+class _State:
+    """A point of a fit."""
+
+    values: np.ndarray
+    offsets: list[np.ndarray]
+    cost: float
+    starts: tuple[np.ndarray, ...]
+    refits: int
+    """How often initial states may still be fitted anew."""
+
+
+class Solver:
+    """Fits the parameters of one prediction."""
+
+    def __init__(self, prediction: Prediction, cfg: FitCfg | None = None) -> None:
+        """Prepare to fit `prediction`."""
+        self.p = prediction
+        self.cfg = cfg or FitCfg()
+        self.scale = np.array([q.scale for q in prediction.parameters])
+        self.low = np.array([q.low for q in prediction.parameters])
+        self.high = np.array([q.high for q in prediction.parameters])
+        self.step = np.full(len(self.scale), STEP)
+
+    def start_sensitivity(
+        self, values: np.ndarray, offsets: Sequence[np.ndarray] | None = None
+    ) -> tuple[np.ndarray, ...]:
+        """Return how the residuals depend on the initial states, dr / d(offset / spread), one (n, 2 nv) a window."""
+        trials = []
+        for w, window in enumerate(self.p.windows):
+            base = np.zeros(len(window.spread)) if offsets is None else offsets[w] * window.spread
+            trials.append(Trial(w, values, base))
+            for k, spread in enumerate(window.spread):
+                moved = base.copy()
+                moved[k] += PROBE * spread
+                trials.append(Trial(w, values, moved))
+        residuals = self.p.residuals(trials)
+        found, at = [], 0
+        for window in self.p.windows:
+            size = len(window.spread)
+            base = residuals[at]
+            columns = np.stack([(r - base) / PROBE for r in residuals[at + 1 : at + 1 + size]], axis=1)
+            wild = np.abs(columns).max(axis=0) > 0.5 * np.abs(base).max() + 1e2
+            columns[:, wild] = 0.0
+            found.append(columns)
+            at += 1 + size
+        return tuple(found)
+
+    def refine_starts(
+        self, values: np.ndarray, offsets: Sequence[np.ndarray], rounds: int = 3
+    ) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
+        """Fit the initial states alone, each window by itself, at fixed parameters.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states in units of their spread, where to start.
+            rounds: How often the dependence on the initial states is computed.
+
+        Returns:
+            The errors of the initial states, and how the residuals depend on them at the last round, see `Fit.starts`.
+        """
+        offsets = [np.array(o) for o in offsets]
+        starts: tuple[np.ndarray, ...] = ()
+        residuals = self.p.residuals(self.trials(values, offsets))
+        for _ in range(rounds):
+            starts = self.start_sensitivity(values, offsets)
+            limit = huber_limit(residuals)
+            costs = [start_cost(r, o, limit) for r, o in zip(residuals, offsets, strict=True)]
+            open_windows = set(range(len(offsets)))
+            for damping in DAMPINGS:
+                chosen = sorted(open_windows)
+                moved = {
+                    w: offsets[w] + start_step(residuals[w], starts[w], offsets[w], limit, damping) for w in chosen
+                }
+                trials = [Trial(w, values, moved[w] * self.p.windows[w].spread) for w in chosen]
+                for w, r in zip(chosen, self.p.residuals(trials), strict=True):
+                    cost = start_cost(r, moved[w], limit)
+                    if cost < costs[w]:
+                        open_windows.discard(w)
+                        offsets[w], residuals[w], costs[w] = moved[w], r, cost
+                if not open_windows:
+                    break
+        return offsets, starts
+
+    def polish(self, fit: Fit) -> Fit:
+        """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
+
+        Initial states that have made up for a wrong parameter do not always find back on their own.
+        """
+        here, starts = self.refine_starts(fit.values, fit.offsets, rounds=1)
+        measured, others = self.refine_starts(fit.values, [np.zeros_like(o) for o in here], rounds=2)
+        pairs = [self.p.residuals(self.trials(fit.values, offsets)) for offsets in (here, measured)]
+        limit = huber_limit(pairs[0])
+        better = [
+            start_cost(b, n, limit) < start_cost(a, o, limit) for a, b, o, n in zip(*pairs, here, measured, strict=True)
+        ]
+        offsets = [n if new else o for n, o, new in zip(measured, here, better, strict=True)]
+        chosen = tuple(n if new else o for n, o, new in zip(others, starts, better, strict=True))
+        return self.fit(fit.values, offsets, chosen)
+
+    def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
+        """Return one trial a window."""
+        return [Trial(w, values, offset * self.p.windows[w].spread) for w, offset in enumerate(offsets)]
+
+    def linearise(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> tuple[Linear, ...]:
+        """Return residuals and sensitivities at a point; `offsets` in units of their spread."""
+        count, size = len(self.p.windows), len(self.scale)
+        dynamic = [k for k in range(size) if not self.p.measured_only[k]]
+        steps = self._steps(values)
+        trials = self.trials(values, offsets)
+        for k in dynamic:
+            moved = values.copy()
+            moved[k] += steps[k]
+            trials += self.trials(moved, offsets)
+        readers = self.p.readers(trials)
+        base = [self.p.observed(w, readers[w], values) for w in range(count)]
+        jacobian = [np.zeros((len(r), size)) for r in base]
+        for i, k in enumerate(dynamic):
+            for w in range(count):
+                row = (i + 1) * count + w
+                jacobian[w][:, k] = (self.p.observed(w, readers[row], trials[row].values) - base[w]) / steps[k]
+        for k in set(range(size)) - set(dynamic):
+            moved = values.copy()
+            moved[k] += steps[k]
+            for w in range(count):
+                jacobian[w][:, k] = (self.p.observed(w, readers[w], moved) - base[w]) / steps[k]
+        self._adapt(jacobian)
+        return tuple(Linear(r, j * self.scale) for r, j in zip(base, jacobian, strict=True))
+
+    def _steps(self, values: np.ndarray) -> np.ndarray:
+        """Return the steps of finite differences, away from the bounds."""
+        steps = self.step * self.scale
+        return np.where(values + steps > self.high, -steps, steps)
+
+    def _adapt(self, jacobian: Sequence[np.ndarray]) -> None:
+        """Choose steps for the next time that change the residuals enough to be seen and little enough to be linear."""
+        change = np.sqrt(np.mean(np.concatenate(jacobian) ** 2, axis=0)) * self.scale
+        wanted = np.where(change > 0, WANTED / np.maximum(change, 1e-12), 1.0)
+        self.step = np.clip(wanted, 0.01, 0.3)
+
+    def fit(
+        self,
+        values: np.ndarray | None = None,
+        offsets: Sequence[np.ndarray] | None = None,
+        starts: tuple[np.ndarray, ...] | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Fit:
+        """Fit from a start.
+
+        Args:
+            values: Parameters at the start, shape (P,); by default as the model has them, or their null values.
+            offsets: Errors of the initial states in units of their spread.
+            starts: See `Fit.starts`; computed where not given.
+            progress: Called with the share done, 0..1.
+        """
+        values = self.inside(self.p.start if values is None else values)
+        offsets = [np.zeros(len(w.spread)) for w in self.p.windows] if offsets is None else list(offsets)
+        if starts is None:
+            offsets, starts = self.refine_starts(values, offsets)
+        if not len(values):
+            linear = self.linearise(values, offsets)
+            cost = self.cost([piece.residual for piece in linear], offsets, values)
+            return Fit(values, tuple(offsets), cost, linear, starts, True, self.p.simulated)
+        damping, refits, converged = self.cfg.damping, self.cfg.refits, False
+        linear = self.linearise(values, offsets)
+        cost = self.cost([piece.residual for piece in linear], offsets, values)
+        for iteration in range(self.cfg.iterations):
+            state = _State(values, list(offsets), cost, starts, refits)
+            found, damping = self._advance(state, linear, damping)
+            refits = found.refits
+            gain = (cost - found.cost) / max(cost, 1e-12)
+            if found.cost < cost:
+                values, offsets, cost, starts = found.values, found.offsets, found.cost, found.starts
+                linear = self.linearise(values, offsets)
+            if progress is not None:
+                progress((iteration + 1) / self.cfg.iterations)
+            if gain < self.cfg.tolerance:
+                converged = True
+                break
+        return Fit(values, tuple(offsets), cost, linear, starts, converged, self.p.simulated)
+
+    def _advance(self, state: _State, linear: Sequence[Linear], damping: float) -> tuple[_State, float]:
+        """Return a better point, or the same one where there is none, and the next damping.
+
+        A step takes the dependence on the initial states as it was computed last. Where it brings less than a quarter
+        of what it promised, they are fitted anew at the new parameters before it is judged.
+        """
+        for _ in range(5):
+            move, moves = self.solve(linear, state.starts, state.offsets, state.values, damping)
+            values = self.inside(state.values + move * self.scale)
+            offsets = [o + m for o, m in zip(state.offsets, moves, strict=True)]
+            expected = [
+                piece.residual + piece.jacobian @ move + a @ m
+                for piece, a, m in zip(linear, state.starts, moves, strict=True)
+            ]
+            promised = state.cost - self.cost(expected, offsets, values)
+            cost = self.cost(self.p.residuals(self.trials(values, offsets)), offsets, values)
+            good = state.cost - cost > 0.25 * max(promised, 0.0)
+            if cost < state.cost and (good or not state.refits):
+                return _State(values, offsets, cost, state.starts, state.refits), max(damping / 5, 1e-6)
+            if state.refits:
+                begin = state.offsets if cost > 2 * state.cost else offsets
+                refitted, starts = self.refine_starts(values, begin, rounds=1)
+                again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values)
+                state = replace(state, refits=state.refits - 1)
+                if again < state.cost:
+                    return _State(values, refitted, again, starts, state.refits), damping
+            damping = max(damping * 8, 1e-2)
+        return state, damping
+
+    def inside(self, values: np.ndarray) -> np.ndarray:
+        """Return values within their bounds; infinite ones stay."""
+        return np.where(np.isinf(values), values, np.clip(values, self.low, self.high))
+
+    def prior(self, values: np.ndarray) -> np.ndarray:
+        """Return the parameters' distances from where the fit started, in units of their weak prior."""
+        start = np.where(np.isfinite(self.p.start), self.p.start, values)
+        finite = np.isfinite(values)
+        return np.where(finite, (values - start) / (PRIOR * self.scale), 0.0)
+
+    def cost(self, residuals: Sequence[np.ndarray], offsets: Sequence[np.ndarray], values: np.ndarray) -> float:
+        """Return half the robust sum of squares, with the priors."""
+        limit = huber_limit(residuals)
+        total = sum(float(huber(r, limit).sum()) for r in residuals)
+        total += 0.5 * sum(float(o @ o) for o in offsets)
+        prior = self.prior(values)
+        return total + 0.5 * float(prior @ prior)
+
+    def solve(
+        self,
+        linear: Sequence[Linear],
+        starts: Sequence[np.ndarray],
+        offsets: Sequence[np.ndarray],
+        values: np.ndarray,
+        damping: float,
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the damped step of the parameters, in units of their scale, and of each initial state."""
+        size = len(self.scale)
+        limit = huber_limit([piece.residual for piece in linear])
+        normal, slope = np.eye(size) / PRIOR**2, self.prior(values) / PRIOR
+        parts = []
+        for piece, a, o in zip(linear, starts, offsets, strict=True):
+            weight = huber_weight(piece.residual, limit)
+            aw = a.T * weight
+            m = aw @ a + np.eye(a.shape[1]) * (1 + damping)
+            c = aw @ piece.jacobian
+            b = aw @ piece.residual + o
+            jw = piece.jacobian.T * weight
+            solved = np.linalg.solve(m, np.column_stack([c, b]))
+            normal += jw @ piece.jacobian - c.T @ solved[:, :size]
+            slope += jw @ piece.residual - c.T @ solved[:, size]
+            parts.append(solved)
+        curvature = np.maximum(np.diag(normal), 1e-9)
+        move = -np.linalg.solve(normal + damping * np.diag(curvature), slope)
+        # Parameters on a bound that would leave it stay, and the others move as if they were known.
+        held = ((values <= self.low) & (move < 0)) | ((values >= self.high) & (move > 0)) | np.isinf(values)
+        if held.any():
+            free = ~held
+            move = np.zeros(size)
+            if free.any():
+                sub = normal[np.ix_(free, free)] + damping * np.diag(curvature[free])
+                move[free] = -np.linalg.solve(sub, slope[free])
+        return move, [-(s[:, size] + s[:, :size] @ move) for s in parts]
+
+
+def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float) -> float:
+    """Return the cost of one window with the prior of its initial state."""
+    return float(huber(residual, limit).sum() + 0.5 * offset @ offset)
+
+
+def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limit: float, damping: float) -> np.ndarray:
+    """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
+    weighted = start.T * huber_weight(residual, limit)
+    normal = weighted @ start
+    normal += np.diag(1.0 + damping * (1.0 + np.diag(normal)))
+    return -np.linalg.solve(normal, weighted @ residual + offset)
+
+
+def huber_limit(residuals: Sequence[np.ndarray]) -> float:
+    """Return where Huber's loss turns linear: `HUBER` times the spread of the residuals, at least of the noise."""
+    pooled = np.concatenate(residuals)
+    return HUBER * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
+
+
+def huber(residual: np.ndarray, limit: float) -> np.ndarray:
+    """Return Huber's loss, half the square up to `limit` and a straight line beyond."""
+    size = np.abs(residual)
+    return np.where(size <= limit, 0.5 * residual**2, limit * (size - 0.5 * limit))
+
+
+def huber_weight(residual: np.ndarray, limit: float) -> np.ndarray:
+    """Return the weights of iteratively reweighted least squares."""
+    return np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
+
+
+def projected(fit: Fit) -> list[Linear]:
+    """Return residuals and sensitivities with the initial states eliminated, window by window.
+
+    What is left of each is what no change of the initial state within its prior can take up.
+    """
+    found = []
+    for piece, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
+        m = a.T @ a + np.eye(a.shape[1])
+        both = np.column_stack([piece.jacobian, piece.residual])
+        inner = a.T @ both
+        inner[:, -1] += o
+        rest = both - a @ np.linalg.solve(m, inner)
+        found.append(replace(piece, jacobian=rest[:, :-1], residual=rest[:, -1]))
+    return found

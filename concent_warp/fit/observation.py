@@ -1,0 +1,171 @@
+"""What is fitted: windows of demonstrations, with measured values in units of their noise.
+
+A window starts from a state that the measurements tell only roughly; its error is estimated along with the parameters
+(multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE", 1983). Where motion forgets
+its start or keeps close to it, as in pushing and in driven arms, a window is a whole demonstration; where small
+differences grow, as in impacts and tumbling, it ends before they have grown much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import RecordingError
+from concent_warp.fit.windows import Measured
+from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Demonstration, Recording
+
+RATE_TIME = 0.03
+"""A velocity at the start of a window is uncertain by the noise over this time [s]."""
+START_NOISE = 3.0
+"""Uncertainty of a state at the start of a window, in standard deviations of the measurement noise."""
+UNSEEN = (1e-3, 1e-2)
+"""Uncertainty of a position [m or rad] and a velocity that no instrument reads."""
+FEWEST = 12
+"""A recording with fewer measured values than this says nothing."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The samples of one channel that lie in a window."""
+
+    channel: str
+    rows: slice
+    """Where they stand among the residuals of the window; each sample has as many in a row as it has components."""
+    time: np.ndarray
+    """Times [s] from the window's start, shape (T,)."""
+    value: np.ndarray
+    """Measured values, shape (T, dim)."""
+    std: float
+    """Standard deviation of the noise of a component (of the rotation vector, for orientations)."""
+    orientation: bool
+
+
+@dataclass(frozen=True)
+class Window:
+    """A span of a demonstration that is simulated in one go."""
+
+    demonstration: Demonstration
+    number: int
+    """Position of the demonstration in the recording."""
+    start: float
+    """[s]."""
+    end: float
+    qpos: np.ndarray
+    """Estimated state at the start, shape (nq,)."""
+    qvel: np.ndarray
+    """Shape (nv,)."""
+    spread: np.ndarray
+    """Standard deviation of the estimate, of positions and then velocities, shape (2 nv,)."""
+    readings: tuple[Reading, ...]
+    count: int
+    """Number of residuals."""
+    clock: np.ndarray = field(repr=False)
+    """Time in the demonstration that each residual belongs to [s], shape (count,)."""
+
+
+def start_spread(m: mujoco.MjModel, noise: Mapping[str, float]) -> np.ndarray:
+    """Return the standard deviation of a measured initial state, positions and then velocities, shape (2 nv,)."""
+    position, velocity = np.full(m.nv, UNSEEN[0]), np.full(m.nv, UNSEEN[1])
+
+    def seen(dof: slice, std: float) -> None:
+        position[dof] = START_NOISE * std
+        velocity[dof] = START_NOISE * std / RATE_TIME
+
+    for sensor, std in noise.items():
+        row = m.sensor(sensor).id
+        kind, target = int(m.sensor_type[row]), int(m.sensor_objid[row])
+        if kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
+            dof = int(m.jnt_dofadr[target])
+            seen(slice(dof, dof + 1), std)
+        elif kind == int(mujoco.mjtSensor.mjSENS_TENDONPOS):
+            first = m.tendon_adr[target]
+            for w in range(first, first + m.tendon_num[target]):
+                if m.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT):
+                    dof = int(m.jnt_dofadr[m.wrap_objid[w]])
+                    seen(slice(dof, dof + 1), std)
+        elif kind in (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)):
+            if int(m.sensor_objtype[row]) not in (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY)):
+                continue
+            joint = int(m.body_jntadr[target])
+            if joint < 0 or m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
+                continue
+            dof = int(m.jnt_dofadr[joint]) + 3 * (kind == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
+            seen(slice(dof, dof + 3), std)
+    return np.concatenate([position, velocity])
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording as a model reads it: which channels count, with what noise, and the state at any time."""
+
+    model: Model
+    recording: Recording
+    noise: Mapping[str, float]
+    """Standard deviation of a component of each channel that counts."""
+
+    def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the measured state of a demonstration at a time [s], qpos (nq,) and qvel (nv,)."""
+        m = self.model.scene.model
+        qpos, qvel = initial_state(m, d)
+        if time <= 0.0 and d.qpos is not None and d.qvel is not None:
+            return qpos, qvel
+        measured = self.measured(d)
+        if measured is not None:
+            return measured.state(time)
+        if time <= 0.0:
+            return qpos, qvel
+        raise RecordingError(
+            "a window cannot start where the state was not measured",
+            where=d.name,
+            fix="record poses of all free bodies and all joints",
+        )
+
+    def measured(self, d: Demonstration) -> Measured | None:
+        """Return how everything was seen to move in a demonstration, None where something was not."""
+        try:
+            return Measured.of(self.model.scene, d, initial_state(self.model.scene.model, d)[0])
+        except RecordingError:
+            return None
+
+    def window(self, number: int, start: float, end: float) -> Window | None:
+        """Return a window; None where nothing was measured in it."""
+        m = self.model.scene.model
+        d = self.recording.demonstrations[number]
+        readings, clock, count = [], [], 0
+        for name, std in self.noise.items():
+            if name not in d.measured:
+                continue
+            channel = d.measured[name]
+            inside = (channel.time >= start - 1e-9) & (channel.time <= end + 1e-9)
+            inside &= np.isfinite(channel.value).all(axis=1)
+            if not inside.any():
+                continue
+            orientation = int(m.sensor_type[m.sensor(name).id]) in map(int, UNIT_QUATERNION_SENSORS)
+            value = np.asarray(channel.value[inside], dtype=float)
+            if orientation:
+                value = value / np.linalg.norm(value, axis=1, keepdims=True)
+            dim = 3 if orientation else value.shape[1]
+            size = dim * len(value)
+            time = channel.time[inside]
+            readings.append(Reading(name, slice(count, count + size), time - start, value, std, orientation))
+            clock.append(np.repeat(time, dim))
+            count += size
+        if not count:
+            return None
+        qpos, qvel = self.state(d, start)
+        spread = start_spread(m, {r.channel: r.std for r in readings})
+        return Window(d, number, start, end, qpos, qvel, spread, tuple(readings), count, np.concatenate(clock))
+
+
+def first_time(d: Demonstration, channels: Sequence[str]) -> float:
+    """Return when the first of some channels was first read [s]."""
+    return min((float(d.measured[c].time[0]) for c in channels if c in d.measured), default=0.0)
