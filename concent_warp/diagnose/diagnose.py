@@ -17,7 +17,7 @@ from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blo
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
-from concent_warp.diagnose.search import Candidate, Node, Screened, chance, fit_candidate, node, screen
+from concent_warp.diagnose.search import Candidate, Node, Screened, chance, fit_candidate, node, screen, strengthened
 from concent_warp.errors import ModelError
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction
@@ -128,14 +128,16 @@ class Procedure:
         """Look for one effect that the node's model lacks; return it, and what could have been seen."""
         chosen = candidates(base.model, self.channels, self.cfg.effects)
         span = 0.85 / self.cfg.additions
-        screened = self.parallel(screen, [(base, e) for e in chosen], "screening", 0.4 * span)
+        screened = self.parallel(screen, [(base, e) for e in chosen], "screening", 0.5 * span)
         null = chance(base, screened, self.cfg.draws, self.cfg.seed)
         critical = float(np.quantile(null, 1 - self.cfg.level))
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, critical)) is not None)
-        promising = sorted(screened, key=lambda s: -s.promise)
-        survivors = [s for s in promising if s.promise > 0.25 * critical][: self.cfg.survivors]
-        fitted = self.parallel(fit_candidate, [(base, s) for s in survivors], "fitting", 0.6 * span)
+        fitted = self.fitted(base, screened, critical)
         findings = [self.finding(base, c, null, critical, step, chosen) for c in fitted]
+        rivals = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
+        if rivals:
+            base = strengthened(base, sorted(rivals, key=lambda c: -c.share(base))[:STRONGEST])
+            findings = [self.finding(base, c, null, critical, step, chosen) for c in fitted]
         good = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not good:
             self.findings += sorted(findings, key=lambda f: -f.gain)
@@ -148,13 +150,25 @@ class Procedure:
         self.findings += [replace(f, accepted=False, reason=f.reason or "another one explains more") for f in rest]
         return group[0][0], smallest
 
+    def fitted(self, base: Node, screened: Sequence[Screened], critical: float) -> list[Candidate]:
+        """Fit the promising candidates, the most promising first; once one leaves only noise, no distant others."""
+        promising = sorted((s for s in screened if s.promise > 0.5 * critical), key=lambda s: -s.promise)
+        left, found = promising[: self.cfg.survivors], []
+        while left:
+            found += self.parallel(fit_candidate, [(base, s) for s in left[:FIRST]], "fitting", 0.15 / FIRST)
+            left = left[FIRST:]
+            if min(c.ratio for c in found) < EXPLAINED:
+                best = max(c.share(base) for c in found)
+                left = [s for s in left if s.promise > DISTANT * best]
+        return found
+
     def finding(
         self, base: Node, c: Candidate, null: np.ndarray, critical: float, step: int, among: Sequence[Any]
     ) -> Finding:
         """Return a fitted candidate with its evidence."""
         rng = np.random.default_rng(self.cfg.seed)
-        share = c.share(base.errors)
-        low, high = bootstrap_interval(c.gain, base.errors, base.blocks.demonstration, rng)
+        share, gain = c.share(base), c.gain(base)
+        low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, rng)
         p = float((1 + np.sum(null >= share)) / (len(null) + 1))
         parameters = fitted_parameters(base, c)
         reason = ""
@@ -164,8 +178,12 @@ class Procedure:
             reason = f"takes away less than {100 * self.cfg.least_gain:.0f} % of the error"
         elif low <= 0:
             reason = "the interval of its gain includes none"
+        elif np.mean([gain[base.blocks.fold == f].sum() > 0 for f in np.unique(base.blocks.fold)]) < MOST:
+            reason = "folds disagree"
         elif not any(q.excludes_null for q in parameters):
             reason = "its parameters may be at their null values"
+        elif any(q.at_bound for q in parameters):
+            reason = "a parameter has run to its bound"
         return Finding(
             label(c.effect, among),
             c.effect.target,
@@ -175,7 +193,7 @@ class Procedure:
             low,
             high,
             p,
-            sign_flip_p(c.gain, rng),
+            sign_flip_p(gain, rng),
             not reason,
             step,
             removed(base, c),
@@ -218,6 +236,16 @@ class Procedure:
 
 DIVERGED = 300.0
 """Residual over noise that only a simulation which has diverged reaches."""
+FIRST = 3
+"""Candidates that are fitted at a time before it is asked whether more are needed."""
+EXPLAINED = 1.1
+"""Residual over noise at which a candidate has left little to others."""
+DISTANT = 0.3
+"""Share of the best gain below which a promise is not worth a fit any more."""
+STRONGEST = 3
+"""Rivals whose initial states are tried on the model that they beat."""
+MOST = 0.8
+"""Share of the folds in which an effect must gain."""
 SAME = 0.02
 """Gains that differ by less than this share of the error are taken for the same."""
 
@@ -240,7 +268,9 @@ def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
         p, value = prediction.parameters[k], float(c.fit.values[k])
         reach = 1.96 * spread[k] * p.scale
         low, high = max(value - reach, p.low), min(value + reach, p.high)
-        found.append(FittedParameter(p.name, value, float(low), float(high), p.unit, p.null))
+        bound = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
+        at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bound)
+        found.append(FittedParameter(p.name, value, float(low), float(high), p.unit, p.null, at_bound))
     return tuple(found)
 
 
@@ -265,7 +295,7 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
     best = max(good, key=lambda pair: pair[1].gain)
     group = []
     for c, f in good:
-        difference = best[0].gain - c.gain
+        difference = c.errors - best[0].errors
         error = np.sqrt(len(difference)) * difference.std()
         if difference.sum() <= max(2 * error, SAME * base.errors.sum()):
             group.append((c, f))
@@ -277,7 +307,7 @@ def plausibility(base: Node, c: Candidate, f: Finding) -> float:
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    return float(c.gain.sum() - len(scale) * np.log(base.blocks.count) - away @ away)
+    return float(c.gain(base).sum() - len(scale) * np.log(base.blocks.count) - away @ away)
 
 
 def detectable_size(base: Node, s: Screened, critical: float) -> Detectable | None:

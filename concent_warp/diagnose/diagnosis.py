@@ -33,6 +33,8 @@ class FittedParameter:
     unit: str
     null: float
     """Value at which the effect does nothing."""
+    at_bound: bool = False
+    """Whether it has run to a bound that is not the null value."""
 
     @property
     def excludes_null(self) -> bool:

@@ -44,8 +44,6 @@ class Node:
     """Where the robust loss turns linear."""
     errors: np.ndarray
     """Held-out error of each block, shape (B,)."""
-    rows: np.ndarray
-    """Number of residuals in each block, shape (B,)."""
     engine: EngineName = "mujoco"
 
     @property
@@ -85,15 +83,19 @@ class Candidate:
     fit: Fit
     sums: Sums
     pieces: tuple[Linear, ...]
-    gain: np.ndarray
-    """Fall of the held-out error of each block against the node, shape (B,)."""
+    errors: np.ndarray
+    """Held-out error of each block, shape (B,)."""
     ratio: float
     """Residual over noise that is left."""
     simulated: float
 
-    def share(self, errors: np.ndarray) -> float:
+    def gain(self, base: Node) -> np.ndarray:
+        """Return by how much the held-out error of each block falls against a node, shape (B,)."""
+        return base.errors - self.errors
+
+    def share(self, base: Node) -> float:
         """Return the gain as a share of the node's held-out error."""
-        return float(self.gain.sum() / max(errors.sum(), 1e-12))
+        return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
 
 
 def noise_ratio(pieces: Sequence[Linear]) -> float:
@@ -109,11 +111,26 @@ def node(model: Model, windows: Sequence[Window], blocks: Blocks, engine: Engine
     if len(fit.values):
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
+    return assessed(model, windows, blocks, fit, engine)
+
+
+def assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> Node:
+    """Return a fitted model as a node."""
     pieces = tuple(projected(fit))
     limit = huber_limit([piece.residual for piece in pieces])
     errors = HeldOut(block_sums(pieces, blocks, limit), blocks).own()
-    rows = np.bincount(np.concatenate(blocks.of_row), minlength=blocks.count)
-    return Node(model, tuple(windows), blocks, fit, pieces, limit, errors, rows, engine)
+    return Node(model, tuple(windows), blocks, fit, pieces, limit, errors, engine)
+
+
+def strengthened(base: Node, rivals: Sequence[Candidate]) -> Node:
+    """Return the node with initial states fitted anew from where its rivals have them, window by window.
+
+    A fit may end in a local minimum of an initial state; a rival that only got out of one has explained nothing.
+    """
+    solver = Solver(Prediction(base.model, (), base.windows, engine=base.engine))
+    fit = solver.better_starts(base.fit, [c.fit.offsets for c in rivals])
+    found = assessed(base.model, base.windows, base.blocks, fit, base.engine)
+    return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 
 
 def screen(base: Node, effect: Effect) -> Screened:
@@ -192,7 +209,7 @@ def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
         fit,
         sums,
         pieces,
-        base.errors - errors,
+        errors,
         noise_ratio(pieces),
         solver.p.simulated,
     )

@@ -165,16 +165,29 @@ class Solver:
 
         Initial states that have made up for a wrong parameter do not always find back on their own.
         """
-        here, starts = self.refine_starts(fit.values, fit.offsets, rounds=1)
-        measured, others = self.refine_starts(fit.values, [np.zeros_like(o) for o in here], rounds=2)
-        pairs = [self.p.residuals(self.trials(fit.values, offsets)) for offsets in (here, measured)]
-        limit = huber_limit(pairs[0])
-        better = [
-            start_cost(b, n, limit) < start_cost(a, o, limit) for a, b, o, n in zip(*pairs, here, measured, strict=True)
-        ]
-        offsets = [n if new else o for n, o, new in zip(measured, here, better, strict=True)]
-        chosen = tuple(n if new else o for n, o, new in zip(others, starts, better, strict=True))
-        return self.fit(fit.values, offsets, chosen)
+        fresh = self.better_starts(fit, [[np.zeros_like(o) for o in fit.offsets]])
+        return self.fit(fresh.values, fresh.offsets, fresh.starts)
+
+    def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]]) -> Fit:
+        """Return a fit at the same parameters with the best initial state of each window that is found.
+
+        Args:
+            fit: The fit.
+            others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
+        """
+        found = [self.refine_starts(fit.values, fit.offsets, rounds=1)]
+        found += [self.refine_starts(fit.values, offsets, rounds=2) for offsets in others]
+        residuals = [self.p.residuals(self.trials(fit.values, offsets)) for offsets, _ in found]
+        limit = huber_limit(residuals[0])
+        offsets, starts = [], []
+        for w in range(len(self.p.windows)):
+            costs = [start_cost(r[w], o[w], limit) for r, (o, _) in zip(residuals, found, strict=True)]
+            best = int(np.argmin(costs))
+            offsets.append(found[best][0][w])
+            starts.append(found[best][1][w])
+        linear = self.linearise(fit.values, offsets)
+        cost = self.cost([piece.residual for piece in linear], offsets, fit.values)
+        return replace(fit, offsets=tuple(offsets), starts=tuple(starts), linear=linear, cost=cost)
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
         """Return one trial a window."""

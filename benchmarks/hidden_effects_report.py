@@ -1,0 +1,224 @@
+"""The page of the hidden-effect benchmark: shares with intervals, a table by effect, the confusions as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from pages import FOLDER, data_path, machine_line, table
+from scipy.stats import norm
+
+from concent_warp.model import write_text
+
+NAME = "hidden_effects"
+FLOOR = 1.3
+"""Residual over noise at which a model has reached the noise."""
+Row = dict[str, Any]
+
+
+def write_report(rows: Sequence[Row], total: int, facts: dict[str, Any]) -> None:
+    """Write data, picture and page."""
+    import json
+
+    data_path(NAME).parent.mkdir(parents=True, exist_ok=True)
+    write_text(data_path(NAME), json.dumps({"machine": facts, "rows": [slim(row) for row in rows]}, indent=1))
+    confusion(rows)
+    write_text(FOLDER / f"{NAME}.md", page(rows, total, facts))
+
+
+def slim(row: Row) -> Row:
+    """Return a row without what the page does not show."""
+    kept = {k: v for k, v in row.items() if k not in ("detectable", "where", "versions", "issues")}
+    kept["effects"] = [e for e in row.get("effects", ()) if e["accepted"]]
+    return kept
+
+
+def base(name: str) -> str:
+    """Return the name of an effect without its target."""
+    return name.split("(")[0]
+
+
+def accepted(row: Row) -> list[str]:
+    """Return the effects that were accepted, in order."""
+    return [base(e["name"]) for e in row.get("effects", ()) if e["accepted"]]
+
+
+def groups(row: Row) -> list[set[str]]:
+    """Return the groups of names that were not told apart."""
+    return [{base(name) for name in group} for group in row.get("groups", ())]
+
+
+def first_right(row: Row) -> bool:
+    """Return whether the hidden effect is the first that is named."""
+    return accepted(row)[:1] == [row["truth"][0]["name"]]
+
+
+def in_group(row: Row) -> bool:
+    """Return whether the hidden effect is among the first ones named."""
+    return bool(groups(row)) and row["truth"][0]["name"] in groups(row)[0]
+
+
+def both_found(row: Row) -> bool:
+    """Return whether each of several hidden effects is among those named, in groups of their own."""
+    truth = {t["name"] for t in row["truth"]}
+    left = groups(row)
+    for name in sorted(truth):
+        match = next((g for g in left if name in g), None)
+        if match is None:
+            return False
+        left.remove(match)
+    return True
+
+
+def alarm(row: Row) -> bool:
+    """Return whether an effect was named, or one said to be missing."""
+    return row.get("verdict") != "none_needed"
+
+
+def none_of_these(row: Row) -> bool:
+    """Return whether something was said to be missing that no effect explains."""
+    return row.get("verdict") == "none_of_these"
+
+
+def at_floor(row: Row) -> bool:
+    """Return whether the last model's error is within `FLOOR` times the noise."""
+    return bool(row.get("ratio")) and row["ratio"][-1] <= FLOOR
+
+
+def coverage(rows: Iterable[Row]) -> list[bool]:
+    """Return, for each true parameter of an effect that was rightly named first, whether its interval covers it."""
+    hits = []
+    for row in rows:
+        if not first_right(row):
+            continue
+        truth = row["truth"][0]["parameters"]
+        found = next(e for e in row["effects"] if e["accepted"])
+        for p in found["parameters"]:
+            if p["name"] in truth and p["interval"][0] is not None and p["interval"][1] is not None:
+                hits.append(p["interval"][0] <= truth[p["name"]] <= p["interval"][1])
+    return hits
+
+
+def wilson(hits: Sequence[bool]) -> tuple[float, float, float]:
+    """Return the share of hits and its 95 % interval (Wilson, J. Am. Stat. Assoc. 22, 1927)."""
+    n = len(hits)
+    if not n:
+        return np.nan, np.nan, np.nan
+    z, share = float(norm.ppf(0.975)), sum(hits) / n
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
+    reach = z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    return share, float(centre - reach), float(centre + reach)
+
+
+def figure(title: str, bar: str, hits: Sequence[bool]) -> list[str]:
+    """Return a row of the table of shares."""
+    share, low, high = wilson(hits)
+    if not len(hits):
+        return [title, bar, "-", "-", "0"]
+    return [title, bar, f"{100 * share:.0f} %", f"{100 * low:.0f}-{100 * high:.0f} %", str(len(hits))]
+
+
+def page(rows: Sequence[Row], total: int, facts: dict[str, Any]) -> str:
+    """Return the page."""
+    single = [r for r in rows if r["kind"] == "single"]
+    null = [r for r in rows if r["kind"] == "null"]
+    outside = [r for r in rows if r["kind"] == "outside"]
+    pair = [r for r in rows if r["kind"] == "pair"]
+    right = [r for r in single if first_right(r)]
+
+    def over(of: Sequence[Row], hit: Callable[[Row], bool]) -> list[bool]:
+        return [hit(r) for r in of]
+
+    shares = [
+        figure("right effect named first", ">= 90 %", over(single, first_right)),
+        figure("right effect in the group named first", ">= 97 %", over(single, in_group)),
+        figure("false alarm, nothing hidden", "<= 5 %", over(null, alarm)),
+        figure('"none of these", effect outside the library', ">= 80 %", over(outside, none_of_these)),
+        figure("both found, two effects at once", ">= 75 %", over(pair, both_found)),
+        figure(f"error within {FLOOR} x noise after adding the right effect", "", over(right, at_floor)),
+        figure("true parameter within its 95 % interval", "90-99 %", coverage(single)),
+    ]
+    seconds = np.array([r["seconds"] for r in rows]) if rows else np.zeros(1)
+    by_rig = []
+    for rig in dict.fromkeys(r["rig"] for r in rows):
+        mine = np.array([r["seconds"] for r in rows if r["rig"] == rig])
+        by_rig.append([rig, str(len(mine)), f"{np.median(mine):.0f}", f"{mine.max():.0f}"])
+    effects = []
+    for name in dict.fromkeys(r["truth"][0]["name"] for r in single):
+        mine = [r for r in single if r["truth"][0]["name"] == name]
+        others = sorted(
+            {accepted(r)[0] if accepted(r) else r.get("verdict", "error") for r in mine if not first_right(r)}
+        )
+        effects.append(
+            [
+                f"`{name}`",
+                str(len(mine)),
+                str(sum(map(first_right, mine))),
+                str(sum(map(in_group, mine))),
+                ", ".join(others) or "-",
+            ]
+        )
+    failed = [r for r in rows if "error" in r]
+    return f"""# Hidden effects
+
+How often `concent diagnose` names the effect that is hidden in a recording. The recordings are made in the stand-in
+world, whose own implementation of each effect is not that of the library; `benchmarks/hidden_effects_data.py` lists
+them.
+
+```
+python benchmarks/hidden_effects.py            # {total} data sets, resumable
+python benchmarks/hidden_effects.py --report   # this page
+```
+
+{machine_line(facts)} {len(rows)} of {total} data sets done, {len(failed)} ended in an error;
+{seconds.sum() / 3600:.1f} hours of one core in all.
+
+{table(["", "bar", "share", "95 % interval", "data sets"], shares)}
+Intervals are Wilson's. Data with two magnitudes: the middle one leaves a residual of about four standard deviations of
+the noise, the large one two to three times that.
+
+## By effect
+
+{table(["effect", "data sets", "first", "in the group", "named instead"], effects)}
+![which effect was named for which](hidden_effects.png)
+
+## Time
+
+Seconds on one core for a whole diagnosis, all candidates and the calibration included, beside others on a shared
+machine.
+
+{table(["rig", "data sets", "median [s]", "longest [s]"], by_rig)}"""
+
+
+def confusion(rows: Sequence[Row]) -> None:
+    """Draw which effect was named first where which was hidden."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    truths: dict[str, list[str]] = {}
+    for r in rows:
+        if r["kind"] in ("single", "null", "outside"):
+            truth = r["truth"][0]["name"] if r["truth"] else "(nothing)"
+            named = accepted(r)[0] if accepted(r) else r.get("verdict", "error")
+            if none_of_these(r):
+                named = "none_of_these"
+            truths.setdefault(truth, []).append(named)
+    across = [*truths, *sorted({n for named in truths.values() for n in named} - set(truths))]
+    counts = np.zeros((len(truths), len(across)))
+    for i, named in enumerate(truths.values()):
+        for n in named:
+            counts[i, across.index(n)] += 1 / len(named)
+    figure_, axes = plt.subplots(figsize=(0.24 * len(across) + 3.2, 0.24 * len(truths) + 2.8), layout="constrained")
+    axes.imshow(counts, cmap="Blues", vmin=0, vmax=1)
+    axes.set_xticks(range(len(across)), across, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(truths)), list(truths), fontsize=7)
+    axes.set_xlabel("named first")
+    axes.set_ylabel("hidden")
+    for i, j in zip(*np.nonzero(counts), strict=True):
+        colour = "white" if counts[i, j] > 0.6 else "black"
+        axes.text(j, i, f"{100 * counts[i, j]:.0f}", ha="center", va="center", fontsize=5, color=colour)
+    figure_.savefig(FOLDER / f"{NAME}.png", dpi=150)
+    plt.close(figure_)
