@@ -16,8 +16,10 @@ import numpy as np
 FLIPS = 999
 EXACT_BLOCKS = 11
 """With no more blocks than this all flips are gone through."""
-BLOCK = 4
+SHORTEST_BLOCK, LONGEST_BLOCK = 2, 4
 """Windows in a block; they overlap by half."""
+WANTED_BLOCKS = 24
+"""Blocks that are aimed at, within these lengths."""
 FEWEST_BLOCKS = 5
 """Fewer blocks test nothing: 2^-5 is the smallest p-value that they can give, both signs counted."""
 MOST_PATTERNS = 2
@@ -143,8 +145,9 @@ def patterns(
     return tuple(found)
 
 
-def blocks_of(counts: Sequence[int], size: int = BLOCK) -> np.ndarray:
+def blocks_of(counts: Sequence[int]) -> np.ndarray:
     """Return the block of each window of demonstrations with `counts` windows, shape (sum,); none spans two."""
+    size = int(np.clip(sum(counts) // WANTED_BLOCKS, SHORTEST_BLOCK, LONGEST_BLOCK))
     labels, first = [], 0
     for count in counts:
         number = max(round(count / size), 1)

@@ -18,11 +18,16 @@ if TYPE_CHECKING:
     from concent_warp.diagnose.shooting import Windows
 
 DIRECTION, SPEED, ACCELERATION = "direction of motion", "velocity", "acceleration"
+SLOW, LIMIT = "direction of slow motion", "drive force near its peak"
 LOADED, GRAVITY, DRIVE = "direction of motion x load", "weight on it", "drive force"
 COMMAND_RATE, POSITION, CONSTANT, CONTACT = "rate of the command", "position", "a constant", "contact"
 SLIDING, DRAG = "direction of sliding", "velocity x speed"
 AXES = ("x", "y", "z")
 
+SLOW_PERCENTILE = 25
+"""Percentile of a joint's speed that is called slow."""
+PEAK = 0.75
+"""Share of the largest drive force from which on it is near its peak."""
 RATE_STEP = 0.01
 """Time over which the rate of a command is taken [s]."""
 
@@ -62,13 +67,16 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
         v = qvel[:, joint.dof]
         std = np.sqrt(joint.position.smooth.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
         direction = v / np.sqrt(v**2 + (2 * std) ** 2)
+        force, scale = drive[:, joint.dof], float(np.percentile(np.abs(v), SLOW_PERCENTILE))
         raw = {
             DIRECTION: direction,
+            SLOW: direction * np.exp(-((v / max(scale, 1e-9)) ** 2)),
+            LIMIT: np.sign(force) * np.maximum(np.abs(force) - PEAK * float(np.abs(force).max()), 0),
             SPEED: v,
             ACCELERATION: qacc[:, joint.dof],
             LOADED: direction * np.abs(load[:, joint.dof]),
             GRAVITY: load[:, joint.dof],
-            DRIVE: drive[:, joint.dof],
+            DRIVE: force,
             COMMAND_RATE: (drive[:, joint.dof] - before[:, joint.dof]) / (back * dt),
             POSITION: qpos[:, joint.qpos] - qpos[:, joint.qpos].mean(),
             CONSTANT: np.ones(len(time)),

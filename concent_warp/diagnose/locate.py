@@ -6,30 +6,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
-from concent_warp.diagnose.contact_state import BETWEEN, BodyWindows, body_windows
+from concent_warp.diagnose.body_forces import body_force, judged
 from concent_warp.diagnose.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
-from concent_warp.diagnose.features import CONTACT, body_force_features, body_torque_features, joint_features
-from concent_warp.diagnose.force_place import force_place
-from concent_warp.diagnose.location import DETECTABLE, BodyForce, ForceSeries, JointForce, Location, PhaseForce
-from concent_warp.diagnose.measured_motion import BodyMotion, Motion, measured_motion
-from concent_warp.diagnose.phases import FREE, REST
-from concent_warp.diagnose.shooting import WindowCfg, Windows, window_forces
-from concent_warp.diagnose.wrench import Wrenches, joined, steady_force, wrenches
+from concent_warp.diagnose.features import CONTACT, joint_features
+from concent_warp.diagnose.location import DETECTABLE, ForceSeries, JointForce, Location
+from concent_warp.diagnose.measured_motion import Motion, measured_motion
+from concent_warp.diagnose.shooting import WindowCfg, Windows, window_forces, window_length
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 
-FEWEST_WINDOWS = 3
-"""Windows that make a phase."""
 SELDOM = 0.05
 """Share of the time below which a joint's contact is neglected."""
-SHORT_BLOCK, LONG_PHASE = 2, 48
-"""Windows in a block of a phase with fewer windows than the second number."""
+BEYOND_NOISE = 1.7
+"""Forces this many times what noise leaves are there, whatever they depend on; without any, up to 1.4 was seen where
+contacts change within windows."""
 
 
 def locate(
@@ -59,20 +54,19 @@ def locate(
     motions = [measured_motion(model, d, simulator) for d in chosen]
     if cfg.length is None:
         # One length for all, so that their forces can be taken together.
-        cfg = replace(cfg, length=max(min(max(0.1, 8 * motion.period), 0.3) for motion in motions))
+        cfg = replace(cfg, length=max(map(window_length, motions)))
     windows = [window_forces(d.name, simulator, m, cfg) for d, m in zip(chosen, motions, strict=True)]
     features = [joint_features(w, m) for w, m in zip(windows, motions, strict=True)]
     joints = [joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in all_joints(motions)]
-    compiled = simulator.compiled
-    bodies = [body_force(model, compiled, name, motions, windows, cfg) for name in all_bodies(motions)]
+    bodies = [body_force(model, name, motions, windows, cfg.seed) for name in all_bodies(motions)]
     accepted = holm([f.p for f in joints] + [f.p for f in bodies])
     joints = [
-        replace(f, significant=ok and bool(f.dependences.patterns))
+        replace(f, significant=f.ratio > BEYOND_NOISE or (ok and bool(f.dependences.patterns)))
         for f, ok in zip(joints, accepted[: len(joints)], strict=True)
     ]
-    bodies = [judged(f, ok) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
-    joints.sort(key=lambda f: (f.p, -f.rms / f.noise if f.noise else 0.0))
-    bodies.sort(key=lambda f: (f.p, -f.rms / f.noise if f.noise else 0.0))
+    bodies = [judged(f, ok, f.ratio > BEYOND_NOISE) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
+    joints.sort(key=lambda f: (not f.significant, -f.ratio))
+    bodies.sort(key=lambda f: (not f.significant, -f.ratio))
     return Location(windows[0].length, tuple(joints), tuple(bodies))
 
 
@@ -112,6 +106,7 @@ def joint_force(
         unit=unit,
         rms=root_mean_square(force[valid]),
         noise=root_mean_square(std[valid]),
+        ratio=root_mean_square(force[valid] / std[valid]),
         detectable=detectable(std[valid], least),
         p=found.p,
         significant=False,
@@ -129,148 +124,6 @@ def detectable(std: np.ndarray, share: float) -> float:
         return np.nan
     precision = float((1 / std**2).sum())
     return max(DETECTABLE, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
-
-
-def body_force(
-    model: Model,
-    compiled: mujoco.MjModel,
-    name: str,
-    motions: Sequence[Motion],
-    windows: Sequence[Windows],
-    cfg: WindowCfg,
-) -> BodyForce:
-    """Return the unexplained force on a free body."""
-    parts: list[tuple[Motion, Windows, BodyMotion, BodyWindows]] = []
-    for motion, window in zip(motions, windows, strict=True):
-        for body in motion.bodies:
-            if body.name == name:
-                parts.append((motion, window, body, body_windows(motion, window, body)))
-    counts = [len(window.start) for _, window, _, _ in parts]
-    block = np.split(blocks_of(counts), np.cumsum(counts)[:-1])
-    turned = all(body.orientation is not None for _, _, body, _ in parts)
-    seen: list[Wrenches] = []
-    valid: list[np.ndarray] = []
-    for (_, window, body, state), labels in zip(parts, block, strict=True):
-        dofs = slice(body.dof, body.dof + 6)
-        force, covariance = window.force[:, dofs], window.covariance[:, dofs, dofs]
-        seen.append(wrenches(force, covariance, state, labels, turned=turned))
-        valid.append(np.asarray(np.isfinite(force[:, : 6 if turned else 3]).all(axis=1)))
-    everything = joined(seen)
-    force_features, torque_features = [], []
-    for (motion, window, body, state), ok in zip(parts, valid, strict=True):
-        acceleration = motion.acceleration(window.time)[:, body.dof : body.dof + 3]
-        force_features.append({n: f[ok] for n, f in body_force_features(state, acceleration, name).items()})
-        torque_features.append({n: f[ok] for n, f in body_torque_features(state, name).items()})
-    spread = np.sqrt(np.einsum("nii->n", everything.covariance[:, 3:, 3:]) / 3) * everything.size
-    touches = any(len(state.touches[k]) for _, _, _, state in parts for k in range(len(state.touches)))
-    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
-    along, about = (
-        dependences(values, std, projected(sight, tables), everything.block, cfg.seed, least)
-        for values, std, sight, tables in (
-            (everything.force, everything.std, everything.free[:, :3, :3], force_features),
-            (everything.torque, spread, everything.free[:, 3:, 3:], torque_features),
-        )
-    )
-    phases = body_phases(model, compiled, parts, seen, valid, cfg)
-    values = [along.p, about.p, *(phase.p for phase in phases)]
-    return BodyForce(
-        body=name,
-        rms=root_mean_square(np.linalg.norm(everything.force, axis=1)),
-        noise=float(np.sqrt(np.einsum("nii->n", everything.covariance[:, :3, :3]).mean())) if len(spread) else np.nan,
-        p=min(1.0, min(values) * len(values)),
-        significant=False,
-        force=along,
-        torque=about,
-        phases=tuple(sorted(phases, key=lambda phase: phase.p)),
-        series=tuple(
-            ForceSeries(window.demonstration, window.time[ok], w.force, w.std)
-            for (_, window, _, _), w, ok in zip(parts, seen, valid, strict=True)
-        ),
-    )
-
-
-def projected(sight: np.ndarray, tables: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return features (n, 3) of several demonstrations together, as far as contacts leave them to be seen."""
-    joined_up = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    return {name: np.einsum("nij,nj->ni", sight, value) for name, value in joined_up.items()}
-
-
-def body_phases(
-    model: Model,
-    compiled: mujoco.MjModel,
-    parts: Sequence[tuple[Motion, Windows, BodyMotion, BodyWindows]],
-    seen: Sequence[Wrenches],
-    valid: Sequence[np.ndarray],
-    cfg: WindowCfg,
-) -> list[PhaseForce]:
-    """Return the steady force and its place in each phase but rest, which shows no forces."""
-    found = []
-    names = {str(phase) for _, _, _, state in parts for phase in state.phase} - {REST, BETWEEN}
-    for phase in sorted(names):
-        chosen = [state.phase[ok] == phase for (_, _, _, state), ok in zip(parts, valid, strict=True)]
-        count = sum(int(c.sum()) for c in chosen)
-        if count < FEWEST_WINDOWS:
-            continue
-        size = SHORT_BLOCK if count < LONG_PHASE else None
-        counts = [int(c.sum()) for c in chosen]
-        w = joined([s.only(c) for s, c in zip(seen, chosen, strict=True)])
-        w = replace(w, block=blocks_of(counts) if size is None else blocks_of(counts, size))
-        if not (w.std > 0).all():
-            continue
-        steady = steady_force(w, cfg.seed)
-        if steady is None:
-            continue
-        touches = [
-            state.touches[k]
-            for (_, _, _, state), c, ok in zip(parts, chosen, valid, strict=True)
-            for k in np.flatnonzero(ok)[c]
-        ]
-        body = parts[0][2]
-        local = np.einsum("nji,nj->ni", w.rotation, w.torque)
-        spans = []
-        for (_, window, _, state), ok in zip(parts, valid, strict=True):
-            spans += spans_of(window, (state.phase == phase) & ok)
-        stride = parts[0][1].length / 2
-        found.append(
-            PhaseForce(
-                phase=phase,
-                spans=tuple(spans),
-                frame=body.name if steady.frame == "body" else steady.frame,
-                vector=steady.vector,
-                std=steady.std,
-                share=steady.share,
-                impulse=w.force.sum(axis=0) * stride / max(len(spans), 1),
-                torque=local.mean(axis=0),
-                p=steady.p,
-                test=steady.test,
-                significant=False,
-                place=force_place(model, compiled, body.body, w, steady, touches),
-                arrow=np.einsum("nji,nj->i", w.rotation, steady.steady) / len(w.force),
-            )
-        )
-    return found
-
-
-def spans_of(window: Windows, chosen: np.ndarray) -> list[tuple[str, float, float]]:
-    """Return demonstration, start and end [s] of each run of chosen windows."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int))).reshape(-1, 2)
-    ends = window.start + window.length
-    return [(window.demonstration, float(window.start[a]), float(ends[b - 1])) for a, b in edges]
-
-
-def judged(found: BodyForce, accepted: bool) -> BodyForce:
-    """Return a body with what is significant told; places of forces that are not are dropped."""
-    bound = LEVEL / max(len(found.phases), 1)
-    phases = []
-    for phase in found.phases:
-        ok = (
-            accepted
-            and phase.p <= bound
-            and phase.share >= (LEAST_SHARE if phase.phase == FREE else LEAST_SHARE_IN_CONTACT)
-        )
-        phases.append(replace(phase, significant=ok, place=phase.place if ok else None))
-    shown = any(phase.significant for phase in phases) or bool(found.force.patterns or found.torque.patterns)
-    return replace(found, significant=accepted and shown, phases=tuple(phases))
 
 
 def holm(p: Sequence[float]) -> list[bool]:

@@ -10,7 +10,12 @@ import numpy as np
 from concent_warp.diagnose.comparison import finite
 from concent_warp.diagnose.dependence import LEVEL, Dependences
 from concent_warp.diagnose.force_place import ForcePlace
-from concent_warp.diagnose.location_words import body_sentence, joint_sentence, pattern_sentence
+from concent_warp.diagnose.location_words import (
+    body_sentence,
+    joint_sentence,
+    nothing_sentence,
+    pattern_sentence,
+)
 
 DETECTABLE = 3.0
 """Standard errors above which a steady force is seen."""
@@ -44,18 +49,20 @@ class JointForce:
     rms: float
     noise: float
     """RMS that the measurement noise alone leaves."""
+    ratio: float
+    """RMS of force over noise, window by window."""
     detectable: float
     """Smallest steady force that would have been seen."""
     p: float
     """Probability of such a dependence on any of the features by chance."""
     significant: bool
-    """After correction for the number of joints and bodies (Holm)."""
+    """It follows a pattern, after correction for the number of joints and bodies (Holm), or is far beyond noise."""
     dependences: Dependences
     series: tuple[ForceSeries, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON, SI units."""
-        names = ("joint", "unit", "rms", "noise", "detectable", "p", "significant")
+        names = ("joint", "unit", "rms", "noise", "ratio", "detectable", "p", "significant")
         return {
             **{name: getattr(self, name) for name in names},
             **dependences_json(self.dependences),
@@ -118,10 +125,12 @@ class BodyForce:
     """Of the force [N]."""
     noise: float
     """RMS that the measurement noise alone leaves [N]."""
+    ratio: float
+    """RMS of force over noise, window by window."""
     p: float
     """Smallest p-value of its phases and dependences, corrected for their number."""
     significant: bool
-    """After correction for the number of joints and bodies (Holm)."""
+    """It follows a pattern, after correction for the number of joints and bodies (Holm), or is far beyond noise."""
     force: Dependences
     torque: Dependences
     phases: tuple[PhaseForce, ...]
@@ -130,7 +139,7 @@ class BodyForce:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON, SI units."""
-        names = ("body", "rms", "noise", "p", "significant")
+        names = ("body", "rms", "noise", "ratio", "p", "significant")
         return {
             **{name: getattr(self, name) for name in names},
             "force": dependences_json(self.force),
@@ -147,9 +156,9 @@ class Location:
     window: float
     """Time over which forces are averaged [s]."""
     joints: tuple[JointForce, ...]
-    """Most significant first."""
+    """Those with significant forces first, then by how far beyond noise."""
     bodies: tuple[BodyForce, ...]
-    """Most significant first."""
+    """Those with significant forces first, then by how far beyond noise."""
 
     def arrows(self) -> list[dict[str, Any]]:
         """Return what to draw on the objects: significant forces that have a place, in the frame of their body.
@@ -176,15 +185,11 @@ class Location:
         for joint in self.joints:
             found.append(joint_sentence(joint))
         for body in self.bodies:
-            shown = [phase for phase in body.phases if phase.significant]
-            found += [body_sentence(body.body, phase) for phase in shown]
+            lines = [body_sentence(body.body, phase) for phase in body.phases if phase.significant]
             for what, dependences, unit in (("force", body.force, "N"), ("torque", body.torque, "N m")):
                 if body.significant and dependences.patterns:
-                    found.append(pattern_sentence(f"{body.body}, {what}", dependences, unit))
-            if not shown and not body.significant:
-                found.append(
-                    f"{body.body}: nothing beyond noise (force {body.rms:.2g} N rms, noise {body.noise:.2g} N)."
-                )
+                    lines.append(pattern_sentence(f"{body.body}, {what}", dependences, unit))
+            found += lines or [nothing_sentence(body)]
         return found
 
     def to_json(self) -> dict[str, Any]:

@@ -11,10 +11,12 @@ from concent_warp.diagnose.wrench import SLIP, WORLD
 
 if TYPE_CHECKING:
     from concent_warp.diagnose.dependence import Dependences
-    from concent_warp.diagnose.location import JointForce, PhaseForce
+    from concent_warp.diagnose.location import BodyForce, JointForce, PhaseForce
 
 MEANINGS = {
     features.DIRECTION: ("opposes motion, whatever its speed", "goes with motion, whatever its speed"),
+    features.SLOW: ("opposes slow motion", "goes with slow motion"),
+    features.LIMIT: ("takes from the drive's force near its peak", "adds to the drive's force near its peak"),
     features.SPEED: ("opposes motion and grows with speed", "goes with motion and grows with speed"),
     features.DRAG: ("opposes motion and grows with the square of speed", "goes with the square of speed"),
     features.ACCELERATION: ("opposes acceleration, as missing inertia does", "goes with acceleration"),
@@ -39,7 +41,7 @@ UNITS = {
     features.POSITION: "per {length}",
 }
 """Unit of a slope over the force's unit."""
-DIMENSIONLESS = (features.LOADED, features.GRAVITY, features.DRIVE)
+DIMENSIONLESS = (features.LOADED, features.GRAVITY, features.DRIVE, features.LIMIT)
 AXES = "xyz"
 
 
@@ -49,8 +51,24 @@ def joint_sentence(found: JointForce) -> str:
     if found.significant and found.dependences.patterns:
         length = "rad" if found.unit == "N m" else "m"
         return f"{head}; it {pattern_words(found.dependences, found.unit, length)}."
-    extra = "but it follows none of the features" if found.rms > 2 * found.noise else "no more than noise"
-    return f"{head}, {extra}; a steady force of {found.detectable:.2g} {found.unit} would have shown."
+    if found.significant:
+        return f"{head}; it follows none of the features{where_words(found)}."
+    return f"{head}, no more than noise; a steady force of {found.detectable:.2g} {found.unit} would have shown."
+
+
+def where_words(found: JointForce) -> str:
+    """Return when a force is largest, in words."""
+    worst = max(found.series, key=lambda s: np.nanmax(np.abs(s.force) / s.std, initial=0))
+    k = int(np.nanargmax(np.abs(worst.force) / worst.std))
+    return f", and is largest at {worst.time[k]:.2f} s of {worst.demonstration}"
+
+
+def nothing_sentence(found: BodyForce) -> str:
+    """Return the sentence about a body of whose force nothing more is known."""
+    size = f"force {found.rms:.2g} N rms, noise {found.noise:.2g} N"
+    if found.significant:
+        return f"{found.body}: unexplained forces ({size}) that are steady in no phase and follow none of the features."
+    return f"{found.body}: nothing beyond noise ({size})."
 
 
 def pattern_sentence(what: str, found: Dependences, unit: str) -> str:

@@ -66,7 +66,13 @@ def joined(parts: list[Wrenches]) -> Wrenches:
 
 
 def wrenches(
-    force: np.ndarray, covariance: np.ndarray, state: BodyWindows, block: np.ndarray, *, turned: bool
+    force: np.ndarray,
+    covariance: np.ndarray,
+    state: BodyWindows,
+    block: np.ndarray,
+    valid: np.ndarray,
+    *,
+    turned: bool,
 ) -> Wrenches:
     """Return what is seen of residual generalised forces of a free joint.
 
@@ -75,9 +81,9 @@ def wrenches(
         covariance: Theirs, shape (K, 6, 6).
         state: What the body does in these windows.
         block: Blocks, shape (K,).
+        valid: Which windows to take, shape (K,) bool.
         turned: Whether the orientation was measured.
     """
-    valid = np.isfinite(force[:, : 6 if turned else 3]).all(axis=1)
     force, covariance = np.nan_to_num(force[valid]), covariance[valid]
     rotation = state.rotation[valid]
     change = np.zeros((len(force), 6, 6))
