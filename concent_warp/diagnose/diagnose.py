@@ -17,7 +17,18 @@ from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blo
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
-from concent_warp.diagnose.search import Candidate, Node, Screened, chance, fit_candidate, node, screen, strengthened
+from concent_warp.diagnose.search import (
+    Candidate,
+    Node,
+    Screened,
+    chance,
+    extended,
+    fit_candidate,
+    node,
+    polish_candidate,
+    screen,
+    strengthened,
+)
 from concent_warp.errors import ModelError
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction
@@ -35,9 +46,8 @@ class DiagnosisCfg:
     level: float = 0.05
     """Probability of naming an effect where nothing is missing."""
     least_gain: float = 0.05
-    """An effect must take away at least this share of the held-out error, unless its gain is beyond doubt."""
-    beyond_doubt: float = 5.0
-    """A gain this many times what chance reaches in `level` of all cases counts, however small a share it is."""
+    """An effect must take away at least this share of the held-out error: less is seen in long recordings, and means
+    little."""
     survivors: int = 8
     """Candidates that are fitted, of all that are screened."""
     additions: int = 3
@@ -119,8 +129,7 @@ class Procedure:
             detectable = detectable or smallest
             if best is None:
                 break
-            self.progress(self._done, f"fitting the model with {best.effect.name}")
-            nodes.append(node(best.model, windows, blocks, self.cfg.engine, None))
+            nodes.append(extended(nodes[-1], best))
         self.progress(1.0, "done")
         return self.conclude(nodes, detectable, issues)
 
@@ -133,11 +142,11 @@ class Procedure:
         critical = float(np.quantile(null, 1 - self.cfg.level))
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, critical)) is not None)
         fitted = self.fitted(base, screened, critical)
-        findings = [self.finding(base, c, null, critical, step, chosen) for c in fitted]
+        findings = [self.finding(base, c, null, step, chosen) for c in fitted]
         rivals = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
-        if rivals:
+        if rivals and max(c.share(base) for c in rivals) < DOUBTFUL:
             base = strengthened(base, sorted(rivals, key=lambda c: -c.share(base))[:STRONGEST])
-            findings = [self.finding(base, c, null, critical, step, chosen) for c in fitted]
+            findings = [self.finding(base, c, null, step, chosen) for c in fitted]
         good = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not good:
             self.findings += sorted(findings, key=lambda f: -f.gain)
@@ -160,11 +169,16 @@ class Procedure:
             if min(c.ratio for c in found) < EXPLAINED:
                 best = max(c.share(base) for c in found)
                 left = [s for s in left if s.promise > DISTANT * best]
+        if not found:
+            return found
+        best = max(c.share(base) for c in found)
+        rough = [k for k, c in enumerate(found) if c.share(base) > NEAR * best and c.ratio > SETTLED]
+        polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
+        for k, c in zip(rough, polished, strict=True):
+            found[k] = c
         return found
 
-    def finding(
-        self, base: Node, c: Candidate, null: np.ndarray, critical: float, step: int, among: Sequence[Any]
-    ) -> Finding:
+    def finding(self, base: Node, c: Candidate, null: np.ndarray, step: int, among: Sequence[Any]) -> Finding:
         """Return a fitted candidate with its evidence."""
         rng = np.random.default_rng(self.cfg.seed)
         share, gain = c.share(base), c.gain(base)
@@ -174,7 +188,7 @@ class Procedure:
         reason = ""
         if p > self.cfg.level:
             reason = "no better than chance"
-        elif share < self.cfg.least_gain and share < self.cfg.beyond_doubt * critical:
+        elif share < self.cfg.least_gain:
             reason = f"takes away less than {100 * self.cfg.least_gain:.0f} % of the error"
         elif low <= 0:
             reason = "the interval of its gain includes none"
@@ -242,6 +256,12 @@ EXPLAINED = 1.1
 """Residual over noise at which a candidate has left little to others."""
 DISTANT = 0.3
 """Share of the best gain below which a promise is not worth a fit any more."""
+NEAR = 0.4
+"""Share of the best gain from which on a candidate is worth a second fit."""
+SETTLED = 1.03
+"""Residual over noise at which a fit needs no second one."""
+DOUBTFUL = 0.4
+"""Gain below which it is made sure that it is not owed to better initial states alone."""
 STRONGEST = 3
 """Rivals whose initial states are tried on the model that they beat."""
 MOST = 0.8

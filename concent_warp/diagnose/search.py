@@ -192,10 +192,20 @@ def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
 
 def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> Candidate:
     """Fit a candidate together with the model's own parameters and the initial states."""
-    prediction = Prediction(base.model, (screened.effect,), base.windows, engine=base.engine, threads=1)
-    solver = Solver(prediction, cfg)
-    fit = solver.fit(screened.start, base.fit.offsets, base.fit.starts)
-    return judged(base, screened.effect, solver, solver.polish(fit))
+    solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine, threads=1), cfg)
+    return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
+
+
+def polish_candidate(base: Node, candidate: Candidate, cfg: FitCfg | None = None) -> Candidate:
+    """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
+    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1), cfg)
+    found = judged(base, candidate.effect, solver, solver.polish(candidate.fit))
+    return found if found.fit.cost < candidate.fit.cost else candidate
+
+
+def extended(base: Node, added: Candidate) -> Node:
+    """Return the node of the model that a candidate makes of a node's."""
+    return assessed(added.model, base.windows, base.blocks, added.fit, base.engine)
 
 
 def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
