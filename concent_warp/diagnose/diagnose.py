@@ -7,6 +7,7 @@ against what chance makes of the whole search. Add the best, and begin again wit
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -29,6 +30,7 @@ from concent_warp.diagnose.search import (
     screen,
     strengthened,
 )
+from concent_warp.diagnose.where import where
 from concent_warp.errors import ModelError
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction
@@ -66,6 +68,8 @@ class DiagnosisCfg:
     """Processes at a time; -1: one a CPU. Others than joblib's own run them with `joblib.parallel_config`."""
     seed: int = 0
     """Seed of all that is drawn."""
+    explain: bool = True
+    """Whether to say where the model fails and which experiment would tell more; it takes a while."""
 
 
 Progress = Callable[[float, str], None]
@@ -105,6 +109,7 @@ class Procedure:
         self.findings: list[Finding] = []
         self.groups: list[tuple[str, ...]] = []
         self._done = 0.0
+        self._began = time.monotonic()
 
     def run(self) -> Diagnosis:
         """Go through the procedure."""
@@ -237,7 +242,7 @@ class Procedure:
             verdict=verdict,
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
             groups=tuple(self.groups),
-            where=(),
+            where=self.places(nodes[0]) if verdict != "none_needed" else (),
             unexplained=unexplained,
             ratio=tuple(n.ratio for n in nodes),
             detectable=detectable,
@@ -247,7 +252,25 @@ class Procedure:
             seed=self.cfg.seed,
         )
 
+    def places(self, given: Node) -> tuple[dict[str, Any], ...]:
+        """Return where the model as given fails; forces are looked for no longer than the diagnosis has taken."""
+        if not self.cfg.explain:
+            return ()
+        spent = min(time.monotonic() - self._began, LONGEST_SEARCH)
+        return tuple(
+            where(
+                given.model,
+                self.recording,
+                self.cfg.engine,
+                windows=given.windows,
+                offsets=given.fit.offsets,
+                seconds=spent,
+            )
+        )
 
+
+LONGEST_SEARCH = 60.0
+"""Longest search for missing forces [s]."""
 DIVERGED = 300.0
 """Residual over noise that only a simulation which has diverged reaches."""
 FIRST = 3
