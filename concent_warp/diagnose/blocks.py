@@ -184,4 +184,6 @@ def covariance(sums: Sums, blocks: Blocks) -> np.ndarray:
     robust = inverse @ (scores.T @ scores) @ inverse * correction
     wider = np.sqrt(np.maximum(np.diag(robust), np.diag(inverse)))
     spread = np.sqrt(np.maximum(np.diag(robust), 1e-300))
-    return robust * np.outer(wider / spread, wider / spread)
+    found = robust * np.outer(wider / spread, wider / spread)
+    np.fill_diagonal(found, wider**2)  # also of parameters that nothing depends on, whose scores are all zero
+    return found
