@@ -7,7 +7,8 @@ The firmware sets the duty cycle in proportion to the error counted in ticks, so
 kt and resistance R the torque is kt vin / R times the duty cycle, cut at 1, less kt^2 / R times the speed.
 
 ``load`` and ``speed`` are the firmware's own estimates and are left out: the load is a 16-bit number without a sign,
-the speed is filtered. The times between samples are uneven and kept as they are.
+the speed is filtered. The times between samples are uneven and kept as they are. Where ``torque_enable`` says that the
+motor was let go (logs of the kind "lift and drop"), the rest of the log is left out: no command describes it.
 """
 
 from __future__ import annotations
@@ -134,8 +135,9 @@ def servo_scene(setup: Setup) -> str:
 
 
 def swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
-    """Return a log as a demonstration; its clock begins at its first sample, where the servo rests."""
-    columns = {key: column(document, key, path) for key in ("timestamp", "position", "goal_position")}
+    """Return a log, as far as the motor drives, as a demonstration; its clock begins at its first sample, at rest."""
+    driven = driven_entries(document, path)
+    columns = {key: column(document, key, path)[:driven] for key in ("timestamp", "position", "goal_position")}
     time = columns["timestamp"] - columns["timestamp"][0]
     position = columns["position"]
     return Demonstration(
@@ -146,6 +148,19 @@ def swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
         action={DRIVE: Channel(time, columns["goal_position"])},
         measured={SENSOR: Channel(time, position[:, None])},
     )
+
+
+def driven_entries(document: dict[str, Any], path: Path) -> int:
+    """Return how many entries there are before the motor is let go."""
+    released = [row for row, entry in enumerate(document["entries"]) if isinstance(entry, dict) and not driving(entry)]
+    if released and released[0] < 2:
+        raise RecordingError("the motor is off from the start", where=path, expected="torque_enable true")
+    return released[0] if released else len(document["entries"])
+
+
+def driving(entry: dict[str, Any]) -> bool:
+    """Return whether the motor drives; it does where nothing is said of it."""
+    return bool(entry.get("torque_enable", True))
 
 
 def column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:

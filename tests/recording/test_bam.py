@@ -82,6 +82,16 @@ def test_logs_of_different_payloads_are_refused_together(tmp_path):
         read_bam(tmp_path)
 
 
+def test_a_log_ends_where_the_motor_is_let_go(tmp_path):
+    entries = [{"timestamp": 0.1 * k, "position": 0.0, "goal_position": 1.0, "torque_enable": k < 3} for k in range(6)]
+    demonstration = read_bam(written(tmp_path, "a", entries=entries))[0]
+    assert len(demonstration.measured[SENSOR].time) == len(demonstration.action["servo"].time) == 3
+    for entry in entries:
+        entry["torque_enable"] = False
+    with pytest.raises(RecordingError, match="off from the start"):
+        read_bam(written(tmp_path, "b", entries=entries))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -121,5 +131,6 @@ def test_measured_logs_are_read_at_each_gain(kp):
     assert len(recording.demonstrations) == 4
     for demonstration in recording.demonstrations:
         channel = demonstration.measured[SENSOR]
-        assert 5.9 < channel.time[-1] < 6.1
+        lasts = 2.0 if demonstration.task == "lift_and_drop" else 6.0
+        assert channel.time[-1] == pytest.approx(lasts, abs=0.02)
         assert 0.003 < np.median(np.diff(channel.time)) < 0.007
