@@ -121,10 +121,8 @@ class Size(BodyEffect):
         compiled = spec.copy().compile()
         scale = float(values[0])
         for n in self.target:
-            body, b = spec.body(n), compiled.body(n).id
-            body.explicitinertial = True
-            body.mass, body.inertia = float(compiled.body_mass[b]), compiled.body_inertia[b]
-            body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
+            body = spec.body(n)
+            keep_inertia(body, compiled)
             for geom in body.geoms:
                 geom.pos = scale * np.array(geom.pos)
                 if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
@@ -132,6 +130,14 @@ class Size(BodyEffect):
                 else:
                     geom.size = scale * np.array(geom.size)
                     geom.fromto = scale * np.array(geom.fromto)
+
+
+def keep_inertia(body: mujoco.MjsBody, compiled: mujoco.MjModel) -> None:
+    """Give a body the mass and inertia that it was compiled with, whatever becomes of its geoms."""
+    b = compiled.body(body.name).id
+    body.explicitinertial = True
+    body.mass, body.inertia = float(compiled.body_mass[b]), compiled.body_inertia[b]
+    body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
 
 
 def scale_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, scale: float) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import entry_points
 
-from concent_warp.effects import contact, drives, joints, measurement, objects, world
+from concent_warp.effects import contact, drives, geometry, joints, measurement, objects, world
 from concent_warp.effects.effect import Effect
 from concent_warp.errors import ModelError
 
@@ -31,6 +31,7 @@ OURS: tuple[type[Effect], ...] = (
     objects.CenterOfMass,
     objects.Inertia,
     objects.Size,
+    geometry.ContactGeometryOffset,
     contact.SlidingFriction,
     contact.AnisotropicFriction,
     contact.TorsionalFriction,
