@@ -31,7 +31,7 @@ from concent_warp.diagnose.search import (
     strengthened,
 )
 from concent_warp.diagnose.where import where
-from concent_warp.errors import ModelError
+from concent_warp.fit.effects import check_finite
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
@@ -120,13 +120,8 @@ class Procedure:
         )
         blocks = cut_blocks(windows)
         self.progress(0.03, "fitting the model as it is")
+        check_finite(Prediction(self.model, (), windows, engine=self.cfg.engine), self.model.scene.source)
         base = node(self.model, windows, blocks, self.cfg.engine, None)
-        if not np.isfinite(base.ratio) or base.ratio > DIVERGED:
-            raise ModelError(
-                "the model does not stay finite on this recording",
-                where=self.model.scene.source,
-                fix="check time step, units and initial state, for instance with `concent compare`",
-            )
         nodes, detectable = [base], ()
         for step in range(self.cfg.additions):
             self._done = 0.1 + 0.85 * step / self.cfg.additions
@@ -181,6 +176,12 @@ class Procedure:
         polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
+        leader = int(np.argmax([c.share(base) for c in found]))
+        for _ in range(ROUNDS):
+            better = polish_candidate(base, found[leader]) if found[leader].ratio > SETTLED else found[leader]
+            if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
+                break
+            found[leader] = better
         return found
 
     def finding(self, base: Node, c: Candidate, null: np.ndarray, step: int, among: Sequence[Any]) -> Finding:
@@ -222,11 +223,15 @@ class Procedure:
     def parallel(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], text: str, span: float) -> list[T]:
         """Do independent pieces of work, in processes where more than one is allowed; results in the tasks' order."""
         results: list[T] = []
-        for i, result in enumerate(run_all(work, tasks, self.cfg.jobs)):
+        for i, result in enumerate(self.results(work, tasks)):
             results.append(result)
             self.progress(self._done + span * (i + 1) / max(len(tasks), 1), f"{text}, {i + 1} of {len(tasks)}")
         self._done += span
         return results
+
+    def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
+        """Yield the results of independent pieces of work in the tasks' order."""
+        return run_all(work, tasks, self.cfg.jobs)
 
     def conclude(self, nodes: Sequence[Node], detectable: tuple[Detectable, ...], issues: Sequence[str]) -> Diagnosis:
         """Return the verdict."""
@@ -271,8 +276,6 @@ class Procedure:
 
 LONGEST_SEARCH = 60.0
 """Longest search for missing forces [s]."""
-DIVERGED = 300.0
-"""Residual over noise that only a simulation which has diverged reaches."""
 FIRST = 3
 """Candidates that are fitted at a time before it is asked whether more are needed."""
 EXPLAINED = 1.1
@@ -283,6 +286,8 @@ NEAR = 0.4
 """Share of the best gain from which on a candidate is worth a second fit."""
 SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
+ROUNDS, FINE = 3, 0.01
+"""How often the best fit is taken up again, as long as its cost falls by the second number."""
 DOUBTFUL = 0.4
 """Gain below which it is made sure that it is not owed to better initial states alone."""
 STRONGEST = 3
@@ -290,7 +295,7 @@ STRONGEST = 3
 MOST = 0.8
 """Share of the folds in which an effect must gain."""
 SAME = 0.02
-"""Gains that differ by less than this share of the error are taken for the same."""
+"""Errors that differ by less than this share are taken for the same."""
 
 
 def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
@@ -332,7 +337,7 @@ def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
 def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[Candidate, Finding]]:
     """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
 
-    Gains are the same where they differ by less than 2 standard errors over the blocks, or by `SAME` of the error.
+    They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it.
     Among equals those come first that need fewer parameters and smaller values of them.
     """
     best = max(good, key=lambda pair: pair[1].gain)
@@ -340,7 +345,7 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
     for c, f in good:
         difference = c.errors - best[0].errors
         error = np.sqrt(len(difference)) * difference.std()
-        if difference.sum() <= max(2 * error, SAME * base.errors.sum()):
+        if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
             group.append((c, f))
     return sorted(group, key=lambda pair: -plausibility(base, *pair))
 

@@ -29,6 +29,9 @@ from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
+FAR = 1.0
+"""Errors of initial states, in units of their spread, that count as far from what was measured."""
+
 
 @dataclass(frozen=True)
 class Node:
@@ -134,28 +137,41 @@ def strengthened(base: Node, rivals: Sequence[Candidate]) -> Node:
 
 
 def screen(base: Node, effect: Effect) -> Screened:
-    """Look at what a candidate could do, from its sensitivities and a few scanned values."""
-    prediction = Prediction(base.model, (effect,), base.windows, engine=base.engine, threads=1)
-    solver = Solver(prediction)
-    values = prediction.start.copy()
-    pieces = eliminated(solver, base, sensitive_start(solver, values))
+    """Look at what a candidate could do, from its sensitivities and a few scanned values.
+
+    Sensitivities are taken at the node's initial states, and at the measured ones where those are far off: initial
+    states that make up for a missing effect lead to where its sensitivities mean little.
+    """
+    solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine, threads=1))
+    values = solver.p.start.copy()
+    at = sensitive_start(solver, values)
     # What matters is the residual of the node itself; at a start off the null value it is another.
-    pieces = tuple(replace(piece, residual=known.residual) for piece, known in zip(pieces, base.pieces, strict=True))
-    errors = HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
-    gain = float((base.errors.sum() - errors.sum()) / max(base.errors.sum(), 1e-12))
+    pieces = with_residuals(projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces)
+    gain = linear_gain(base, pieces, base.pieces, base.errors)
+    if max(float(np.abs(o).max()) for o in base.fit.offsets) > FAR:
+        zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
+        there = projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
+        plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
+        before = HeldOut(block_sums(plain, base.blocks, base.limit), base.blocks).own()
+        gain = max(gain, linear_gain(base, there, plain, before))
     scanned, start = scan(solver, base, values)
-    return Screened(effect, gain, scanned, start, pieces, prediction.simulated)
+    return Screened(effect, gain, scanned, start, pieces, solver.p.simulated)
+
+
+def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Linear, ...]:
+    """Return sensitivities with the residuals of others."""
+    return tuple(replace(piece, residual=known.residual) for piece, known in zip(pieces, of, strict=True))
+
+
+def linear_gain(base: Node, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
+    """Return the share of the held-out error that a linear step with the sensitivities takes away."""
+    errors = HeldOut(block_sums(with_residuals(pieces, plain), base.blocks, base.limit), base.blocks).own()
+    return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
 
 
 def sensitive_start(solver: Solver, values: np.ndarray) -> np.ndarray:
     """Return where sensitivities are taken: the null values, and finite values for limits that are infinite there."""
     return np.where(np.isfinite(values), values, solver.scale)
-
-
-def eliminated(solver: Solver, base: Node, values: np.ndarray) -> tuple[Linear, ...]:
-    """Return sensitivities with the initial states eliminated, at the node's initial states."""
-    linear = solver.linearise(values, base.fit.offsets)
-    return tuple(projected(replace(base.fit, linear=linear)))
 
 
 def scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndarray]:
