@@ -18,6 +18,7 @@ COMMANDS = {
     "replay": "replay a recording in a model and save what the model predicts",
     "events": "extract the contact event sequence of a recording",
     "compare": "compare a model, or two, with a recording",
+    "locate": "find where a model lacks forces: by joint, and on which place of which object",
 }
 """Names of the commands, each a module of this package, with what they do."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141

@@ -11,6 +11,7 @@ from concent_warp.diagnose.wrench import SLIP, WORLD
 
 if TYPE_CHECKING:
     from concent_warp.diagnose.dependence import Dependences
+    from concent_warp.diagnose.force_place import ForcePlace
     from concent_warp.diagnose.location import BodyForce, JointForce, PhaseForce
 
 MEANINGS = {
@@ -99,26 +100,31 @@ def body_sentence(body: str, found: PhaseForce) -> str:
     text = f"{body}, {found.phase} ({spans}{more}): {found.size:.2g} ± {1.96 * found.size_std:.1g} N unexplained"
     text += f" {direction_words(found.vector, found.frame)}"
     if found.place is not None:
-        place = found.place
-        coordinates = ", ".join(
-            "?" if axis in place.hidden else f"{1e3 * place.point[i]:.0f}" for i, axis in enumerate(AXES)
-        )
-        if place.against is not None:
-            text += f", at its contact with {place.against} ({place.face})"
-        elif place.off and not place.through_center:
-            text += f", on a line that misses it by {1e3 * place.off:.0f} mm"
-        elif not place.off:
-            text += f", at ({coordinates}) mm: {place.face}"
-        if place.hidden and place.against is None and not place.off:
-            text += f", where along {' and '.join(place.hidden)} its contacts hide"
-        elif not place.off and place.against is None:
-            told = max(place.std[i] for i, axis in enumerate(AXES) if axis not in place.hidden)
-            text += f", ± {1e3 * 1.96 * told:.1g} mm"
-        if place.through_center:
-            text += "; its line passes through the centre of mass, as that of weight, wind or inertia does"
+        text += place_words(found.place)
     if found.phase == "impact":
         text += f"; {np.linalg.norm(found.impulse):.2g} N s a time"
     return f"{text}; p = {found.p:.2g}."
+
+
+def place_words(place: ForcePlace) -> str:
+    """Return where a force acts, in words, to follow on what it is."""
+    if place.against is not None:
+        words = f", at its contact with {place.against} ({place.face})"
+    elif place.through_center:
+        words = ""
+    elif place.off:
+        words = f", on a line that misses it by {1e3 * place.off:.0f} mm"
+    else:
+        told = [i for i, axis in enumerate(AXES) if axis not in place.hidden]
+        coordinates = ", ".join(f"{1e3 * place.point[i]:.0f}" if i in told else "?" for i in range(3))
+        words = f", at ({coordinates}) mm: {place.face}"
+        if told:
+            words += f", ± {1e3 * 1.96 * max(place.std[i] for i in told):.2g} mm"
+        if place.hidden:
+            words += f" (where along {' and '.join(place.hidden)} its contacts hide)"
+    if place.through_center:
+        words += "; its line passes through the centre of mass, as that of weight, wind or inertia does"
+    return words
 
 
 def direction_words(vector: np.ndarray, frame: str) -> str:

@@ -1,0 +1,84 @@
+"""``concent locate``: where a model lacks forces, by joint and on the objects."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.markup import escape
+
+from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
+from concent_warp.cli.terminal import say, say_written
+from concent_warp.diagnose.locate import locate
+from concent_warp.diagnose.location import Location
+from concent_warp.diagnose.shooting import WindowCfg
+from concent_warp.errors import RecordingError
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Find where a model lacks forces: by joint, with what they depend on, and on the objects, with the place."""
+
+    recording: tyro.conf.Positional[Path]
+    """Recording."""
+    model: Path | None = None
+    """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations; all by default."""
+    engine: EngineName = "mujoco"
+    """Engine."""
+    window: float | None = None
+    """Time over which forces are averaged [s]; 0.1 s for joints, 0.12 s with objects, more where readings are rare, by
+    default."""
+    json: bool = False
+    """Print one JSON object with all figures in SI units instead of sentences."""
+    html: Path | None = None
+    """Write a report with the objects and the forces on them in 3D to this file."""
+    png: Path | None = None
+    """Write a picture of the objects and the forces to this file."""
+    overwrite: bool = False
+    """Replace files that are there."""
+
+
+def run(arguments: Arguments) -> Location:
+    """Locate, and print or write what was asked for."""
+    if arguments.window is not None and not arguments.window > 0:
+        raise RecordingError("a window must have a length", expected="--window above 0 s", found=arguments.window)
+    recording = load_recording(arguments.recording).only(arguments.demonstrations)
+    own = Scene(recording.scene, source=recording.source)
+    model = Model(own) if arguments.model is None else Model.load(arguments.model)
+    for path in (arguments.html, arguments.png):
+        if path is not None:
+            claim_file(path, overwrite=arguments.overwrite)
+    found = locate(model, recording, arguments.engine, cfg=WindowCfg(arguments.window))
+    if arguments.json:
+        print(json.dumps(found.to_json(), indent=1, allow_nan=False))
+    else:
+        for sentence in found.sentences():
+            say(escape(sentence))
+    written = []
+    if arguments.png is not None:
+        from concent_warp.diagnose.location_plot import plot_location
+
+        make_folder(arguments.png.parent)
+        plot_location(found, model, arguments.png)
+        written.append(arguments.png)
+    if arguments.html is not None:
+        from concent_warp.diagnose.compare import compare
+        from concent_warp.report.report import write_report
+
+        models = {"model": model}
+        settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+        make_folder(arguments.html.parent)
+        compared = compare(models, recording, arguments.engine)
+        write_report(arguments.html, recording, models, compared, settings=settings, location=found.to_json())
+        written.append(arguments.html)
+    if written and not arguments.json:
+        say_written(*written)
+    return found
