@@ -24,17 +24,20 @@ STEPS = (0.2, 0.2, 0.1, 0.05, 0.02)
 Residuals = dict[str, np.ndarray]
 
 
-def ratios(model: Model, recording: Recording, *, refit: bool = True) -> dict[str, float]:
-    """Return the root mean square of residual over noise of each channel, over all demonstrations."""
+def ratios(model: Model, recording: Recording) -> dict[str, float]:
+    """Return the root mean square of residual over noise of each channel, over all demonstrations.
+
+    Starts are refitted where bodies move at the start; what rests or is driven forgets its start.
+    """
     engine = MujocoEngine(model, threads=1)
     square: dict[str, list[np.ndarray]] = {}
     for demonstration in recording.demonstrations:
-        for name, value in best_residuals(engine, demonstration, refit).items():
+        for name, value in best_residuals(engine, demonstration).items():
             square.setdefault(name, []).append(value.ravel() ** 2)
     return {name: float(np.sqrt(np.mean(np.concatenate(parts)))) for name, parts in square.items()}
 
 
-def best_residuals(engine: MujocoEngine, demonstration: Demonstration, refit: bool) -> Residuals:
+def best_residuals(engine: MujocoEngine, demonstration: Demonstration) -> Residuals:
     """Return residuals over noise by channel, each (T, dim), from the start that explains most."""
     m, nv = engine.compiled, engine.compiled.nv
     qpos, qvel = initial_state(engine.model.scene.model, demonstration)
@@ -54,7 +57,7 @@ def best_residuals(engine: MujocoEngine, demonstration: Demonstration, refit: bo
     best = np.zeros(2 * nv)
     residual = run(best[None])[0]
     cost = np.sum(stacked(residual, best) ** 2)
-    for step in STEPS if refit else ():
+    for step in STEPS if qvel.any() else ():
         base = stacked(residual, best)
         varied = np.concatenate([best + step * np.eye(2 * nv), best - step * np.eye(2 * nv)])
         seen = np.stack([stacked(r, x) for r, x in zip(run(varied), varied, strict=True)], axis=1)

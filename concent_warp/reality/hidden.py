@@ -8,6 +8,7 @@ from __future__ import annotations
 from concent_warp.reality.hidden_case import Builder, Hidden
 from concent_warp.reality.hidden_contact import CONTACT
 from concent_warp.reality.hidden_drives import DRIVES
+from concent_warp.reality.hidden_gears import GEARS
 from concent_warp.reality.hidden_joints import JOINTS
 from concent_warp.reality.hidden_measurement import MEASUREMENT
 from concent_warp.reality.hidden_objects import OBJECTS
@@ -15,7 +16,7 @@ from concent_warp.reality.hidden_outside import OUTSIDE
 from concent_warp.reality.hidden_world import WORLD
 from concent_warp.reality.rig import Rig
 
-INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **OBJECTS, **CONTACT, **WORLD, **MEASUREMENT}
+INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **GEARS, **OBJECTS, **CONTACT, **WORLD, **MEASUREMENT}
 """Effects that a library of effects has, by canonical name."""
 EVERY: dict[str, Builder] = {**INSIDE, **OUTSIDE}
 

@@ -1,7 +1,4 @@
-"""Hidden effects in drives: commands late or smoothed, weak or limited motors, play, springs, wrong zeros.
-
-Play and springs have a rotor of their own, a second joint that the servo drives, coupled to the link by a tendon.
-"""
+"""Hidden effects in drives: commands late or smoothed, weak or limited motors, wrong zeros."""
 
 from __future__ import annotations
 
@@ -103,62 +100,6 @@ def actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("actuator_saturation", effect, {"limit": magnitude}, names(found))
 
 
-def add_rotor(spec: mujoco.MjSpec, drive: Drive, inertia: float) -> mujoco.MjsTendon:
-    """Give a drive a rotor beside its joint, and return the tendon whose length is rotor angle less link angle."""
-    link = spec.joint(drive.joint)
-    rotor = spec.worldbody.add_body(name=f"{drive.joint}_rotor")
-    rotor.explicitinertial = True
-    rotor.mass, rotor.inertia = (inertia, [1e-6] * 3) if link.type == SLIDE else (1e-3, [inertia] * 3)
-    rotor.add_joint(name=f"{drive.joint}_rotor", type=link.type, axis=[0, 0, 1] if link.type != SLIDE else [1, 0, 0])
-    spec.actuator(drive.actuator).target = f"{drive.joint}_rotor"
-    tendon = spec.add_tendon(name=f"{drive.joint}_gear")
-    tendon.wrap_joint(f"{drive.joint}_rotor", 1.0)
-    tendon.wrap_joint(drive.joint, -1.0)
-    return tendon
-
-
-SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
-
-
-def light(drive: Drive, rig: Rig) -> float:
-    """Return a rotor inertia that hardly counts beside what the drive moves [kg m^2 or kg]."""
-    m = rig.scene.model
-    return 0.01 * float(m.dof_M0[m.joint(drive.joint).dofadr[0]])
-
-
-def backlash(rig: Rig, magnitude: float) -> Hidden:
-    """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
-    found = drives(rig)
-
-    def edit(spec: mujoco.MjSpec) -> None:
-        for d in found:
-            tendon = add_rotor(spec, d, light(d, rig))
-            tendon.limited, tendon.range = True, [-magnitude / 2, magnitude / 2]
-            tendon.solref_limit = [2 * spec.option.timestep, 1.0]
-            tendon.solimp_limit = [0.95, 0.99, 1e-4, 0.5, 2.0]
-
-    return Hidden("backlash", HiddenEffect("backlash", edit=edit), {"play": magnitude}, names(found))
-
-
-def joint_compliance(rig: Rig, magnitude: float) -> Hidden:
-    """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
-    found = drives(rig)
-    compliance = np.array([magnitude / d.weight for d in found])
-
-    def edit(spec: mujoco.MjSpec) -> None:
-        for d, c in zip(found, compliance, strict=True):
-            tendon = add_rotor(spec, d, light(d, rig))
-            tendon.stiffness = [1 / c, 0, 0]
-            tendon.damping = [1e-3 / c, 0, 0]
-            tendon.springlength = [0.0, 0.0]
-            for sensor in spec.sensors:
-                if sensor.type == mujoco.mjtSensor.mjSENS_JOINTPOS and sensor.objname == d.joint:
-                    sensor.objname = f"{d.joint}_rotor"
-
-    truth = each("compliance", names(found), compliance)
-    return Hidden("joint_compliance", HiddenEffect("joint_compliance", edit=edit), truth, names(found))
-
-
 def joint_offset(rig: Rig, magnitude: float) -> Hidden:
     """How far the true angle is beyond what encoder and drive take it for [rad or m], in alternate directions."""
     found = drives(rig)
@@ -197,8 +138,6 @@ DRIVES: dict[str, Builder] = {
         actuator_saturation,
         actuator_delay,
         actuator_lag,
-        backlash,
-        joint_compliance,
         joint_offset,
     )
 }

@@ -24,7 +24,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "actuator_saturation": (1.0, 0.92, 0.82),
         "actuator_delay": (6e-4, 1.2e-3, 3e-3),
         "actuator_lag": (6e-4, 1.2e-3, 3e-3),
-        "backlash": (0.003, 0.0055, 0.014),
+        "backlash": (0.0035, 0.0065, 0.016),
         "joint_compliance": (0.008, 0.018, 0.05),
         "joint_offset": (0.01, 0.022, 0.055),
         "mass": (1.025, 1.055, 1.14),

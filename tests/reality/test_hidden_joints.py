@@ -24,7 +24,11 @@ def swing(*found: Hidden, target: float = 0.0, start: float | None = None, durat
     settle, qpos = (0.8, {}) if start is None else (0.0, {"hinge": [start]})
     trial = Trial(duration, action, qpos=qpos, settle=settle)
     motion, _, _ = perform(model, trial, effects, PENDULUM.physics)
-    return np.column_stack([motion.time, motion.sensordata[:, 0], motion.sensordata[:, 3]])
+    angle = motion.sensordata[:, :1]
+    for effect in effects:
+        if effect.measure is not None:
+            _, angle = effect.measure("hinge_position", motion.time, angle)
+    return np.column_stack([motion.time, angle, motion.sensordata[:, 3]])
 
 
 def sag(angle: float, kp: float = 5.0, mass_arm: float = 0.03 * 0.05 + 0.3 * 0.1) -> float:
