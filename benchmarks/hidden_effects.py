@@ -102,7 +102,7 @@ def study(case: DataSet, out: Path) -> dict[str, Any]:
     }
     begun = time.perf_counter()
     try:
-        found = diagnose(Model(data.scene), data.recording, DiagnosisCfg(jobs=1, seed=case.seed))
+        found = diagnose(Model(data.scene), data.recording, DiagnosisCfg(jobs=1, seed=case.seed, explain=False))
         result |= found.to_json()
     except ConcentError as error:
         result |= {"error": str(error)}

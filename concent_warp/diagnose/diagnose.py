@@ -8,7 +8,7 @@ against what chance makes of the whole search. Add the best, and begin again wit
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -18,6 +18,7 @@ from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blo
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
+from concent_warp.diagnose.noise import UNDERESTIMATE
 from concent_warp.diagnose.search import (
     Candidate,
     Node,
@@ -32,7 +33,7 @@ from concent_warp.diagnose.search import (
 )
 from concent_warp.diagnose.where import where
 from concent_warp.fit.effects import check_finite
-from concent_warp.fit.observe import observe
+from concent_warp.fit.observe import channel_noises, observe
 from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -115,13 +116,7 @@ class Procedure:
         """Go through the procedure."""
         issues = check_data(self.recording)
         self.progress(0.0, "cutting windows")
-        windows = observe(
-            self.model, self.recording, length=self.cfg.window, engine=self.cfg.engine, seed=self.cfg.seed
-        )
-        blocks = cut_blocks(windows)
-        self.progress(0.03, "fitting the model as it is")
-        check_finite(Prediction(self.model, (), windows, engine=self.cfg.engine), self.model.scene.source)
-        base = node(self.model, windows, blocks, self.cfg.engine, None)
+        base = self.baseline()
         nodes, detectable = [base], ()
         for step in range(self.cfg.additions):
             self._done = 0.1 + 0.85 * step / self.cfg.additions
@@ -132,6 +127,29 @@ class Procedure:
             nodes.append(extended(nodes[-1], best))
         self.progress(1.0, "done")
         return self.conclude(nodes, detectable, issues)
+
+    def baseline(self) -> Node:
+        """Return the model as it is, with its own parameters and the initial states fitted.
+
+        Noise that is estimated and not stated is taken for larger where even the blocks that the model explains best
+        show more: readings that were filtered tell too little of it.
+        """
+        noise = channel_noises(self.model, self.recording)
+        recorded = [d.measured for d in self.recording.demonstrations]
+        told = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
+        base = self.fitted_baseline(noise)
+        larger = {c: r for c, r in quiet_ratios(base).items() if c not in told and r > UNDERESTIMATE}
+        if larger:
+            base = self.fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
+        return base
+
+    def fitted_baseline(self, noise: Mapping[str, float]) -> Node:
+        """Return the model as it is, fitted to readings of some noise."""
+        cfg = self.cfg
+        windows = observe(self.model, self.recording, length=cfg.window, noise=noise, engine=cfg.engine, seed=cfg.seed)
+        self.progress(0.03, "fitting the model as it is")
+        check_finite(Prediction(self.model, (), windows, engine=cfg.engine), self.model.scene.source)
+        return node(self.model, windows, cut_blocks(windows), cfg.engine, None)
 
     def addition(self, base: Node, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
         """Look for one effect that the node's model lacks; return it, and what could have been seen."""
@@ -286,6 +304,8 @@ NEAR = 0.4
 """Share of the best gain from which on a candidate is worth a second fit."""
 SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
+QUIET = 0.25
+"""Share of the blocks, those with the smallest residuals, that tell what noise there is at least."""
 ROUNDS, FINE = 3, 0.01
 """How often the best fit is taken up again, as long as its cost falls by the second number."""
 DOUBTFUL = 0.4
@@ -305,6 +325,16 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
     from joblib import Parallel, delayed
 
     return Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks)
+
+
+def quiet_ratios(base: Node) -> dict[str, float]:
+    """Return the root mean square of the residuals over the noise of each channel, in the quietest blocks it has."""
+    blocks: dict[str, list[float]] = {}
+    for window, piece, rows in zip(base.windows, base.pieces, base.blocks.of_row, strict=True):
+        for r in window.readings:
+            mine, of = piece.residual[r.rows] ** 2, rows[r.rows]
+            blocks.setdefault(r.channel, []).extend(float(np.sqrt(mine[of == b].mean())) for b in np.unique(of))
+    return {channel: float(np.quantile(values, QUIET)) for channel, values in blocks.items()}
 
 
 def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
