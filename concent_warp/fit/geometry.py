@@ -43,7 +43,7 @@ class FitCfg:
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
     generations: int = 70
     """Generations at most."""
-    patience: int = 12
+    patience: int = 20
     """Generations without a better estimate, on the frames of the fit or on the held-out ones, after which it ends."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
