@@ -19,6 +19,8 @@ COMMANDS = {
     "events": "extract the contact event sequence of a recording",
     "compare": "compare a model, or two, with a recording",
     "locate": "find where a model lacks forces: by joint, and on which place of which object",
+    "diagnose": "find which physical effect a model lacks, with the evidence, or why none can be named",
+    "add": "add a physical effect to a model, and fit it to a recording",
 }
 """Names of the commands, each a module of this package, with what they do."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141

@@ -1,0 +1,188 @@
+"""``concent add``: a model gets one more physical effect, at given values or fitted to a recording."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.markup import escape
+
+from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
+from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import say, say_written
+from concent_warp.effects.registry import effect_class, effects
+from concent_warp.errors import ConcentError, ModelError
+from concent_warp.model import Model
+from concent_warp.simulate.select import EngineName
+
+if TYPE_CHECKING:
+    from concent_warp.effects.effect import Effect, Parameter
+    from concent_warp.fit.effects import FittedEffects
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Add a physical effect to a model: at its null value, at given values, or fitted to a recording together with the
+    effects that the model has.
+    """
+
+    effect: tyro.conf.Positional[str] = ""
+    """Effect; --list shows all."""
+    list: bool = False
+    """List all effects with their parameters, and with --model where in it each may act."""
+    model: Path | None = None
+    """Model (.toml) or MJCF (.xml)."""
+    target: tuple[str, ...] = ()
+    """Joints, actuators, bodies or sensors that it acts on; by default all that it may act on."""
+    set: tuple[str, ...] = ()
+    """Values of parameters, such as torque[joint1]=0.1; with --fit the values to start from."""
+    fit: Path | None = None
+    """Recording to fit it to."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations of it; all by default."""
+    window: float | None = None
+    """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
+    engine: EngineName = "mujoco"
+    """Engine of the fit."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Model file (.toml) to write."""
+    overwrite: bool = False
+    """Replace it if it is there."""
+
+
+def run(arguments: Arguments) -> FittedEffects | Model | None:
+    """Add, fit, save; or list."""
+    if arguments.list:
+        say_effects(None if arguments.model is None else Model.load(arguments.model))
+        return None
+    for given, option in ((arguments.effect, "EFFECT"), (arguments.model, "--model"), (arguments.out, "--out")):
+        if not given:
+            raise ConcentError(f"{option} is missing", fix="see concent add --help, or --list for all effects")
+    assert arguments.model is not None
+    assert arguments.out is not None
+    kind = effect_class(arguments.effect)
+    model = Model.load(arguments.model)
+    check_out(arguments.out, arguments.overwrite)
+    added = with_effect(model, chosen(model, kind, arguments.target), assigned(arguments.set))
+    fitted = None
+    if arguments.fit is not None:
+        from concent_warp.fit.effects import fit_effects
+        from concent_warp.recording.load import load_recording
+
+        recording = load_recording(arguments.fit).only(arguments.demonstrations)
+        with work_progress("fitting") as progress:
+            fitted = fit_effects(added, recording, progress, window=arguments.window, engine=arguments.engine)
+        added = fitted.model
+    make_folder(arguments.out.parent)
+    added.save(arguments.out)
+    if fitted is not None:
+        say_fitted(fitted)
+    else:
+        new = added.effects[len(model.effects) :]
+        say_added(new, [[p.name for p in a.effect.parameters(model.compile())] for a in new])
+    say_written(arguments.out)
+    return fitted or added
+
+
+def check_out(path: Path, overwrite: bool) -> None:
+    """Check that a model can be written there.
+
+    Raises:
+        ConcentError: The name does not end in .toml, or the file exists.
+    """
+    if path.suffix != ".toml":
+        raise ConcentError("the name of a model file ends in .toml", where=path)
+    claim_file(path, overwrite=overwrite)
+
+
+def chosen(model: Model, kind: type[Effect], target: Sequence[str]) -> list[Effect]:
+    """Return the effect on the targets asked for, or on each selection that it may act on.
+
+    Raises:
+        ModelError: There is nothing in the model that it may act on.
+    """
+    if target:
+        return [kind(*target)]
+    found = [kind(*names) for names in kind.targets(model.compile())]
+    if not found:
+        what = "the world" if kind.kind == "none" else f"a suitable {kind.kind}"
+        raise ModelError(f"there is nothing for {kind.name} to act on", where=model.scene.source, expected=what)
+    return found
+
+
+def assigned(given: Sequence[str]) -> dict[str, float]:
+    """Return parameters' values from ``name=value``.
+
+    Raises:
+        ConcentError: Something is not of that form.
+    """
+    found = {}
+    for text in given:
+        name, _, value = text.rpartition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise ConcentError("--set is not right", expected="name=value with a number", found=text)
+    return found
+
+
+def with_effect(model: Model, new: Sequence[Effect], values: Mapping[str, float]) -> Model:
+    """Return the model with effects at some of their parameters' values.
+
+    Raises:
+        ModelError: A target or a parameter does not exist, or a value is out of bounds.
+    """
+    known: list[str] = []
+    for effect in new:
+        effect.check(model.compile())
+        names = [p.name for p in effect.parameters(model.compile())]
+        known += names
+        model = model.add(effect, {name: values[name] for name in names if name in values})
+    for name in values:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            raise ModelError(
+                f"{new[0].name} has no parameter {name!r} here",
+                fix=f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}",
+            )
+    return model
+
+
+def say_effects(model: Model | None) -> None:
+    """Write a table of all effects; with a model, where in it each may act."""
+    from rich.table import Table
+
+    from concent_warp.scene.shape_sorter import ShapeSorterCfg
+
+    m = (Model(ShapeSorterCfg().build()) if model is None else model).compile()
+    table = Table(header_style="bold", show_lines=False)
+    columns = ["effect", "what it does", "parameters [unit]", *(["may act on"] if model is not None else [])]
+    for name in columns:
+        table.add_column(name, no_wrap=name == "effect")
+    family = ""
+    for kind in effects().values():
+        if family and kind.family != family:
+            table.add_section()
+        family = kind.family
+        selections = kind.targets(m)
+        cells = [kind.name, kind.summary, parameters_text([p for s in selections for p in kind(*s).parameters(m)])]
+        if model is not None:
+            cells.append("; ".join(", ".join(s) or "the world" for s in selections) or "nothing here")
+        table.add_row(*map(escape, cells))
+    say(table)
+
+
+def parameters_text(parameters: Sequence[Parameter]) -> str:
+    """Return names and units of parameters; several of a kind as one."""
+    found: dict[str, list[str]] = {}
+    for p in parameters:
+        units = found.setdefault(p.name.split("[")[0], [])
+        if p.unit not in units:
+            units.append(p.unit)
+    return ", ".join(f"{name} [{' or '.join(units)}]" for name, units in found.items())

@@ -1,0 +1,199 @@
+"""``concent diagnose``: which physical effect a model lacks, how sure that is, or why none can be named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import tyro
+from rich.markup import escape
+
+from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
+from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
+from concent_warp.cli.terminal import say, say_written
+from concent_warp.diagnose.candidates import candidates
+from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnose.compare import compare
+from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnose.diagnosis import VERDICTS, Diagnosis, Finding
+from concent_warp.errors import ConcentError, ModelError
+from concent_warp.fit.effects import fit_effects
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.recording.recording import Recording
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.select import EngineName
+
+MOST_PLACES = 3
+"""Places that are named below the verdict."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Find which physical effect a model lacks to follow a recording: screen all effects of the library, fit the most
+    promising ones, judge them on held-out data against what chance makes of the whole search, add the best, repeat.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Recording."""
+    model: Path | None = None
+    """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations; all by default."""
+    effects: tuple[str, ...] = ()
+    """Effects to consider; all by default. "concent add --list" lists them."""
+    json: bool = False
+    """Print one JSON object, docs/diagnose.md, and nothing else."""
+    html: Path | None = None
+    """Write a report with the diagnosis, charts, replay and 3D views to this file."""
+    apply: Path | None = None
+    """Save the model with all accepted effects, fitted together, to this file (.toml)."""
+    window: float | None = None
+    """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
+    additions: int = 3
+    """Most effects that are added."""
+    engine: EngineName = "mujoco"
+    """Engine."""
+    jobs: int = -1
+    """Processes at a time; -1: one a CPU."""
+    seed: int = 0
+    """Seed of all that is drawn."""
+    checkpoint: Path | None = None
+    """Folder in which finished pieces are kept: the same command goes on from there after an interruption."""
+    overwrite: bool = False
+    """Replace what --html and --apply name if it is there."""
+
+
+def run(arguments: Arguments) -> Diagnosis:
+    """Diagnose, and print or write what was asked for."""
+    recording = load_recording(arguments.recording).only(arguments.demonstrations)
+    own = Scene(recording.scene, source=recording.source)
+    model = Model(own) if arguments.model is None else Model.load(arguments.model)
+    if arguments.jobs == 0:
+        raise ConcentError("no processes to work with", expected="--jobs -1 or at least 1", found=0)
+    check_effects(model, recording, arguments.effects)
+    for path in (arguments.html, arguments.apply):
+        if path is not None:
+            claim_file(path, overwrite=arguments.overwrite)
+    found = diagnosed(arguments, model, recording)
+    if arguments.json:
+        print(json.dumps(found.to_json(), indent=1, allow_nan=False))
+    else:
+        say_diagnosis(found)
+    if arguments.apply is not None:
+        save_accepted(arguments, found, recording)
+    if arguments.html is not None:
+        from concent_warp.report.report import write_report
+
+        models = {"model": found.models[0]}
+        if found.accepted:
+            models = {"before": found.models[0], "after": found.model}
+        comparison = compare(models, recording, arguments.engine, seed=arguments.seed)
+        settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+        make_folder(arguments.html.parent)
+        write_report(arguments.html, recording, models, comparison, settings=settings, diagnosis=found.to_json())
+        if not arguments.json:
+            say_written(arguments.html)
+    return found
+
+
+def check_effects(model: Model, recording: Recording, names: Sequence[str]) -> None:
+    """Check that each of the effects asked for could be missing.
+
+    Raises:
+        ModelError: There is no such effect, the model has it, or it has nothing to act on.
+    """
+    channels = {c for d in recording.demonstrations for c in d.measured}
+    for name in names:
+        if not candidates(model, channels, [name]):
+            raise ModelError(
+                f"{name} cannot be missing: the model has it, or nothing in model and recording that it acts on",
+                where=model.scene.source,
+                fix="leave it out of --effects",
+            )
+
+
+def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagnosis:
+    """Return the diagnosis; an interruption says how to go on."""
+    cfg = DiagnosisCfg(
+        effects=arguments.effects,
+        window=arguments.window,
+        additions=arguments.additions,
+        engine=arguments.engine,
+        jobs=arguments.jobs,
+        seed=arguments.seed,
+    )
+    made = versions()
+    try:
+        with work_progress("diagnosing") as progress:
+            if arguments.checkpoint is None:
+                found = diagnose(model, recording, cfg, progress)
+            else:
+                found = diagnose_with_checkpoint(model, recording, arguments.checkpoint, cfg, progress, made)
+    except KeyboardInterrupt:
+        advice = f"Finished pieces are kept; go on with: {command_line()}"
+        if arguments.checkpoint is None:
+            advice = "With --checkpoint FOLDER the same command would go on from here."
+        raise KeyboardInterrupt(advice) from None
+    return replace(found, versions=made)
+
+
+def say_diagnosis(found: Diagnosis) -> None:
+    """Write the verdict in sentences, where the model fails, and the table of effects."""
+    say(f"[bold]{escape(VERDICTS[found.verdict].capitalize())}[/bold]")
+    for sentence in found.sentences():
+        say(escape(sentence))
+    places = [str(place["sentence"]) for place in found.where if place.get("sentence")]
+    if places:
+        say("\n[bold]Where the model as given fails[/bold]")
+        for k, sentence in enumerate(places[:MOST_PLACES]):
+            say(escape(f"{k + 1}. {sentence}"))
+    if found.effects:
+        say_effects(found.effects)
+
+
+def say_effects(effects: Sequence[Finding]) -> None:
+    """Write the table of all effects that were fitted, addition by addition, the best first."""
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    for name in ("addition", "effect", "held-out gain [95 %]", "p", "parameters [95 %]", "verdict"):
+        table.add_column(name, justify="right" if name in ("held-out gain [95 %]", "p") else "left")
+    ranked = sorted(effects, key=lambda f: (f.step, not f.accepted, -f.gain))
+    for k, f in enumerate(ranked):
+        last = k + 1 == len(ranked) or ranked[k + 1].step != f.step
+        first = k == 0 or ranked[k - 1].step != f.step
+        shown = ", ".join(map(value_and_interval, f.parameters[:2]))
+        more = f", {len(f.parameters) - 2} more" if len(f.parameters) > 2 else ""
+        cells = [
+            str(f.step + 1) if first else "",
+            f.name,
+            f"{100 * f.gain:.1f} % [{100 * f.low:.1f}, {100 * f.high:.1f}]",
+            f"{f.p:.2g}",
+            shown + more,
+            "accepted" if f.accepted else f.reason,
+        ]
+        table.add_row(*map(escape, cells), end_section=last, style="bold" if f.accepted else None)
+    say(table)
+
+
+def save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
+    """Fit all accepted effects together and save the model; say so where none was accepted."""
+    path = arguments.apply
+    if path is None:
+        return
+    if not found.accepted:
+        if not arguments.json:
+            say(escape(f"No effect was accepted: {path} was not written."))
+        return
+    with work_progress("fitting") as progress:
+        fitted = fit_effects(
+            found.model, recording, progress, window=arguments.window, engine=arguments.engine, seed=arguments.seed
+        )
+    make_folder(path.parent)
+    fitted.model.save(path)
+    if not arguments.json:
+        say_fitted(fitted)
+        say_written(path)

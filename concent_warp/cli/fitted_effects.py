@@ -1,0 +1,70 @@
+"""What the commands say of fitted effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.markup import escape
+
+from concent_warp.cli.terminal import quiet_warp, say, status_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from concent_warp.diagnose.diagnosis import FittedParameter
+    from concent_warp.effects.effect import AddedEffect
+    from concent_warp.fit.effects import FittedEffects
+
+
+@contextmanager
+def work_progress(title: str) -> Iterator[Callable[[float, str], None]]:
+    """Show a bar; what is given is to be called with the share done, 0..1, and what is being done."""
+    quiet_warp()
+    with status_bar(title) as update:
+        yield lambda share, text: update(share, text, None)
+
+
+def number(value: float) -> str:
+    """Return a parameter's value as text."""
+    return f"{value:.4g}" if np.isfinite(value) else "none" if value > 0 else "-none"
+
+
+def value_and_interval(p: FittedParameter) -> str:
+    """Return a parameter as text, such as ``torque 0.0301 [0.0298, 0.0305] N m``; its owner in brackets is left out."""
+    unit = "" if p.unit == "-" else f" {p.unit}"
+    return f"{p.name.split('[')[0]} {number(p.value)} [{number(p.low)}, {number(p.high)}]{unit}"
+
+
+def say_fitted(fitted: FittedEffects) -> None:
+    """Write a table of all parameters with their intervals, how far the error has fallen, and what is doubtful."""
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    for name in ("effect", "parameter", "value", "95 % interval", "unit", "none at"):
+        table.add_column(name, justify="right" if name in ("value", "95 % interval", "none at") else "left")
+    for added, group in zip(fitted.model.effects, fitted.parameters, strict=True):
+        for k, p in enumerate(group):
+            interval = f"{number(p.low)} to {number(p.high)}"
+            cells = [added.effect.name if k == 0 else "", p.name, number(p.value), interval, p.unit, number(p.null)]
+            table.add_row(*map(escape, cells), end_section=k + 1 == len(group))
+    say(table)
+    table = Table(header_style="bold")
+    for name in ("residual / noise", "before", "after"):
+        table.add_column(name, justify="left" if name == "residual / noise" else "right")
+    for channel in fitted.channels:
+        table.add_row(escape(channel.channel), f"{channel.before:.2f}", f"{channel.after:.2f}")
+    table.add_section()
+    table.add_row("all", f"{fitted.before:.2f}", f"{fitted.after:.2f}")
+    say(table)
+    for remark in fitted.remarks:
+        say(escape(remark))
+
+
+def say_added(effects: Sequence[AddedEffect], names: Sequence[Sequence[str]]) -> None:
+    """Write the values that effects were added with; `names` are those of their parameters with units."""
+    for added, parameters in zip(effects, names, strict=True):
+        values = ", ".join(f"{name} {number(value)}" for name, value in zip(parameters, added.values, strict=True))
+        say(escape(f"{added.effect.name}: {values}"))
