@@ -82,6 +82,10 @@ def draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, An
     for setter, value in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):
         setter(value - half, value + half)
     axes.set_box_aspect((1, 1, 1))
+    if arrows:
+        # From the side that the first arrow ends on.
+        x, y = np.array(arrows[0]["point"])[:2] - points.mean(axis=0)[:2] / 1e3
+        axes.view_init(elev=25, azim=float(np.degrees(np.arctan2(y, x))) - 40)
     axes.set_xlabel("x [mm]", fontsize=8)
     axes.set_ylabel("y [mm]", fontsize=8)
     axes.set_zlabel("z [mm]", fontsize=8)
