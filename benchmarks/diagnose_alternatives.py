@@ -1,0 +1,208 @@
+"""A diagnosis against its alternatives, same data, same split: what do they predict, and what do they blame?
+
+Three ways to mend a model that lacks something:
+
+- *diagnosis*: `concent diagnose` with its default settings, and the model with all that it accepts;
+- *everything at once*: the parameters of all candidate effects of the library, fitted together with the initial states
+  by bounded robust least squares, and nothing left out afterwards;
+- *sysid toolbox*: MuJoCo's own `mujoco.sysid` (residual, `optimize`, `calculate_intervals`), which fits what a user
+  names; here everything of the scene that is a plain number in MuJoCo and that one would think of (`PLAIN`), from the
+  measured initial states.
+
+A cause is *blamed* where the 95 % interval of one of its parameters leaves out the value at which it does nothing (for
+the diagnosis: where it is accepted; a group counts as right if the hidden effect is in it). The data sets are of
+`hidden_effects_data.py`, with seeds of their own; what judges is another recording of the same experiment, with another
+seed: windows of it are predicted, each from the measured state as corrected by the first 30 % of the window. The
+measured data and their judges are those of `diagnose_real.py`.
+
+    python benchmarks/diagnose_alternatives.py                      # what is not done yet, then the page
+    python benchmarks/diagnose_alternatives.py --names pendulum-null-0
+    python benchmarks/diagnose_alternatives.py --table              # the page alone
+
+The toolbox needs packages that mujoco installs on request: pip install "mujoco[sysid]".
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from diagnose_alternatives_report import write_report
+from diagnose_real import FOLDERS, GAINS, Case, servo, tosses
+from diagnose_real import Args as RealArgs
+from everything import Blame, fit_everything
+from held_out import noise_errors, spans_of
+from hidden_effects_data import DataSet, cases, make, true_model
+from pages import ROOT, machine, read_data, write_data
+from sysid_toolbox import fit_toolbox
+
+from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
+from concent_warp.model import Model
+from concent_warp.recording.recording import Recording
+
+NAME = "diagnose_alternatives"
+NAMES = (
+    "pendulum-null-0",
+    "drop-null-0",
+    "slide-null-0",
+    "pendulum-joint_friction-middle-0",
+    "pendulum-load_friction-middle-0",
+    "pendulum-actuator_lag-middle-0",
+    "pendulum-actuator_gain-middle-0",
+    "slide-sliding_friction-middle-0",
+    "slide-gravity_tilt-middle-0",
+    "spin-torsional_friction-middle-0",
+    "drop-contact_compliance-middle-0",
+    "tumble-inertia-middle-0",
+)
+"""Data sets: rigs that are simulated quickly, effects that all three ways know, and some that not all know."""
+SHIFT, FRESH = 500, 900
+"""Added to the seeds of the data that are fitted, and of those that judge."""
+HEAD = 0.3
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    names: tuple[str, ...] = NAMES
+    """Data sets of `hidden_effects_data.py`."""
+    data: Path = ROOT.parent / "shared" / "data"
+    """Folder with the folders contactnets_cube and bam_xl330."""
+    real: bool = True
+    """Whether to try the measured data too."""
+    fitted: int = 30
+    """Tosses that are fitted."""
+    judged: int = 60
+    """Tosses that judge."""
+    again: bool = False
+    """Do again what is done."""
+    table: bool = False
+    """Write the page from the figures that there are."""
+
+
+Fitted = tuple[Model, list[Blame]]
+"""A model, and what is blamed."""
+WAYS: dict[str, Callable[[Model, Recording], Fitted]] = {}
+
+
+def way(name: str) -> Callable[[Callable[[Model, Recording], Fitted]], Callable[[Model, Recording], Fitted]]:
+    """Enter a way to mend a model."""
+
+    def enter(function: Callable[[Model, Recording], Fitted]) -> Callable[[Model, Recording], Fitted]:
+        WAYS[name] = function
+        return function
+
+    return enter
+
+
+@way("diagnosis")
+def diagnosed(model: Model, recording: Recording) -> Fitted:
+    """Diagnose, and take all that is accepted."""
+    found = diagnose(model, recording, DiagnosisCfg(jobs=1, explain=False))
+    groups = [*found.groups, *((f.name,) for f in found.accepted[len(found.groups) :])]
+    blamed = [
+        Blame(f.name.split("(")[0], tuple(n.split("(")[0] for n in group))
+        for f, group in zip(found.accepted, groups, strict=True)
+    ]
+    return found.model, blamed
+
+
+@way("everything at once")
+def everything(model: Model, recording: Recording) -> Fitted:
+    """Fit all candidate effects together."""
+    return fit_everything(model, recording)
+
+
+@way("sysid toolbox")
+def toolbox(model: Model, recording: Recording) -> Fitted:
+    """Fit MuJoCo's plain numbers by its toolbox."""
+    return fit_toolbox(model, recording)
+
+
+def main(args: Args) -> None:
+    """Measure what is not done, and write data and page."""
+    if not args.table:
+        known = {c.name: c for c in cases()}
+        for name in args.names:
+            keep(name, args, lambda name=name: synthetic(known[name]))
+        if args.real:
+            missing = [str(args.data / f) for f in FOLDERS.values() if not (args.data / f).is_dir()]
+            if missing:
+                print(f"no measured data in {' and '.join(missing)}: --data or --no-real", file=sys.stderr)
+                raise SystemExit(2)
+            settings = RealArgs(data=args.data, fitted=args.fitted, judged=args.judged)
+            for kp in GAINS:
+                keep(f"servo, kp {kp:g}", args, lambda kp=kp: measured(servo(settings, kp)))
+            keep("tosses", args, lambda: measured(tosses(settings)))
+    write_report(read_data(NAME))
+
+
+def keep(name: str, args: Args, work: Callable[[], dict[str, Any]]) -> None:
+    """Do a data set unless it is done, and keep what came out."""
+    rows = read_data(NAME).get("rows", {})
+    if name in rows and not args.again:
+        return
+    row = work()
+    rows = {**read_data(NAME).get("rows", {}), name: row}
+    write_data(NAME, {"machine": machine(), "rows": rows})
+    errors = ", ".join(f"{way} {r['error']:.2f} {r['blamed']} {r['seconds']:.0f} s" for way, r in row["ways"].items())
+    print(f"{name}: drawing {row['drawing']:.2f}, floor {row['floor']}, {errors}", flush=True)
+
+
+def synthetic(case: DataSet) -> dict[str, Any]:
+    """Try all ways on a data set with a hidden effect."""
+    data = make(replace(case, seed=case.seed + SHIFT))
+    fresh = make(replace(case, seed=case.seed + FRESH))
+    model = Model(data.scene)
+    spans = spans_of(model, fresh.recording, HEAD)
+
+    def error(m: Model) -> float:
+        return pooled(noise_errors(m, spans))
+
+    truth = true_model(data) if data.truth else model
+    hidden = [t.effect for t in data.truth]
+    floor = None if truth is None else error(truth)
+    return {"unit": "noise", "hidden": hidden, "floor": floor, **tried(model, data.recording, error, hidden)}
+
+
+def measured(case: Case) -> dict[str, Any]:
+    """Try all ways on measured data, whose truth nobody knows."""
+    judge = case.judges[0]
+
+    def error(m: Model) -> float:
+        return pooled(judge.errors(m))
+
+    return {"unit": judge.unit, "hidden": None, "floor": None, **tried(case.model, case.seen, error, None)}
+
+
+def pooled(errors: np.ndarray) -> float:
+    """Return the root mean square over windows or tosses."""
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def tried(
+    model: Model, recording: Recording, error: Callable[[Model], float], hidden: Sequence[str] | None
+) -> dict[str, Any]:
+    """Return what each way makes of a recording: error on held-out data, what it blames, time."""
+    ways = {}
+    for name, mend in WAYS.items():
+        begin = time.perf_counter()
+        mended, blamed = mend(model, recording)
+        spent = time.perf_counter() - begin
+        row: dict[str, Any] = {"error": error(mended), "seconds": spent, "blamed": sorted({b.name for b in blamed})}
+        if hidden is not None:
+            row["right"] = sorted({h for h in hidden for b in blamed if h in b.group})
+            row["wrong"] = sorted({b.name for b in blamed if not set(b.group) & set(hidden)})
+        ways[name] = row
+    return {"drawing": error(model), "ways": ways}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
