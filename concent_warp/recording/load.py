@@ -5,20 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 
 from concent_warp.errors import RecordingError
+from concent_warp.recording.bam import read_bam
 from concent_warp.recording.contactnets import read_contactnets
 from concent_warp.recording.csv import read_csv
 from concent_warp.recording.hdf5 import read_hdf5
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 
-KINDS = "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses"
+KINDS = (
+    "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses, a .json log "
+    "of a servo or a folder of logs"
+)
 
 
 def load_recording(path: Path | str) -> Recording:
     """Read a recording of any kind.
 
-    An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``; a folder by what is in it: ``.pt``
-    files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders.
+    An HDF5 file by its suffix ``.h5`` or ``.hdf5``, a ContactNets toss by ``.pt``, a BAM log by ``.json``; a folder by
+    what is in it: ``.pt`` files, or else CSV files, a ``scene.xml`` or ``demo_*`` folders, or else ``.json`` files.
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
@@ -29,6 +33,8 @@ def load_recording(path: Path | str) -> Recording:
             return read_contactnets(path)
         if (path / "scene.xml").exists() or any(path.glob("*.csv")) or any(path.glob(f"{PREFIX}*")):
             return read_csv(path)
+        if any(path.glob("*.json")):
+            return read_bam(path)
         raise RecordingError("the folder holds no recording", where=path, expected=KINDS)
     if not path.exists():
         raise RecordingError("no such recording", where=path, expected=KINDS, fix="check the path")
@@ -36,4 +42,6 @@ def load_recording(path: Path | str) -> Recording:
         return read_hdf5(path)
     if path.suffix == ".pt":
         return read_contactnets(path)
+    if path.suffix == ".json":
+        return read_bam(path)
     raise RecordingError("unknown kind of recording", where=path, expected=KINDS, found=path.suffix or "no suffix")

@@ -7,6 +7,7 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.bam import JOINT, SENSOR, TICK, read_bam
+from concent_warp.recording.load import load_recording
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -73,6 +74,11 @@ def test_a_folder_of_two_gains_is_read_one_gain_at_a_time(tmp_path):
     assert [d.name for d in read_bam(tmp_path, kp=100).demonstrations] == ["demo_b"]
     with pytest.raises(RecordingError, match="no log at kp 200"):
         read_bam(tmp_path, kp=200)
+
+
+def test_logs_are_recognised_by_their_suffix_and_in_a_folder(tmp_path):
+    path = written(tmp_path, "a")
+    assert load_recording(path)[0].name == load_recording(tmp_path)[0].name == "demo_a"
 
 
 def test_logs_of_different_payloads_are_refused_together(tmp_path):
