@@ -77,7 +77,7 @@ class Args:
     """Folder with the folders contactnets_cube and bam_xl330."""
     real: bool = True
     """Whether to try the measured data too."""
-    fitted: int = 30
+    fitted: int = 16
     """Tosses that are fitted."""
     judged: int = 60
     """Tosses that judge."""

@@ -32,12 +32,11 @@ from diagnose_real_report import NAME, write_report
 from held_out import Spans, by_demonstration, change, cut_spans, prediction_errors
 from pages import ROOT, machine, read_data, write_data
 
-from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
-from concent_warp.diagnose.diagnosis import Diagnosis
+from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, diagnose, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.least_squares import FitCfg, Solver
-from concent_warp.fit.observe import observe
+from concent_warp.fit.observation import Window
 from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.bam import DRIVE, JOINT, SENSOR, read_bam
@@ -61,6 +60,8 @@ DECOYS: dict[Part, tuple[str, ...]] = {
     "tosses": ("air_drag", "torsional_friction", "rolling_friction"),
     "servo": ("stribeck_friction", "actuator_delay"),
 }
+ADDITIONS: dict[Part, int] = {"tosses": 2, "servo": 3}
+"""Most effects that a diagnosis adds."""
 LADDER = ((), ("joint_friction", "joint_damping"), ("load_friction",), ("stribeck_friction",), ("actuator_delay",))
 """Effects of servos in the order of the literature, each fitted on top of those before it; the last two each alone."""
 
@@ -72,16 +73,16 @@ class Args:
     data: Path = ROOT.parent / "shared" / "data"
     """Folder with the folders contactnets_cube and bam_xl330."""
     parts: tuple[Part, ...] = ("tosses", "servo")
-    fitted: int = 30
+    fitted: int = 16
     """Tosses that are diagnosed."""
     judged: int = 60
     """Tosses that judge."""
     seed: int = 0
     """Of the split of the tosses."""
-    additions: int = 3
-    """Most effects that a diagnosis adds."""
     jobs: int = 1
     """Processes of a diagnosis."""
+    contrast: bool = False
+    """Fit decoys and the ladder again, for the diagnoses that there are."""
     table: bool = False
     """Write the page from the figures that there are."""
 
@@ -117,7 +118,11 @@ def main(args: Args) -> None:
         for part in args.parts:
             begin = time.perf_counter()
             cases = [tosses(args)] if part == "tosses" else [servo(args, kp) for kp in GAINS]
-            studies = [study(case, part, args) for case in cases]
+            old = read_data(NAME).get(part, {}).get("studies", []) if args.contrast else []
+            if args.contrast:
+                studies = [contrasted(found, case, part) for found, case in zip(old, cases, strict=True)]
+            else:
+                studies = [study(case, part, args) for case in cases]
             spent = time.perf_counter() - begin
             write_data(NAME, {**read_data(NAME), part: {"studies": studies, "seconds": spent, "machine": machine()}})
     write_report(read_data(NAME))
@@ -180,45 +185,59 @@ def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
     """Diagnose a recording and judge every step, and the decoys on top of the last."""
     title, model, seen, judges = case.title, case.model, case.seen, case.judges
     begin = time.perf_counter()
-    cfg = DiagnosisCfg(additions=args.additions, jobs=args.jobs, explain=False)
+    cfg = DiagnosisCfg(additions=ADDITIONS[part], jobs=args.jobs, explain=False)
     diagnosis = diagnose(model, seen, cfg, lambda share, text: progress(title, begin, share, text))
     spent = time.perf_counter() - begin
     print(f"\n{title}: {diagnosis.verdict}, {[f.name for f in diagnosis.accepted]}, {spent:.0f} s", flush=True)
     steps = ["as published", *(f"+ {f.name}" for f in diagnosis.accepted)]
     rows = judged(steps, list(diagnosis.models), judges)
-    decoys = []
-    for name in DECOYS[part]:
-        if name in {f.name.split("(")[0] for f in diagnosis.accepted}:
-            decoys.append({"name": name, "accepted": True, "changes": [], "values": {}})
-            continue
-        added = fitted(diagnosis.model, [chosen(name)], seen)
-        pairs = [change(j.errors(diagnosis.model), j.errors(added)) for j in judges]
-        decoys.append(
-            {"name": name, "accepted": False, "changes": [asdict(c) for c in pairs], "values": values(added, name)}
-        )
-        print(f"  decoy {name}: {[f'{100 * c.fall:.1f} % p {c.p:.2g}' for c in pairs]}", flush=True)
     found: dict[str, Any] = {
         "title": title,
         "seconds": spent,
         "judges": [{"name": j.name, "unit": j.unit, "units": len(j.errors(model))} for j in judges],
         "diagnosis": diagnosis.to_json(),
-        "considered": considered(diagnosis),
         "steps": rows,
-        "decoys": decoys,
     }
+    return contrasted(found, case, part)
+
+
+def contrasted(found: dict[str, Any], case: Case, part: Part) -> dict[str, Any]:
+    """Return a study with decoys added to its final model, and for servos with a ladder of effects, fitted anew."""
+    windows = Procedure(case.model, case.seen, DiagnosisCfg(), silent).baseline().windows
+    final = rebuilt(case.model, found)
+    held = {a.effect.name for a in final.effects}
+    decoys = []
+    for name in DECOYS[part]:
+        if name in held:
+            decoys.append({"name": name, "accepted": True, "changes": [], "values": {}})
+            continue
+        added = fitted(final, [chosen(name)], windows)
+        pairs = [change(j.errors(final), j.errors(added)) for j in case.judges]
+        decoys.append(
+            {"name": name, "accepted": False, "changes": [asdict(c) for c in pairs], "values": values(added, name)}
+        )
+        print(f"  decoy {name}: {[f'{100 * c.fall:.1f} % p {c.p:.2g}' for c in pairs]}", flush=True)
+    found = {**found, "decoys": decoys}
     if part == "servo":
-        found["ladder"] = ladder(model, seen, judges)
+        found["ladder"] = ladder(case.model, windows, case.judges)
     return found
+
+
+def rebuilt(model: Model, found: dict[str, Any]) -> Model:
+    """Return the last model of a study from its figures."""
+    known: dict[str, float] = found["steps"][-1]["values"]
+    targets = {f["name"].split("(")[0]: f["target"] for f in found["diagnosis"]["effects"] if f["accepted"]}
+    model = replace(model, effects=())
+    for name in dict.fromkeys(key.split(".", 1)[0] for key in known):
+        effect = effect_class(name)(*targets[name]) if name in targets else chosen(name)
+        parts = {key.split(".", 1)[1]: value for key, value in known.items() if key.startswith(f"{name}.")}
+        model = model.add(effect, parts)
+    return model
 
 
 def progress(title: str, begin: float, share: float, text: str) -> None:
     """Say how far a diagnosis is, on one line."""
     print(f"\r{title}: {100 * share:3.0f} % {text:40s} {time.perf_counter() - begin:5.0f} s", end="", flush=True)
-
-
-def considered(diagnosis: Diagnosis) -> list[str]:
-    """Return the names of all effects that were fitted."""
-    return sorted({f.name for f in diagnosis.effects})
 
 
 def judged(names: Sequence[str], models: Sequence[Model], judges: Sequence[Judge]) -> list[dict[str, Any]]:
@@ -232,16 +251,16 @@ def judged(names: Sequence[str], models: Sequence[Model], judges: Sequence[Judge
     return rows
 
 
-def ladder(model: Model, seen: Recording, judges: Sequence[Judge]) -> list[dict[str, Any]]:
+def ladder(model: Model, windows: Sequence[Window], judges: Sequence[Judge]) -> list[dict[str, Any]]:
     """Fit what the literature adds to servos, step by step, without any choice, and judge each step."""
-    models = [fitted(model, [], seen)]
+    models = [fitted(model, [], windows)]
     names = ["drive strength alone"]
     for added in LADDER[1:3]:
-        models.append(fitted(models[-1], [chosen(name) for name in added], seen))
+        models.append(fitted(models[-1], [chosen(name) for name in added], windows))
         names.append("+ " + " and ".join(added))
     rows = judged(names, models, judges)
     for added in LADDER[3:]:
-        more = fitted(models[-1], [chosen(name) for name in added], seen)
+        more = fitted(models[-1], [chosen(name) for name in added], windows)
         rows.append(judged(["", f"+ {added[0]}, on top"], [models[-1], more], judges)[1])
     return rows
 
@@ -249,13 +268,13 @@ def ladder(model: Model, seen: Recording, judges: Sequence[Judge]) -> list[dict[
 def chosen(name: str) -> Effect:
     """Return an effect on what it concerns in these scenes."""
     kind = effect_class(name)
-    target = {"joint": (JOINT,), "actuator": (DRIVE,), "body": ("cube",), "geom": ("cube", "board"), "none": ()}
+    target = {"joint": (JOINT,), "actuator": (DRIVE,), "body": ("cube",), "none": ()}
     return kind(*target[kind.kind])
 
 
-def fitted(model: Model, added: Sequence[Effect], seen: Recording) -> Model:
-    """Return a model with more effects, all parameters fitted to a recording together with the initial states."""
-    prediction = Prediction(model, added, observe(model, seen), threads=1)
+def fitted(model: Model, added: Sequence[Effect], windows: Sequence[Window]) -> Model:
+    """Return a model with more effects, all parameters fitted to windows together with the initial states."""
+    prediction = Prediction(model, added, windows, threads=1)
     solver = Solver(prediction, FitCfg(iterations=15))
     return prediction.model(solver.polish(solver.fit()).values)
 

@@ -8,7 +8,8 @@ kt and resistance R the torque is kt vin / R times the duty cycle, cut at 1, les
 
 ``load`` and ``speed`` are the firmware's own estimates and are left out: the load is a 16-bit number without a sign,
 the speed is filtered. The times between samples are uneven and kept as they are. Where ``torque_enable`` says that the
-motor was let go (logs of the kind "lift and drop"), the rest of the log is left out: no command describes it.
+motor was let go (logs of the kind "lift and drop"), the rest of the log is left out: no command describes it. The noise
+of the position is stated as what the encoder's 12 bits leave, tick / sqrt(12).
 """
 
 from __future__ import annotations
@@ -146,7 +147,7 @@ def swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
         qpos=position[:1],
         qvel=np.zeros(1),
         action={DRIVE: Channel(time, columns["goal_position"])},
-        measured={SENSOR: Channel(time, position[:, None])},
+        measured={SENSOR: Channel(time, position[:, None], noise_std=TICK / math.sqrt(12))},
     )
 
 

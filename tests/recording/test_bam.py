@@ -39,6 +39,7 @@ def test_a_log_keeps_its_uneven_times_counted_from_its_first_sample(tmp_path):
     np.testing.assert_allclose(demonstration.measured[SENSOR].value[:, 0], [0.0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(demonstration.action["servo"].value, [0.0, 0.2, 0.4, 0.6])
     assert demonstration.task == "sin_sin"
+    assert demonstration.measured[SENSOR].noise_std == pytest.approx(2 * np.pi / 4096 / np.sqrt(12))
     assert demonstration.qpos is not None
     assert demonstration.qpos[0] == 0.0
 
