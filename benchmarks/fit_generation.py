@@ -159,7 +159,8 @@ def measure_generation(args: Args, recording: Recording, population: int) -> dic
     """Return the figures of one population."""
     search = search_of(args, recording, population)
     begun = time.perf_counter()
-    mask, reachable, loss, _ = search.survey(search.used)
+    found = search.survey(search.used)
+    mask, reachable, loss = found.mask, found.reachable, found.loss
     survey = time.perf_counter() - begun
     search.evolution.scale_to(loss)
     collidable = reachable | mask

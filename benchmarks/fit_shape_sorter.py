@@ -176,7 +176,7 @@ def report(args: Args) -> None:
         "rule. Means over seeds with bootstrap 95 % intervals.",
         "",
         f"`python benchmarks/{NAME}.py`, {platform.machine()}, {date.today().isoformat()}; C MuJoCo, one core a fit",
-        "(`taskset -c 0`).",
+        "(`taskset`), of a 16-core host whose H200 compared the point clouds.",
         "",
         "| start | seeds | null | exact | before | flat | after, fitted | after, unseen "
         "| fall, fitted | fall, unseen | fall, exact | overlap, fitted | overlap, unseen | seconds a fit |",

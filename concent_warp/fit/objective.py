@@ -14,6 +14,7 @@ import numpy as np
 from concent_warp.fit.target import BodyTarget, Segment
 from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
 from concent_warp.simulate.replay import bracketing
+from concent_warp.simulate.select import has_cuda
 
 if TYPE_CHECKING:
     import torch
@@ -120,7 +121,10 @@ class Objective:
         import torch
 
         n = len(self.segments)
-        position, quaternion = torch.as_tensor(rollout.body_position), torch.as_tensor(rollout.body_quaternion)
+        # Clouds are compared on the graphics processor where there is one, wherever they were simulated.
+        device = "cuda" if has_cuda() else None
+        position = torch.as_tensor(rollout.body_position, device=device)
+        quaternion = torch.as_tensor(rollout.body_quaternion, device=device)
         fit, held = [], []
         for aim in self.aims(position.device, position.dtype):
             mine = slice(aim.segment, None, n), slice(None), aim.body
@@ -129,7 +133,7 @@ class Objective:
                 if frames is not None:
                     losses.append(distance[:, frames].mean(dim=1))
         fit, held = fit or held, held or fit
-        diverged = torch.as_tensor(rollout.diverged).reshape(count, n).any(dim=1)
+        diverged = torch.as_tensor(rollout.diverged, device=device).reshape(count, n).any(dim=1)
         both = torch.stack([torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)])
         both = torch.where(diverged | ~torch.isfinite(both), torch.inf, both).cpu().numpy().astype(float)
         return Losses(both[0], both[1])
