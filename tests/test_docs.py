@@ -31,7 +31,13 @@ recording = load_recording("demo.h5")
 scene = Scene(recording.scene)
 model = Model(scene, ContactGeometryCfg(count=96).build(scene))
 engine = make_engine("mujoco", model)
-"""
+""",
+    "diagnose.md": f"""
+import shutil
+from pathlib import Path
+Path("demo.h5").unlink()
+shutil.copy({str(ROOT / "examples" / "hidden_effect" / "demo.h5")!r}, "demo.h5")
+""",
 }
 """What a page takes as given."""
 

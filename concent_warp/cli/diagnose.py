@@ -71,8 +71,7 @@ def run(arguments: Arguments) -> Diagnosis:
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     own = Scene(recording.scene, source=recording.source)
     model = Model(own) if arguments.model is None else Model.load(arguments.model)
-    if arguments.jobs == 0:
-        raise ConcentError("no processes to work with", expected="--jobs -1 or at least 1", found=0)
+    check_numbers(arguments)
     check_effects(model, recording, arguments.effects)
     for path in (arguments.html, arguments.apply):
         if path is not None:
@@ -97,6 +96,20 @@ def run(arguments: Arguments) -> Diagnosis:
         if not arguments.json:
             say_written(arguments.html)
     return found
+
+
+def check_numbers(arguments: Arguments) -> None:
+    """Check the settings that are numbers.
+
+    Raises:
+        ConcentError: One of them makes no sense.
+    """
+    if arguments.jobs == 0:
+        raise ConcentError("no processes to work with", expected="--jobs -1 or at least 1", found=0)
+    if arguments.additions < 1:
+        raise ConcentError("too few additions", expected="--additions at least 1", found=arguments.additions)
+    if arguments.window is not None and not arguments.window > 0:
+        raise ConcentError("no length of a window", expected="--window above 0 s", found=arguments.window)
 
 
 def check_effects(model: Model, recording: Recording, names: Sequence[str]) -> None:
