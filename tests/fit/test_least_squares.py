@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.least_squares import (
+    HUBER,
+    Fit,
+    Linear,
+    Solver,
+    huber,
+    huber_limit,
+    huber_weight,
+    projected,
+    start_step,
+)
+from concent_warp.fit.prediction import Prediction
+from tests.fit.swinging import DAMPING, NOISE, drawing, swung, windows_of
+
+
+def solver_for(recording, *names, length=None):
+    effects = [effect_class(name)("hinge") for name in names]
+    return Solver(Prediction(drawing(recording), effects, windows_of(recording, length)))
+
+
+def test_the_damping_that_was_left_out_is_found():
+    solver = solver_for(swung(), "joint_damping")
+    fit = solver.polish(solver.fit())
+    assert fit.converged
+    assert fit.values[0] == pytest.approx(DAMPING, rel=0.02)
+    residual = np.concatenate([piece.residual for piece in fit.linear])
+    assert np.std(residual) == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_effect_that_is_not_there_stays_near_its_null_value():
+    fit = solver_for(swung(damping=0.0), "joint_damping").fit()
+    assert abs(fit.values[0]) < 0.02 * DAMPING
+
+
+def test_two_effects_at_once_are_told_apart():
+    fit = solver_for(swung(), "joint_damping", "armature").fit()
+    assert fit.values[0] == pytest.approx(DAMPING, rel=0.03)
+    assert abs(fit.values[1]) < 5e-5
+
+
+def test_a_wrong_initial_angle_is_found_along_with_the_damping():
+    solver = solver_for(swung(told=0.006), "joint_damping")
+    fit = solver.fit()
+    start = fit.offsets[0] * solver.p.windows[0].spread
+    assert start[0] == pytest.approx(-0.006, abs=1e-3)
+    assert fit.values[0] == pytest.approx(DAMPING, rel=0.03)
+
+
+def test_initial_states_alone_are_fitted_at_fixed_parameters():
+    solver = solver_for(swung(told=0.006), "joint_damping", length=0.5)
+    values = np.array([DAMPING])
+    zero = [np.zeros(2) for _ in solver.p.windows]
+    offsets, starts = solver.refine_starts(values, zero)
+    before, after = (solver.p.residuals(solver.trials(values, o)) for o in (zero, offsets))
+    assert solver.cost(after, offsets, values) < 0.5 * solver.cost(before, zero, values)
+    assert offsets[0][0] * solver.p.windows[0].spread[0] == pytest.approx(-0.006, abs=1.5e-3)
+    assert [a.shape for a in starts] == [(w.count, 2) for w in solver.p.windows]
+
+
+def test_outliers_hardly_move_the_estimate():
+    recording = swung()
+    channel = recording.demonstrations[0].measured["angle"]
+    channel.value[20::40] += 0.3
+    fit = solver_for(recording, "joint_damping").fit()
+    assert fit.values[0] == pytest.approx(DAMPING, rel=0.06)
+
+
+def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_either():
+    solver = solver_for(swung(), "joint_damping")
+    offsets, starts = solver.refine_starts(solver.p.start, [np.zeros(2)])
+    begun = solver.cost(solver.p.residuals(solver.trials(solver.p.start, offsets)), offsets, solver.p.start)
+    fit = solver.fit(solver.p.start, offsets, starts)
+    assert fit.cost < begun
+    assert solver.polish(fit).cost <= fit.cost * (1 + 1e-9)
+
+
+def test_values_stay_within_their_bounds_and_infinite_ones_stay_infinite():
+    solver = solver_for(swung(), "joint_damping", "joint_friction")
+    assert solver.inside(np.array([-1.0, np.inf])).tolist() == [solver.low[0], np.inf]
+    assert solver.inside(np.array([1e9, 0.0])).tolist() == [solver.high[0], 0.0]
+    gained = swung(damping=0.0)
+    channel = gained.demonstrations[0].measured["angle"]
+    channel.value[:] *= 1.05  # swings further than any damping allows
+    fit = solver_for(gained, "joint_damping").fit()
+    assert fit.values[0] == 0.0
+
+
+def test_the_loss_is_quadratic_and_then_linear():
+    assert huber(np.array([2.0, -2.0, 10.0]), 4.0).tolist() == [2.0, 2.0, 32.0]
+    assert huber_weight(np.array([2.0, -8.0]), 4.0).tolist() == [1.0, 0.5]
+    rng = np.random.default_rng(0)
+    assert huber_limit([rng.normal(0, 0.1, 1000)]) == HUBER
+    assert huber_limit([rng.normal(0, 10.0, 10000)]) == pytest.approx(10 * HUBER, rel=0.05)
+
+
+def test_what_an_initial_state_can_take_up_is_projected_out():
+    rng = np.random.default_rng(0)
+    start = 1e3 * rng.normal(size=(30, 2))
+    rest = rng.normal(size=(30, 1))
+    rest -= start @ np.linalg.lstsq(start, rest, rcond=None)[0]
+    piece = Linear(rest[:, 0] + start @ [0.3, -0.2], 2 * rest + start @ [[1.0], [2.0]])
+    fit = Fit(np.zeros(1), (np.zeros(2),), 0.0, (piece,), (start,), True, 0.0)
+    (found,) = projected(fit)
+    np.testing.assert_allclose(found.residual, rest[:, 0], atol=1e-3)
+    np.testing.assert_allclose(found.jacobian, 2 * rest, atol=1e-2)
+
+
+def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
+    rng = np.random.default_rng(1)
+    a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -0.2])
+    step = start_step(r, a, o, HUBER, 0.0)
+    stacked = np.vstack([a, np.eye(2)])
+    expected = -np.linalg.lstsq(stacked, np.concatenate([r, o]), rcond=None)[0]
+    np.testing.assert_allclose(step, expected, atol=1e-10)
+
+
+def test_sensitivities_are_those_of_finite_differences():
+    solver = solver_for(swung(), "joint_damping", "armature")
+    values = np.array([DAMPING, 1e-4])
+    (linear,) = solver.linearise(values, [np.zeros(2)])
+    moved = values + np.array([1e-4, 0.0]) * solver.scale
+    (first,), (second,) = (solver.p.residuals(solver.trials(v, [np.zeros(2)])) for v in (values, moved))
+    slope = (second - first) / 1e-4
+    assert np.abs(linear.jacobian[:, 0] - slope).max() < 0.15 * np.abs(slope).max()
+    assert NOISE * np.abs(slope).max() > 0
