@@ -22,7 +22,7 @@ from typing import Any
 import tyro
 from hidden_effects_data import DataSet, Kind, cases, make
 from hidden_effects_report import write_report
-from pages import machine
+from pages import machine, machine_line
 
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
 from concent_warp.errors import ConcentError
@@ -43,13 +43,15 @@ class Args:
     names: tuple[str, ...] = ()
     """Only data sets of these names."""
     shift: int = 0
-    """Added to every seed: other data of the same kind, for work on the method, which must not see those of the page."""
+    """Added to every seed: other data of the same kind, for work on the method, which must not see the page's."""
     jobs: int = len(os.sched_getaffinity(0))
     """Data sets at a time."""
     out: Path = OUT
     """Where the results lie."""
     report: bool = False
     """Write the page from what is done, and diagnose nothing."""
+    host: str = ""
+    """Where the results come from, in words, if not from this machine."""
 
 
 def main(args: Args) -> None:
@@ -67,7 +69,7 @@ def main(args: Args) -> None:
                 print(f"{k + 1:3d}/{len(todo)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
     rows = [json.loads(path(args.out, c).read_text()) for c in chosen if path(args.out, c).is_file()]
     if args.report or not (args.rigs or args.effects or args.names or args.shift or len(args.kinds) < 4):
-        write_report(rows, len(cases()), machine())
+        write_report(rows, len(cases()), args.host or machine_line(machine()))
 
 
 def wanted(case: DataSet, args: Args) -> bool:

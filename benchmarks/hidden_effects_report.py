@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from pages import FOLDER, data_path, machine_line, table
+from pages import FOLDER, data_path, table
 from scipy.stats import norm
 
 from concent_warp.model import write_text
@@ -17,14 +17,14 @@ FLOOR = 1.3
 Row = dict[str, Any]
 
 
-def write_report(rows: Sequence[Row], total: int, facts: dict[str, Any]) -> None:
+def write_report(rows: Sequence[Row], total: int, host: str) -> None:
     """Write data, picture and page."""
     import json
 
     data_path(NAME).parent.mkdir(parents=True, exist_ok=True)
-    write_text(data_path(NAME), json.dumps({"machine": facts, "rows": [slim(row) for row in rows]}, indent=1))
+    write_text(data_path(NAME), json.dumps({"host": host, "rows": [slim(row) for row in rows]}, indent=1))
     confusion(rows)
-    write_text(FOLDER / f"{NAME}.md", page(rows, total, facts))
+    write_text(FOLDER / f"{NAME}.md", page(rows, total, host))
 
 
 def slim(row: Row) -> Row:
@@ -119,7 +119,7 @@ def figure(title: str, bar: str, hits: Sequence[bool]) -> list[str]:
     return [title, bar, f"{100 * share:.0f} %", f"{100 * low:.0f}-{100 * high:.0f} %", str(len(hits))]
 
 
-def page(rows: Sequence[Row], total: int, facts: dict[str, Any]) -> str:
+def page(rows: Sequence[Row], total: int, host: str) -> str:
     """Return the page."""
     single = [r for r in rows if r["kind"] == "single"]
     null = [r for r in rows if r["kind"] == "null"]
@@ -171,7 +171,7 @@ python benchmarks/hidden_effects.py            # {total} data sets, resumable
 python benchmarks/hidden_effects.py --report   # this page
 ```
 
-{machine_line(facts)} {len(rows)} of {total} data sets done, {len(failed)} ended in an error;
+{host} {len(rows)} of {total} data sets done, {len(failed)} ended in an error;
 {seconds.sum() / 3600:.1f} hours of one core in all.
 
 {table(["", "bar", "share", "95 % interval", "data sets"], shares)}
