@@ -81,7 +81,7 @@ def draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, An
     middle = (low + high) / 2
     for setter, value in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):
         setter(value - half, value + half)
-    axes.set_box_aspect((1, 1, 1))
+    axes.set_box_aspect((1, 1, 1), zoom=0.88)
     if arrows:
         # From the side that the first arrow ends on.
         x, y = np.array(arrows[0]["point"])[:2] - points.mean(axis=0)[:2] / 1e3
