@@ -18,6 +18,7 @@ from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blo
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
+from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.noise import UNDERESTIMATE
 from concent_warp.diagnose.search import (
     Candidate,
@@ -109,6 +110,7 @@ class Procedure:
         self.channels = {c for d in recording.demonstrations for c in d.measured}
         self.findings: list[Finding] = []
         self.groups: list[tuple[str, ...]] = []
+        self.hypotheses: list[dict[str, Model]] = []
         self._done = 0.0
         self._began = time.monotonic()
 
@@ -171,6 +173,7 @@ class Procedure:
             return None, smallest
         group = alike(base, good)
         self.groups.append(tuple(f.name for _, f in group))
+        self.hypotheses.append({f.name: c.model for c, f in group})
         first = group[0][1]
         rest = sorted((f for f in findings if f is not first), key=lambda f: -f.gain)
         self.findings.append(first)
@@ -269,11 +272,19 @@ class Procedure:
             unexplained=unexplained,
             ratio=tuple(n.ratio for n in nodes),
             detectable=detectable,
-            next_experiment=None,
+            next_experiment=self.experiment() if verdict != "none_needed" else None,
             issues=tuple(issues),
             models=tuple(n.model for n in nodes),
             seed=self.cfg.seed,
         )
+
+    def experiment(self) -> str | None:
+        """Return what would tell apart the first effects that the data cannot; None where there is nothing to tell."""
+        open_ones = [found for found in self.hypotheses if len(found) > 1]
+        if not open_ones or not self.cfg.explain:
+            return None
+        found = suggest(open_ones[0], self.recording, self.cfg.engine, self.cfg.seed)
+        return None if found is None else found.sentence
 
     def places(self, given: Node) -> tuple[dict[str, Any], ...]:
         """Return where the model as given fails; forces are looked for no longer than the diagnosis has taken."""

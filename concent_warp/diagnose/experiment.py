@@ -12,12 +12,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from concent_warp.diagnose.motions import Bench, Motion
 from concent_warp.diagnose.motions_bodies import body_motions
 from concent_warp.diagnose.motions_drives import drive_motions
 from concent_warp.diagnose.units import times, words
+from concent_warp.errors import ConcentError
 from concent_warp.fit.observation import Reading, Source, Window, start_spread
 from concent_warp.fit.observe import channel_noises, keeps_close
 from concent_warp.fit.prediction import Prediction, Trial, turn
@@ -172,7 +174,11 @@ def separations(
         starts: How residuals depend on the initial state in units of its spread, shape (count, 2 nv); what it may
             account for is taken out.
     """
-    seen = {name: readings(motion.change(model), window, engine) for name, model in models.items()}
+    try:
+        seen = {name: readings(motion.change(model), window, engine) for name, model in models.items()}
+    except (ConcentError, ValueError, mujoco.FatalError):
+        # A payload may not fit a scene that asks for something special of its bodies: one motion less.
+        return None
     if not all(np.isfinite(value).all() for values in seen.values() for value in values):
         return None
     found: Separations = {}

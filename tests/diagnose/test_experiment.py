@@ -40,9 +40,12 @@ def one_speed() -> Recording:
         read.append(d.qpos[0])
         mujoco.mj_step(m, d, nstep=2)
     channel = Channel(time, np.array(read)[:, None], noise_std=NOISE)
-    start = {"qpos": np.zeros(1), "qvel": np.zeros(1)}
     demonstration = Demonstration(
-        "sweep", **start, action={"drive": Channel(time, command)}, measured={"rail_position": channel}
+        "sweep",
+        qpos=np.zeros(1),
+        qvel=np.zeros(1),
+        action={"drive": Channel(time, command)},
+        measured={"rail_position": channel},
     )
     return Recording(CART, (demonstration,))
 
