@@ -13,7 +13,7 @@ A cause is *blamed* where the 95 % interval of one of its parameters leaves out 
 the diagnosis: where it is accepted; a group counts as right if the hidden effect is in it). The data sets are of
 `hidden_effects_data.py`, with seeds of their own; what judges is another recording of the same experiment, with another
 seed: windows of it are predicted, each from the measured state as corrected by the first 30 % of the window. The
-measured data and their judges are those of `diagnose_real.py`.
+measured data, their judges and diagnoses are those of `diagnose_real.py`, which comes first.
 
     python benchmarks/diagnose_alternatives.py                      # what is not done yet, then the page
     python benchmarks/diagnose_alternatives.py --names pendulum-null-0
@@ -36,6 +36,7 @@ import tyro
 from diagnose_alternatives_report import write_report
 from diagnose_real import FOLDERS, GAINS, Case, servo, tosses
 from diagnose_real import Args as RealArgs
+from diagnose_real_report import NAME as REAL
 from everything import Blame, fit_everything
 from held_out import noise_errors, spans_of
 from hidden_effects_data import DataSet, cases, make, true_model
@@ -77,10 +78,6 @@ class Args:
     """Folder with the folders contactnets_cube and bam_xl330."""
     real: bool = True
     """Whether to try the measured data too."""
-    fitted: int = 16
-    """Tosses that are fitted."""
-    judged: int = 60
-    """Tosses that judge."""
     again: bool = False
     """Do again what is done."""
     table: bool = False
@@ -137,7 +134,7 @@ def main(args: Args) -> None:
             if missing:
                 print(f"no measured data in {' and '.join(missing)}: --data or --no-real", file=sys.stderr)
                 raise SystemExit(2)
-            settings = RealArgs(data=args.data, fitted=args.fitted, judged=args.judged)
+            settings = RealArgs(data=args.data)
             for kp in GAINS:
                 keep(f"servo, kp {kp:g}", args, lambda kp=kp: measured(servo(settings, kp)))
             keep("tosses", args, lambda: measured(tosses(settings)))
@@ -173,13 +170,25 @@ def synthetic(case: DataSet) -> dict[str, Any]:
 
 
 def measured(case: Case) -> dict[str, Any]:
-    """Try all ways on measured data, whose truth nobody knows."""
+    """Try all ways on measured data, whose truth nobody knows; the diagnosis is that of `diagnose_real.py`."""
     judge = case.judges[0]
 
     def error(m: Model) -> float:
         return pooled(judge.errors(m))
 
-    return {"unit": judge.unit, "hidden": None, "floor": None, **tried(case.model, case.seen, error, None)}
+    known = [s for part in read_data(REAL).values() for s in part["studies"] if s["title"] == case.title]
+    if not known:
+        print(f"{case.title}: run diagnose_real.py first", file=sys.stderr)
+        raise SystemExit(2)
+    accepted = [f["name"] for f in known[0]["diagnosis"]["effects"] if f["accepted"]]
+    done = {
+        "error": known[0]["steps"][-1]["from_first"][0]["after"],
+        "seconds": known[0]["seconds"],
+        "blamed": sorted(accepted),
+    }
+    rest = tried(case.model, case.seen, error, None, [name for name in WAYS if name != "diagnosis"])
+    rest["ways"] = {"diagnosis": done, **rest["ways"]}
+    return {"unit": judge.unit, "hidden": None, "floor": None, **rest}
 
 
 def pooled(errors: np.ndarray) -> float:
@@ -188,11 +197,16 @@ def pooled(errors: np.ndarray) -> float:
 
 
 def tried(
-    model: Model, recording: Recording, error: Callable[[Model], float], hidden: Sequence[str] | None
+    model: Model,
+    recording: Recording,
+    error: Callable[[Model], float],
+    hidden: Sequence[str] | None,
+    chosen: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what each way makes of a recording: error on held-out data, what it blames, time."""
     ways = {}
-    for name, mend in WAYS.items():
+    for name in chosen or WAYS:
+        mend = WAYS[name]
         begin = time.perf_counter()
         mended, blamed = mend(model, recording)
         spent = time.perf_counter() - begin

@@ -12,6 +12,7 @@ NAME = "diagnose_alternatives"
 WAYS = ("diagnosis", "everything at once", "sysid toolbox")
 COLOURS = ("#1f5fa8", "#c8571b", "#3a8f5c")
 RESAMPLES = 10_000
+TICKS = (0.5, 0.7, 1, 1.5, 2, 3, 5, 7, 10, 15, 20, 30, 50, 100)
 
 
 def write_report(data: dict[str, Any]) -> None:
@@ -59,7 +60,7 @@ Errors on the other recording, residual over noise:
 
 """
     text += table(["data set", "drawing", "truth", *WAYS], [errors(name, row) for name, row in known.items()])
-    text += "\nWhat is blamed (hidden effect in bold):\n\n"
+    text += "\nWhat is blamed (in bold what is hidden; *or*: named as what the data cannot tell from it):\n\n"
     text += table(["data set", *WAYS], [blame(name, row) for name, row in known.items()])
     if real:
         text += """
@@ -124,9 +125,17 @@ def blame(name: str, row: dict[str, Any]) -> list[str]:
     hidden = row["hidden"] or []
     cells = []
     for way in WAYS:
-        named = row["ways"][way]["blamed"]
-        cells.append(", ".join(f"**{n}**" if n in hidden else n for n in named) or "nothing")
+        told = row["ways"][way]
+        cells.append(", ".join(cause(n, hidden, told) for n in told["blamed"]) or "nothing")
     return [name, *cells]
+
+
+def cause(name: str, hidden: Sequence[str], told: dict[str, Any]) -> str:
+    """Return a cause that is blamed: in bold where it is hidden, with what is hidden where that is in its group."""
+    if name in hidden:
+        return f"**{name}**"
+    group = told.get("right", []) if name not in told.get("wrong", [name]) else []
+    return f"{name} or **{', '.join(group)}**" if group else name
 
 
 def draw(rows: dict[str, Any]) -> None:
@@ -135,6 +144,7 @@ def draw(rows: dict[str, Any]) -> None:
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     chosen = [(name, row) for name, row in rows.items() if row["floor"]]
     if not chosen:
@@ -149,9 +159,12 @@ def draw(rows: dict[str, Any]) -> None:
     axis.axvline(1.0, color="grey", linewidth=1)
     axis.set_yticks(places, [name for name, _ in chosen])
     axis.set_xscale("log")
+    axis.xaxis.set_major_locator(FixedLocator(TICKS))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xlabel("error on the other recording, over that of the true model")
     axis.grid(axis="x", alpha=0.3)
-    axis.legend(fontsize=8, loc="best")
+    axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
     figure.tight_layout()
     figure.savefig(FOLDER / f"{NAME}.png", dpi=110)
     plt.close(figure)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -335,7 +335,7 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
         return (work(*task) for task in tasks)
     from joblib import Parallel, delayed
 
-    return Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks)
+    return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks))
 
 
 def quiet_ratios(base: Node) -> dict[str, float]:

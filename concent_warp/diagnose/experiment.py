@@ -211,9 +211,9 @@ def difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np.
 
 
 def experiment(motion: Motion, found: Separations, first: str) -> Experiment:
-    """Return the experiment, in words that begin with what separates the likeliest hypothesis, `first`."""
-    pairs = sorted(found, key=lambda pair: (first not in pair, -found[pair][0]))
+    """Return the experiment, in words that tell what separates the likeliest hypothesis, `first`, from the others."""
     best = max(found, key=lambda pair: found[pair][0])
+    pairs = sorted((pair for pair in found if first in pair), key=lambda pair: -found[pair][0])
     said = [f"{a} and {b} then differ by {times(found[a, b][0])} noise" for a, b in pairs[:1]]
     said += [f"{a} and {b} by {times(found[a, b][0])}" for a, b in pairs[1:]]
     separation, channel = found[best]

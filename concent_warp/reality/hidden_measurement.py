@@ -72,7 +72,7 @@ def frame_offset(rig: Rig, magnitude: float) -> Hidden:
         return time, (rotation * Rotation.from_quat(value, scalar_first=True)).as_quat(scalar_first=True)
 
     axes: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
-    truth = dict(zip(axes, map(float, (*shift, *turn)), strict=True))
+    truth: dict[str, float] = dict(zip(axes, map(float, (*shift, *turn)), strict=True))
     return Hidden("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
 
 

@@ -41,10 +41,11 @@ def main(diagnosis: Path, recording: Path, before: Path, after: Path, out: Path)
     left.set_title("Which effect is missing", loc="left")
     channel = max(
         (r for r in comparison.residuals["before", comparison.demonstrations[0]] if r.ratio is not None),
-        key=lambda r: float(r.ratio.mean()),
+        key=lambda r: float(r.ratio.mean()),  # pyright: ignore[reportOptionalMemberAccess]
     ).channel
     for name, colour in (("before", RED), ("after", GREEN)):
         residual = comparison.residual(name, comparison.demonstrations[0], channel)
+        assert residual is not None
         right.plot(residual.time, residual.ratio, color=colour, linewidth=0.8, label=name)
     right.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="noise")
     right.set_xlabel("time [s]")

@@ -15,7 +15,8 @@ def benchmark(script):
 def test_the_bare_loop_simulates_what_the_generation_does(benchmark, drop, swollen):
     cfg = FitCfg(evolution=EvolutionCfg(population=3, neighbours=2))
     search = Search(swollen, cut(swollen, drop.demonstrations, cfg), cfg, "warp")
-    mask, reachable, _, _ = search.survey(search.used)
+    found = search.survey(search.used)
+    mask, reachable = found.mask, found.reachable
     engine = WarpEngine(swollen, collidable=reachable | mask, device="cpu")
     parts, position = benchmark.generation(search, mask, engine)
     assert set(parts) == set(benchmark.PARTS)

@@ -91,6 +91,6 @@ def test_replay_starts_where_the_window_was_fitted_to_start():
     windows = observe(model(), started_off)
     offset = np.array([0.004, 0.0]) / windows[0].spread
     moved = with_starts(model(), started_off, windows, [offset] * len(windows))
-    np.testing.assert_allclose(moved.demonstrations[0].qpos, [0.004])
+    np.testing.assert_allclose(np.asarray(moved.demonstrations[0].qpos, dtype=float), [0.004])
     assert where(model(), started_off) != []
     assert where(model(), started_off, windows=windows, offsets=[offset] * len(windows)) == []

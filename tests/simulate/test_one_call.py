@@ -12,7 +12,8 @@ SERVO = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody
 <geom type="plane" size="1 1 .1"/><body name="link" pos="0 0 .3"><joint name="hinge" axis="0 1 0"/>
 <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".5"/></body>
 <body name="ball" pos=".3 0 .2"><freejoint/><geom size=".03"/></body></worldbody>
-<actuator><position name="servo" joint="hinge" kp="2" kv=".05"/><motor name="motor" joint="hinge" gear="1e9"/></actuator>
+<actuator><position name="servo" joint="hinge" kp="2" kv=".05"/>
+<motor name="motor" joint="hinge" gear="1e9"/></actuator>
 <sensor><jointpos joint="hinge"/><framepos objtype="body" objname="ball"/></sensor></mujoco>"""
 
 

@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from concent_warp.diagnose.blocks import cut_blocks
+from concent_warp.diagnose.search import chance, extended, fit_candidate, node, polish_candidate, screen
+from concent_warp.effects.registry import effect_class
+from tests.fit.swinging import DAMPING, drawing, swung, windows_of
+
+NAMES = ("joint_damping", "joint_friction", "armature")
+
+
+def base_of(recording):
+    windows = windows_of(recording)
+    return node(drawing(recording), windows, cut_blocks(windows), "mujoco", 1)
+
+
+def effect(name):
+    return effect_class(name)("hinge")
+
+
+@pytest.fixture(scope="module")
+def lacking():
+    return base_of(swung())
+
+
+@pytest.fixture(scope="module")
+def complete():
+    return base_of(swung(damping=0.0))
+
+
+def test_a_model_that_lacks_nothing_leaves_noise_alone(lacking, complete):
+    assert complete.ratio == pytest.approx(1.0, abs=0.1)
+    assert lacking.ratio > 2.5
+
+
+def test_a_look_promises_most_of_the_effect_that_is_missing(lacking):
+    promised = {name: screen(lacking, effect(name)).promise for name in NAMES}
+    assert max(promised, key=promised.__getitem__) == "joint_damping"
+    assert promised["joint_damping"] > 0.8
+    assert promised["armature"] < 0.5
+
+
+def test_a_fit_of_the_missing_effect_leaves_noise_alone_and_gains_in_every_fold(lacking):
+    found = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    assert found.fit.values[0] == pytest.approx(DAMPING, rel=0.03)
+    assert found.ratio == pytest.approx(1.0, abs=0.1)
+    assert found.share(lacking) > 0.8
+    gain = found.gain(lacking)
+    assert all(gain[lacking.blocks.fold == f].sum() > 0 for f in range(5))
+    assert polish_candidate(lacking, found).fit.cost <= found.fit.cost
+    assert extended(lacking, found).ratio == pytest.approx(found.ratio)
+
+
+def test_an_effect_that_is_not_missing_gains_no_more_than_chance(complete):
+    screened = [screen(complete, effect(name)) for name in NAMES]
+    null = chance(complete, screened, 200, 0)
+    assert len(null) == 200
+    for s in screened:
+        assert fit_candidate(complete, s).share(complete) < np.quantile(null, 0.99)
+
+
+def test_chance_makes_more_of_more_candidates_and_little_in_all(complete):
+    screened = [screen(complete, effect(name)) for name in NAMES]
+    one, all_of_them = chance(complete, screened[:1], 200, 0), chance(complete, screened, 200, 0)
+    assert (all_of_them >= one - 1e-12).all()
+    assert np.quantile(all_of_them, 0.95) < 0.1
+    assert np.array_equal(one, chance(complete, screened[:1], 200, 0))
