@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skip(reason="to be brought in step with the diagnosis")
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tutorial_effects.md").read_text()
-STEP = re.compile(r"```console\n(.*?)```\n+```text\n(.*?)```", re.DOTALL)
+STEP = re.compile(r"```console\n([^`]*)```\n+```text\n([^`]*)```")
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 WORDS = re.compile(r"\w")
 

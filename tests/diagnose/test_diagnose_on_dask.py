@@ -9,7 +9,6 @@ from tests.fit.swinging import drawing, swung
 distributed = pytest.importorskip("distributed")
 
 
-@pytest.mark.slow
 def test_a_local_cluster_finds_what_one_process_finds():
     recording = swung(seconds=1.0)
     cfg = DiagnosisCfg(effects=("joint_damping", "armature", "joint_friction"), jobs=1, explain=False)
