@@ -42,6 +42,8 @@ two-sided and not corrected. Windows of one log are not independent, so that the
             text += (
                 f"\n{machine_line(result[part]['machine'])} The {part} took {result[part]['seconds']:.0f} s in all.\n"
             )
+    for said in result.get("servo", {}).get("unfinished", []):
+        text += f"\nDiagnosed, but stopped before it was judged: {said}\n"
     for study in studies:
         text += section(study)
     return text
