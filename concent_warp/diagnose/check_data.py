@@ -8,6 +8,13 @@ from concent_warp.recording.recording import Recording
 
 GAP = 10.0
 """A pause this many times the usual time between samples is a gap."""
+WHITE = 0.8
+"""Mean squared step from sample to sample over twice the variance: 1 for noise, much less for motion (von Neumann,
+"Distribution of the ratio of the mean square successive difference to the variance", Ann. Math. Stat. 12, 1941)."""
+ENOUGH = 30
+"""Samples from which on noise is told from motion."""
+SCATTER = 3.0
+"""Readings that scatter this many times as much as their stated noise do not only stand still."""
 MISSING = 0.2
 """Share of missing samples that is worth a word."""
 
@@ -16,6 +23,7 @@ def check_data(recording: Recording) -> list[str]:
     """Return one sentence on each thing in a recording that looks wrong: gaps, missing samples, channels that stand."""
     found = []
     for d in recording.demonstrations:
+        alone = len(d.measured) == 1
         for name, channel in d.measured.items():
             where = f"{d.name}, {name}"
             if len(channel.time) < 2:
@@ -33,4 +41,18 @@ def check_data(recording: Recording) -> list[str]:
             values = channel.value[known]
             if len(values) > 10 and np.ptp(values, axis=0).max() == 0.0:
                 found.append(f"{where}: the reading never changes.")
+            stated = channel.noise_std
+            beyond = alone if stated is None else values.std(axis=0).max(initial=0.0) > SCATTER * stated
+            if beyond and like_noise(values):
+                found.append(f"{where}: the readings scatter like noise, no motion shows in them.")
     return found
+
+
+def like_noise(values: np.ndarray) -> bool:
+    """Return whether readings (T, dim) change from sample to sample as much as if each were drawn by itself."""
+    if len(values) < ENOUGH:
+        return False
+    variance = values.var(axis=0)
+    moving = variance > 0
+    step = np.mean(np.diff(values, axis=0) ** 2, axis=0)
+    return bool(moving.any() and (step[moving] > 2 * WHITE * variance[moving]).all())

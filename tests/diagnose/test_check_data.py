@@ -7,8 +7,6 @@ from concent_warp.diagnose.check_data import check_data
 from concent_warp.recording.recording import Channel
 from tests.fit.swinging import swung
 
-pytestmark = pytest.mark.skip(reason="to be brought in step with the diagnosis")
-
 
 def spoiled(change):
     recording = swung(seconds=1.0)
@@ -29,6 +27,10 @@ def stuck(channel):
     return replace(channel, value=np.full_like(channel.value, 0.1))
 
 
+def scattered(channel):
+    return replace(channel, value=np.random.default_rng(0).normal(0, 0.5, channel.value.shape))
+
+
 def alone(channel):
     return Channel(channel.time[:1], channel.value[:1], channel.noise_std)
 
@@ -41,8 +43,9 @@ def test_clean_data_are_not_remarked_on():
     ("change", "words"),
     [
         (paused, "demo_0, angle: 1 gaps of up to 0.32 s between samples 0.01 s apart."),
-        (lost, "demo_0, angle: 40 % of the samples are missing."),
+        (lost, "demo_0, angle: 42 % of the samples are missing."),
         (stuck, "demo_0, angle: the reading never changes."),
+        (scattered, "demo_0, angle: the readings scatter like noise, no motion shows in them."),
         (alone, "demo_0, angle: only 1 sample, which says nothing."),
     ],
 )
