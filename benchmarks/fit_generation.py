@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ BOUND = 0.8
 SETTLED = 1.05
 """A fit has converged once its best loss is within this factor of where it ends."""
 PARTS = ("ask", "simulate", "compare", "tell")
+SHOWN = ("loss_mm", "error_mm", "unseen_mm", "contact_overlap")
 
 
 @dataclass(frozen=True)
@@ -119,12 +120,19 @@ class Bare:
             return time.perf_counter() - begun
 
 
-def demonstration() -> tuple[Recording, Truth]:
-    """Return a demonstration as it is read from its file, and what truly happened."""
-    recording, truths = record(RealityCfg(), [0])
+UNSEEN = (1, 2)
+"""Seeds of the demonstrations that judge a fit to that of seed 0."""
+
+
+def demonstration() -> tuple[Recording, Recording, list[Truth]]:
+    """Return a demonstration as it is read from its file, it and two others of the same objects, and what truly
+    happened in all three.
+    """
+    recording, truths = record(RealityCfg(), [0, *UNSEEN])
     with tempfile.TemporaryDirectory() as folder:
         write_hdf5(recording, Path(folder) / "demo.h5")
-        return load_recording(Path(folder) / "demo.h5"), truths[0]
+        found = load_recording(Path(folder) / "demo.h5")
+    return found.only((next(d.name for d in found.demonstrations),)), found, truths
 
 
 def search_of(args: Args, recording: Recording, population: int) -> Search:
@@ -200,7 +208,9 @@ def spread(values: np.ndarray) -> dict[str, float]:
     return {"median": float(np.median(values)), "low": float(values.min()), "high": float(values.max())}
 
 
-def measure_fit(args: Args, recording: Recording, truth: Truth, population: int) -> dict[str, Any]:
+def measure_fit(
+    args: Args, recording: Recording, every: Recording, truths: list[Truth], population: int
+) -> dict[str, Any]:
     """Fit from the file to the end and return how long that took and what error is left."""
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -216,7 +226,11 @@ def measure_fit(args: Args, recording: Recording, truth: Truth, population: int)
         print(f"population {population}: {history[-1][0]:.1f} s, best {1e3 * search.best:.3f} mm", flush=True)
     best = search.result().model
     settled = next(at for at, value in history if value <= SETTLED * search.best)
-    before, after = (judge(model, recording[0], truth) for model in (search.model, best))
+    judged = [
+        [judge(model, d, truth) for d, truth in zip(every.demonstrations, truths, strict=True)]
+        for model in (search.model, best)
+    ]
+    before, after = (found[0] for found in judged)
     return {
         "population": population,
         "generations": len(history),
@@ -227,6 +241,7 @@ def measure_fit(args: Args, recording: Recording, truth: Truth, population: int)
         "stopped": search.stopped,
         "loss_mm": [1e3 * search.history[0]["loss"], 1e3 * search.best],
         "error_mm": [before["mean"], after["mean"]],
+        "unseen_mm": [float(np.mean([found["mean"] for found in each[1:]])) for each in judged],
         "contact_overlap": [before["frames"], after["frames"]],
         "history": [[round(at, 3), round(1e3 * value, 4)] for at, value in history],
     }
@@ -242,17 +257,17 @@ def populations(args: Args) -> Sequence[int]:
     return (1024,) if cuda else (8,)
 
 
-def measure(args: Args) -> dict[str, Any]:
-    """Return what was asked for, of one device."""
-    recording, truth = demonstration()
+def measure(args: Args) -> Iterator[dict[str, Any]]:
+    """Measure what was asked for, of one device; yield the results with each population that is done."""
+    recording, every, truths = demonstration()
     rows = []
     for population in populations(args):
         if args.converge:
-            rows.append(measure_fit(args, recording, truth, population))
+            rows.append(measure_fit(args, recording, every, truths, population))
         else:
             rows.append(measure_generation(args, recording, population))
         print({key: value for key, value in rows[-1].items() if key != "history"}, flush=True)
-    return {"machine": machine(args.device), "start": args.start, "rows": rows}
+        yield {"machine": machine(args.device), "start": args.start, "rows": rows}
 
 
 def number(found: dict[str, float], digits: int = 0) -> str:
@@ -290,12 +305,14 @@ def fit_table(rows: list[dict[str, Any]]) -> str:
             str(row["generations"]),
             f"{row['seconds']:.1f}",
             f"{row['seconds_to_settle']:.1f}",
-            *(" -> ".join(f"{value:.2f}" for value in row[key]) for key in ("loss_mm", "error_mm", "contact_overlap")),
+            *(" -> ".join(f"{value:.2f}" for value in row[key]) for key in SHOWN),
         ]
         for row in rows
     ]
     head = ["candidates", "engine", "generations", "seconds to the end", "seconds to converge"]
-    return table([*head, "Chamfer distance [mm]", "block position error [mm]", "contact overlap"], cells)
+    return table(
+        [*head, "Chamfer distance [mm]", "block position error [mm]", "on unseen [mm]", "contact overlap"], cells
+    )
 
 
 def page(results: dict[str, Any]) -> str:
@@ -323,8 +340,9 @@ def main(args: Args) -> None:
     results = read_data(NAME)
     if not args.table:
         kind = "fit" if args.converge else "generation"
-        results[f"{kind}_{'cpu' if args.device == 'cpu' else 'cuda'}"] = measure(args)
-        write_data(NAME, results)
+        for found in measure(args):
+            results[f"{kind}_{'cpu' if args.device == 'cpu' else 'cuda'}"] = found
+            write_data(NAME, results)
     write_page(NAME, page(results))
 
 
