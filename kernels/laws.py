@@ -46,21 +46,24 @@ def load(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -
     )
 
 
-def dead_zone(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], values: wp.array[Any]) -> None:
-    """Take back the part of a servo's force that an error within the play makes, as far as its limits let it through.
+def loose_gear(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], first: int, values: wp.array[Any]) -> None:
+    """Let a servo's force through only where its rotor presses on an end of the play.
 
     Args:
         m: Model.
-        d: Data; `qfrc_applied` is added to.
+        d: Data; `qfrc_applied` is added to, how far rotors are ahead of their links is kept in `userdata`.
         actuators: Position-controlled actuators of single hinges and slides, shape (n,) int.
+        first: Place of actuator 0 in the user data.
         values: Width of the play at the joint, shape (N, 1).
     """
     wp.launch(
-        dead_zone_kernel,
+        loose_gear_kernel,
         dim=(d.nworld, actuators.size),
         inputs=[
             actuators,
+            first,
             values,
+            m.opt.timestep,
             m.actuator_trnid,
             m.actuator_gear,
             m.actuator_gainprm,
@@ -71,11 +74,12 @@ def dead_zone(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], values: wp.ar
             m.actuator_forcerange,
             m.jnt_qposadr,
             m.jnt_dofadr,
+            d.time,
             d.ctrl,
             d.qpos,
             d.qvel,
         ],
-        outputs=[d.qfrc_applied],
+        outputs=[d.userdata, d.qfrc_applied],
     )
 
 
@@ -166,9 +170,11 @@ def load_kernel(
 
 
 @wp.kernel
-def dead_zone_kernel(
+def loose_gear_kernel(
     actuators: wp.array[int],
+    first: int,
     values: wp.array2d[float],
+    timestep: wp.array[float],
     joint_of: wp.array[wp.vec2i],
     gear: wp.array2d[wp.spatial_vector],
     gain: wp.array2d[Any],
@@ -179,16 +185,20 @@ def dead_zone_kernel(
     force_range: wp.array2d[wp.vec2],
     qpos_address: wp.array[int],
     dof_address: wp.array[int],
+    time: wp.array[float],
     ctrl: wp.array2d[float],
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
+    userdata: wp.array2d[float],
     applied: wp.array2d[float],
 ):
-    """See `dead_zone`; dim (N, n).
+    """See `loose_gear`; dim (N, n).
 
     Args:
         actuators: Shape (n,).
+        first: Place of actuator 0 in the user data.
         values: Shape (N, 1).
+        timestep: [s], shape (1 or N,).
         joint_of: What each actuator drives, shape (nu,).
         gear: Shape (1 or N, nu).
         gain: Gain parameters, the position gain first, shape (1 or N, nu).
@@ -199,30 +209,46 @@ def dead_zone_kernel(
         force_range: Shape (1 or N, nu).
         qpos_address: Shape (njnt,).
         dof_address: Shape (njnt,).
+        time: [s], shape (N,).
         ctrl: Shape (N, nu).
         qpos: Shape (N, nq).
         qvel: Shape (N, nv).
+        userdata: How far rotors are ahead, shape (N, nuserdata).
         applied: Shape (N, nv), added to.
     """
     world, i = wp.tid()
+    play = values[world, 0]
+    if play <= 0.0:
+        return
     a = actuators[i]
     joint = joint_of[a][0]
     dof = dof_address[joint]
     ratio = gear[world % gear.shape[0], a][0]
     kp = gain[world % gain.shape[0], a][0]
     b = bias[world % bias.shape[0], a]
+    dt = timestep[world % timestep.shape[0]]
     command = ctrl[world, a]
     if command_limited[a]:
         limits = command_range[world % command_range.shape[0], a]
         command = wp.clamp(command, limits[0], limits[1])
-    length = ratio * qpos[world, qpos_address[joint]]
-    half = 0.5 * wp.abs(ratio) * wp.max(values[world, 0], 0.0)
-    change = -kp * wp.clamp(command - length, -half, half)
+    half = 0.5 * play * wp.abs(ratio)
+    speed = ratio * qvel[world, dof]
+    error = command + (b[0] + b[1] * ratio * qpos[world, qpos_address[joint]]) / kp
+    force = kp * error + b[2] * speed
+    ahead = userdata[world, first + a]
+    if time[world] == 0.0:
+        ahead = wp.clamp(force / kp, -half, half)
+    alone = error + (ahead - error) * wp.exp(-dt * kp / wp.max(-b[2], 1.0e-9 * kp)) - speed * dt
+    after = wp.clamp(alone, -half, half)
+    userdata[world, first + a] = after
+    through = 0.0
+    if alone != after:
+        through = (alone - after) / (alone - ahead) * (kp * (error - after) + b[2] * speed)
     if force_limited[a]:
         limits = force_range[world % force_range.shape[0], a]
-        force = kp * command + b[0] + b[1] * length + b[2] * ratio * qvel[world, dof]
-        change = wp.clamp(force + change, limits[0], limits[1]) - wp.clamp(force, limits[0], limits[1])
-    wp.atomic_add(applied, world, dof, ratio * change)
+        through = wp.clamp(through, limits[0], limits[1])
+        force = wp.clamp(force, limits[0], limits[1])
+    wp.atomic_add(applied, world, dof, ratio * (through - force))
 
 
 @wp.kernel

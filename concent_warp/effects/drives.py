@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.drive_laws import DeadZone
+from concent_warp.effects.drive_laws import LooseGear
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import (
@@ -216,11 +216,18 @@ class Backlash(ServoEffect):
     """Play between drive and link."""
 
     name = "backlash"
-    summary = "No torque while the link is within half the play of where the drive wants it: a dead zone of the error."
-    source = "dead-zone model: Nordin and Gutman, Automatica 38(10), 2002; gear and rotor without mass"
+    summary = (
+        "The drive turns a rotor without mass, which acts on the link only where it presses on an end of the play; in "
+        "between the link is free, and the rotor follows its command by kp (u - r) = kv dr/dt."
+    )
+    source = "play between inertias: Nordin and Gutman, Automatica 38(10), 2002; the rotor's left out"
     signature = "error that flips by the play at each reversal of the load; free swing in between"
     confusions = ("joint_friction", "stribeck_friction", "joint_compliance")
     threshold = True
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Make room for how far each rotor is ahead of its link."""
+        spec.nuserdata += len(spec.actuators)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """One width of the play for all."""
@@ -231,7 +238,7 @@ class Backlash(ServoEffect):
 
     def law(self, m: mujoco.MjModel) -> Law:
         """Torque that takes back the drive's within the play."""
-        return DeadZone(self.ids(m))
+        return LooseGear(self.ids(m), m.nuserdata - m.nu)
 
 
 class JointCompliance(ServoEffect):

@@ -18,6 +18,9 @@ from concent_warp.reality.hidden_drives import names
 from concent_warp.reality.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
+FINE = 20
+"""Parts of a step in which a rotor crosses its play."""
+
 
 class Rotor(Fresh):
     """The rotor of one drive."""
@@ -72,14 +75,17 @@ class Loose(Rotor):
 
     def turn(self, command: float, q: float, rate: float, dt: float) -> float:
         """See `Rotor.turn`."""
-        d = self.drive
-        rotor = q + self.twist[-1]
-        alone = command + (rotor - command) * np.exp(-d.kp * dt / d.kv) - (q + rate * dt)
-        self.after = float(np.clip(alone, -self.half, self.half))
-        if abs(alone) <= self.half:
-            return 0.0
-        torque = d.kp * (command - q - self.after) - d.kv * rate
-        return float(torque) if torque * self.after > 0 else 0.0
+        d, part = self.drive, dt / FINE
+        keep, through = np.exp(-d.kp * part / d.kv), 0.0
+        link = q
+        for _ in range(FINE):
+            alone = command + (link + self.after - command) * keep - (link + rate * part)
+            link += rate * part
+            self.after = min(max(alone, -self.half), self.half)
+            torque = d.kp * (command - q - self.after) - d.kv * rate
+            if abs(alone) > self.half and torque * self.after > 0:
+                through += torque / FINE
+        return through
 
 
 def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:

@@ -77,6 +77,22 @@ def test_backlash_with_friction_makes_a_loop_as_wide_as_the_play():
     np.testing.assert_allclose(q[up] - command[up], -half - drag, atol=2e-4)
 
 
+def test_link_waits_until_the_rotor_has_crossed_its_half_of_the_play():
+    """The rotor goes to a command of 0.02 as 1 - exp(-t kp / kv), and has to go 0.005."""
+    command = np.where(np.arange(200) < 10, 0.0, 0.02)[:, None]
+    cart = move(world(SERVO, Backlash("drive"), 0.01), 0.2, ctrl=command)
+    arrival = 0.01 + 40 / KP * np.log(0.02 / 0.015)
+    np.testing.assert_array_equal(cart.qpos[cart.time < arrival - 0.001, 0], 0)
+    later = cart.time > arrival
+    start = KP * 0.015 / MASS
+    np.testing.assert_allclose(cart.qvel[later, 0][:5], start * (cart.time[later][:5] - arrival), rtol=0.1)
+
+
+def test_link_flies_freely_within_the_play_undamped_by_the_drive():
+    cart = move(world(SERVO, Backlash("drive"), 0.05), 0.4, qvel=[0.05])
+    np.testing.assert_allclose(cart.qvel[:, 0], 0.05, atol=1e-12)
+
+
 def test_compliant_joint_sags_by_spring_and_drive_and_its_encoder_shows_the_drive_alone():
     c = 0.001
     model = world(WEIGHT, JointCompliance("drive"), c)
