@@ -18,15 +18,20 @@ PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
 
 
 def stribeck(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
-    """Add friction loss that fades with speed: extra exp(-(qd / speed)^2).
+    """Add friction loss that fades with speed: extra exp(-(qd / speed)^2), qd in the middle of the step.
 
     Args:
         m: Model whose `dof_frictionloss` has one row a world.
-        d: Data.
+        d: Data; `qacc` is that of the step before.
         dof: Degrees of freedom, shape (n,) int.
         values: An extra for each of them, then the speed, shape (N, n + 1).
     """
-    wp.launch(stribeck_kernel, dim=(d.nworld, dof.size), inputs=[dof, values, d.qvel], outputs=[m.dof_frictionloss])
+    wp.launch(
+        stribeck_kernel,
+        dim=(d.nworld, dof.size),
+        inputs=[dof, values, m.opt.timestep, d.qvel, d.qacc],
+        outputs=[m.dof_frictionloss],
+    )
 
 
 def load(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
@@ -129,7 +134,9 @@ def anisotropic(
 def stribeck_kernel(
     dof: wp.array[int],
     values: wp.array2d[float],
+    timestep: wp.array[float],
     qvel: wp.array2d[float],
+    qacc: wp.array2d[float],
     frictionloss: wp.array2d[float],
 ):
     """See `stribeck`; dim (N, n).
@@ -137,12 +144,15 @@ def stribeck_kernel(
     Args:
         dof: Shape (n,).
         values: Shape (N, n + 1).
+        timestep: [s], shape (1 or N,).
         qvel: Shape (N, nv).
+        qacc: Shape (N, nv).
         frictionloss: Shape (N, nv), added to.
     """
     world, i = wp.tid()
     row = dof[i]
-    ratio = qvel[world, row] / wp.max(values[world, dof.shape[0]], 1.0e-6)
+    middle = qvel[world, row] + 0.5 * timestep[world % timestep.shape[0]] * qacc[world, row]
+    ratio = middle / wp.max(values[world, dof.shape[0]], 1.0e-6)
     frictionloss[world, row] += wp.max(values[world, i], 0.0) * wp.exp(-ratio * ratio)
 
 

@@ -32,13 +32,17 @@ class DofLaw(Law):
 
 
 class StribeckFriction(DofLaw):
-    """Friction loss + extra exp(-(qd / speed)^2); parameters are the extras, shape (n,), then the speed."""
+    """Friction loss + extra exp(-(qd / speed)^2); parameters are the extras, shape (n,), then the speed.
+
+    qd is the velocity in the middle of the step, after the acceleration of the step before: stick-slip feeds on lag.
+    """
 
     edits = ("dof_frictionloss",)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
-        ratio = d.qvel[self.dof] / max(values[-1], 1e-6)
+        middle = d.qvel[self.dof] + 0.5 * m.opt.timestep * d.qacc[self.dof]
+        ratio = middle / max(values[-1], 1e-6)
         m.dof_frictionloss[self.dof] += np.maximum(values[:-1], 0.0) * np.exp(-ratio * ratio)
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:

@@ -2,12 +2,13 @@
 
 Friction follows Canudas de Wit, Olsson, Astrom, Lischinsky, "A new model for control of systems with friction", IEEE
 Trans. Automatic Control 40(3), 1995 (LuGre): dz/dt = v - sigma |v| z / g(v), force sigma z + sigma_1 dz/dt. The
-bristles are so stiff that a joint at rest gives by a third of a milliradian only.
+bristles are so stiff that a joint at rest gives by a tenth of a milliradian only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -16,7 +17,7 @@ from concent_warp.reality.hidden_case import Builder, Fresh, Hidden, drives, eac
 from concent_warp.reality.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
-GIVE = {"hinge": 3e-4, "slide": 3e-5}
+GIVE = {"hinge": 1e-4, "slide": 1e-5}
 """How far bristles give before they slip [rad], [m]."""
 Level = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 """Given model, data and degree of freedom, returns the friction at steady sliding [N m or N]."""
@@ -73,10 +74,13 @@ def stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
     found = drives(rig)
     speed = 0.03 if rig.slides else 0.3
     extra = np.array([magnitude * d.weight for d in found])
-    levels: dict[str, Level] = {
-        d.joint: lambda _m, s, i, t=t: t * float(np.exp(-((s.qvel[i] / speed) ** 2)))
-        for d, t in zip(found, extra, strict=True)
-    }
+
+    def level(model: mujoco.MjModel, data: mujoco.MjData, dof: int, *, top: float) -> float:
+        # That of the step's middle: what falls with speed and lags behind it makes stick-slip of its own.
+        middle = data.qvel[dof] + 0.5 * model.opt.timestep * data.qacc[dof]
+        return top * float(np.exp(-((middle / speed) ** 2)))
+
+    levels: dict[str, Level] = {d.joint: partial(level, top=t) for d, t in zip(found, extra, strict=True)}
     joints = tuple(d.joint for d in found)
     truth = {**each("extra", joints, extra), "speed": speed}
     return Hidden("stribeck_friction", friction("stribeck_friction", levels), truth, joints)
