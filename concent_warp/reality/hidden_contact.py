@@ -14,6 +14,8 @@ from concent_warp.reality.world import HiddenEffect
 
 FADE = 0.05
 """Turning speed below which torsional and rolling friction fade [rad/s]."""
+LEAST = 1e-5
+"""Coefficient that MuJoCo's contacts have at least."""
 
 
 def drawn_friction(rig: Rig) -> float:
@@ -59,7 +61,7 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
     def edit(spec: mujoco.MjSpec) -> None:
         for geom in (spec.geom(rig.surface), *spec.body(rig.body).geoms):
             friction = np.array(geom.friction)
-            friction[column] = 1e-7
+            friction[column] = LEAST
             geom.friction = friction
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -68,7 +70,7 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
         spin = velocity[:3] * np.array([rolling, rolling, not rolling])
-        data.xfrc_applied[body, 3:] -= magnitude * normal * spin / np.hypot(np.linalg.norm(spin), FADE)
+        data.xfrc_applied[body, 3:] -= (magnitude - LEAST) * normal * spin / np.hypot(np.linalg.norm(spin), FADE)
 
     return HiddenEffect(name, edit=edit, force=force)
 
