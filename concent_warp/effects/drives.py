@@ -188,7 +188,7 @@ class ActuatorLag(DriveEffect):
 
     name = "actuator_lag"
     summary = "The set point y follows the command u as time_constant dy/dt = u - y."
-    source = "first-order lag, exact for commands that are held over a step, taken at mid-step"
+    source = "first-order lag, exact for commands that are held over a step; the mean over each step acts"
     signature = "rounded corners after steps of the command"
     confusions = ("actuator_delay", "joint_damping", "latency")
     history = 0.5
@@ -205,10 +205,11 @@ class ActuatorLag(DriveEffect):
         if tau < 1e-5:
             return ctrl
         slow, ids = ctrl.copy(), self.ids(m)
-        keep, half = np.exp(-m.opt.timestep / tau), np.exp(-0.5 * m.opt.timestep / tau)
+        keep = np.exp(-m.opt.timestep / tau)
+        mean = (1 - keep) * tau / m.opt.timestep
         u = ctrl[:, ids]
         before = lfilter([0, 1 - keep], [1, -keep], u - u[0], axis=0) + u[0]
-        slow[:, ids] = u + (np.asarray(before) - u) * half
+        slow[:, ids] = u + (np.asarray(before) - u) * mean
         return slow
 
 

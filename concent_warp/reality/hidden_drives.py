@@ -13,23 +13,26 @@ from concent_warp.reality.world import HiddenEffect
 
 
 class Late(Fresh):
-    """Commands pass through a queue and act after a delay."""
+    """Commands pass through a queue and act after a delay; over a step, the mean of what acts in it."""
 
     def __init__(self, delay: float) -> None:
         super().__init__()
         self.delay = delay
         self.queue: deque[tuple[float, np.ndarray]] = deque()
-        self.acting = np.zeros(0)
 
     def __call__(self, now: float, ctrl: np.ndarray) -> np.ndarray:
-        """Return what acts now."""
-        if self.step(now) is None:
+        """Return what acts over the step that begins now."""
+        elapsed = self.step(now)
+        if elapsed is None:
             self.queue.clear()
-            self.acting = ctrl.copy()
+            self.queue.append((-np.inf, ctrl.copy()))
         self.queue.append((now + self.delay, ctrl.copy()))
-        while self.queue and self.queue[0][0] <= now + 1e-9:
-            self.acting = self.queue.popleft()[1]
-        return self.acting
+        while len(self.queue) > 1 and self.queue[1][0] <= now + 1e-9:
+            self.queue.popleft()
+        if elapsed is None:
+            return self.queue[0][1]
+        starts = [min(max((start - now) / elapsed, 0.0), 1.0) for start, _ in self.queue] + [1.0]
+        return np.diff(starts) @ np.stack([value for _, value in self.queue])
 
 
 class Sluggish(Fresh):
@@ -41,14 +44,14 @@ class Sluggish(Fresh):
         self.y = np.zeros(0)
 
     def __call__(self, now: float, ctrl: np.ndarray) -> np.ndarray:
-        """Return what acts over the step that begins now: the set point at its middle."""
+        """Return what acts over the step that begins now: the mean of the set point over it."""
         elapsed = self.step(now)
         if elapsed is None:
             self.y = ctrl.copy()
             return self.y
-        middle = ctrl + (self.y - ctrl) * np.exp(-0.5 * elapsed / self.time_constant)
-        self.y = ctrl + (self.y - ctrl) * np.exp(-elapsed / self.time_constant)
-        return middle
+        before = self.y
+        self.y = ctrl + (before - ctrl) * np.exp(-elapsed / self.time_constant)
+        return ctrl + self.time_constant * (before - self.y) / elapsed
 
 
 def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:

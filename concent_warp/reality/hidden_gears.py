@@ -30,6 +30,8 @@ class Rotor(Fresh):
         self.drive, self.column = drive, column
         self.after = 0.0
         """Twist, that is rotor less link, after the last step [rad or m]."""
+        self.share = 1.0
+        """Of the drive's damping that the link feels [-]."""
         self.time: list[float] = []
         self.twist: list[float] = []
         """Twist at the beginning of each step."""
@@ -57,6 +59,7 @@ class Sprung(Rotor):
     def __init__(self, drive: Drive, column: int, compliance: float) -> None:
         super().__init__(drive, column)
         self.stiffness = 1 / compliance
+        self.share = 1 / (1 + drive.kp * compliance)
 
     def turn(self, command: float, q: float, rate: float, dt: float) -> float:
         """See `Rotor.turn`."""
@@ -100,11 +103,13 @@ def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor
             encoders |= {m.sensor(i).name: r for r in rotors if r.drive.joint == joint}
 
     def edit(spec: mujoco.MjSpec) -> None:
-        for d in found:
-            actuator = spec.actuator(d.actuator)
+        for rotor in rotors:
+            d = rotor.drive
+            actuator, joint = spec.actuator(d.actuator), spec.joint(d.joint)
             actuator.gainprm, actuator.biasprm = 0 * np.array(actuator.gainprm), 0 * np.array(actuator.biasprm)
             # Damping at a step's beginning, not at its end as the simulator's servo has it, counts as less inertia.
-            spec.joint(d.joint).armature += d.kv * spec.option.timestep
+            joint.armature += rotor.share * d.kv * spec.option.timestep
+            joint.armature -= (1 - rotor.share) * rig.physics.armature.get(d.joint, 0.0)
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         for rotor in rotors:

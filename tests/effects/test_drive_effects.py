@@ -59,6 +59,14 @@ def test_lagging_drive_reaches_63_percent_of_a_step_after_its_time_constant():
     assert cart.qpos[-1, 0] == pytest.approx(expected, rel=0.005)
 
 
+def test_lag_shorter_than_a_time_step_loses_the_time_constant_times_the_step_of_the_command():
+    """Whatever the steps, the area between command and set point is theirs."""
+    model = world(SERVO, ActuatorLag("drive"), 0.0004)
+    u = np.where(np.arange(50) < 10, 0.0, 0.3)[:, None]
+    lagged = model.effects[0].effect.command(model.compile(), u, np.array([0.0004]))
+    assert (u - lagged).sum() * 0.001 == pytest.approx(0.0004 * 0.3, rel=1e-9)
+
+
 def test_weight_hangs_half_the_play_below_a_drive_with_backlash_and_above_it_when_pulled_up():
     for xml, side in ((WEIGHT, -1), (WEIGHT.replace(f"{-G} 0 0", f"{G} 0 0"), 1)):
         rest = move(world(xml, Backlash("drive"), 0.01), 3.0, ctrl=0.1).qpos[-1, 0]

@@ -93,11 +93,17 @@ def test_delayed_commands_arrive_later_by_the_delay_and_begin_anew_with_each_tri
         assert (acting[:10] == 0).all()
 
 
+def test_late_command_acts_for_the_rest_of_the_step_in_which_its_delay_ends():
+    late = Late(2.25e-3)
+    acting = [late(k * 1e-3, np.full(1, float(k >= 5)))[0] for k in range(12)]
+    np.testing.assert_allclose(acting, [0] * 7 + [0.75] + [1] * 4, atol=1e-9)
+
+
 def test_lagging_set_point_covers_63_percent_in_a_time_constant():
     lag = Sluggish(0.05)
     lag(-1e-3, np.zeros(1))
     path = np.array([lag(k * 1e-3, np.ones(1))[0] for k in range(100)])
-    assert path[49] == pytest.approx(1 - np.exp(-0.0495 / 0.05), abs=1e-6)
+    assert path[49] == pytest.approx(1 - np.exp(-0.0495 / 0.05), abs=1e-5)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "arm", "push", "grasp", "insertion"])
