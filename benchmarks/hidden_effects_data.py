@@ -22,6 +22,7 @@ from hidden_effects_residual import ratios
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
 from concent_warp.reality.hidden import INSIDE, hidden
+from concent_warp.reality.hidden_drives import strain
 from concent_warp.reality.hidden_sizes import MAGNITUDES, SIZES, Size
 from concent_warp.reality.rig import record_rig
 from concent_warp.reality.rigs import RIGS
@@ -122,7 +123,7 @@ class DataSet:
     kind: Kind
     rig: str
     magnitudes: Mapping[str, float]
-    """Value of the main parameter of each hidden effect, by name."""
+    """Value of the main parameter of each hidden effect, by name; of saturation, the limit over `strain`."""
     size: Size | None
     seed: int
     demonstrations: int = 1
@@ -186,7 +187,10 @@ def single(rig: str, effect: str, size: Size, seed: int, *, demonstrations: int 
 def make(case: DataSet) -> Data:
     """Record a data set; the same each time."""
     rig = RIGS[case.rig]
-    inside = [hidden(name, magnitude, rig) for name, magnitude in case.magnitudes.items()]
+    magnitudes = dict(case.magnitudes)
+    if "actuator_saturation" in magnitudes:
+        magnitudes["actuator_saturation"] *= strain(rig, case.demonstrations, case.seed)
+    inside = [hidden(name, magnitude, rig) for name, magnitude in magnitudes.items()]
     recording = record_rig(rig, [h.effect for h in inside], case.demonstrations, case.seed)
     truth = tuple(Truth(h.name, dict(h.truth), h.target, h.name in INSIDE) for h in inside)
     return Data(recording, rig.scene, truth)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.hidden_case import Builder, Drive, Fresh, Hidden, drives, each
-from concent_warp.reality.rig import Rig
+from concent_warp.reality.rig import Rig, perform
 from concent_warp.reality.world import HiddenEffect
 
 
@@ -99,8 +99,29 @@ def actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
             limit = min(magnitude, d.limit)
             spec.actuator(d.actuator).forcerange = [-limit, limit]
 
-    effect = HiddenEffect("actuator_saturation", edit=edit)
+    def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        # At its limit a drive does not damp, so what makes up for the drawing's step in damping is taken back.
+        for d in found:
+            joint, command = model.joint(d.joint), data.ctrl[model.actuator(d.actuator).id]
+            dof = joint.dofadr[0]
+            if abs(d.kp * (command - data.qpos[joint.qposadr[0]]) - d.kv * data.qvel[dof]) > min(magnitude, d.limit):
+                data.qfrc_applied[dof] += rig.physics.armature.get(d.joint, 0.0) * data.qacc[dof]
+
+    effect = HiddenEffect("actuator_saturation", edit=edit, force=force)
     return Hidden("actuator_saturation", effect, {"limit": magnitude}, names(found))
+
+
+def strain(rig: Rig, demonstrations: int, seed: int) -> float:
+    """Return the force [N m or N] that the hardest-working drive exceeds for a hundredth of the time, nothing hidden.
+
+    Motions and seeds differ in what they ask of a drive; a limit that shows on all of them goes with this.
+    """
+    model, seen = rig.world().compile(), []
+    columns = [model.joint(d.joint).dofadr[0] for d in drives(rig)]
+    watch = HiddenEffect("strain", force=lambda _model, data: seen.append(np.abs(data.qfrc_actuator[columns])))
+    for k in range(demonstrations * rig.throws):
+        perform(model, rig.plan(np.random.default_rng([seed, k]), k), [watch], rig.physics)
+    return float(np.quantile(seen, 0.99, axis=0).max())
 
 
 def joint_offset(rig: Rig, magnitude: float) -> Hidden:

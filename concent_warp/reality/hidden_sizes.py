@@ -2,7 +2,9 @@
 
 The middle size leaves a residual of about four standard deviations of the noise in the channels concerned when the
 drawing is replayed (two to three where the start of a throw, refitted, takes some of it), the large one two to three
-times that, the small one half. Where grip is lost there is nothing in between, so sizes lie closer together.
+times that, the small one half. The limit of saturation is in units of `hidden_drives.strain` of the motion at hand, for
+what one motion never asks of a drive another does all the time. Where grip is lost there is nothing in between, so
+sizes lie closer together.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "joint_damping": (0.0025, 0.0055, 0.014),
         "armature": (1e-4, 2e-4, 5e-4),
         "actuator_gain": (0.98, 0.95, 0.88),
-        "actuator_saturation": (1.0, 0.92, 0.82),
+        "actuator_saturation": (1.16, 1.1, 1.0),
         "actuator_delay": (6e-4, 1.2e-3, 3e-3),
         "actuator_lag": (6e-4, 1.2e-3, 3e-3),
         "backlash": (0.0035, 0.0065, 0.016),
