@@ -13,6 +13,8 @@ from concent_warp.scene.contact_geometry import GROUP as SPHERES
 
 AIR = 1.2
 """Density of air at 20 degrees [kg/m^3]."""
+TURNING = 2
+"""Which of the fluid coefficients is that of drag against turning."""
 SPECK = 1e-5
 """Radius of what the air does not act on [m]."""
 
@@ -61,7 +63,8 @@ class AirEffect(Effect):
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Use the ellipsoid model on the target's shape, and on other bodies a speck's instead of their inertia box.
 
-        A model that is in a medium already keeps its own.
+        A model that is in a medium already keeps its own. A ball turns almost freely in air: the friction of its skin
+        is a hundredth of what MuJoCo's coefficient for blunt shapes gives.
         """
         if spec.option.density > 0 or spec.option.viscosity > 0:
             return
@@ -70,6 +73,8 @@ class AirEffect(Effect):
                 drawn = [geom for geom in body.geoms if geom.group != SPHERES]
                 for geom in drawn or body.geoms:
                     geom.fluid_ellipsoid = True
+                    if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
+                        geom.fluid_coefs[TURNING] = 0.0
             elif not any(geom.fluid_ellipsoid for geom in body.geoms):
                 body.add_geom(
                     type=mujoco.mjtGeom.mjGEOM_SPHERE,

@@ -1,7 +1,7 @@
 """Hidden effects of the surroundings: a table that is not level, air.
 
 Air: quadratic drag 0.5 rho C A |v - w| (v - w) of the body's velocity against the wind, A the area of its shadow, and
-the lift rho V omega x v of a spinning body.
+the lift 0.5 rho V omega x v of a spinning body (the coefficient of Auton, J. Fluid Mech. 183, 1987).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def air(density: float, wind: np.ndarray, body: str) -> HiddenEffect:
         against = velocity[3:] - wind
         area, volume = shadow(model, b, data.xmat[b].reshape(3, 3).T @ against)
         data.xfrc_applied[b, :3] -= 0.5 * density * area * np.linalg.norm(against) * against
-        data.xfrc_applied[b, :3] += density * volume * np.cross(velocity[:3], against)
+        data.xfrc_applied[b, :3] += 0.5 * density * volume * np.cross(velocity[:3], against)
 
     return HiddenEffect("air", force=force)
 

@@ -45,8 +45,8 @@ class WorldPhysics:
 
     timestep: float = 0.0005
     """Step [s]."""
-    impratio: float = 10.0
-    """Stiffness of the friction against that of the normal force [-]."""
+    impratio: float | None = None
+    """Stiffness of the friction against that of the normal force [-]; None for the drawing's."""
     lead: float = 0.0
     """By how much commands act earlier than told [s], see `of_coarser_step`."""
     armature: Mapping[str, float] = field(default_factory=dict)
@@ -122,7 +122,8 @@ class Rig:
         spec.option.timestep = self.physics.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.impratio = self.physics.impratio
+        if self.physics.impratio is not None:
+            spec.option.impratio = self.physics.impratio
         spec.option.iterations = 100
         spec.option.ls_iterations = 50
         for joint, armature in self.physics.armature.items():

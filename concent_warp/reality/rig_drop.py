@@ -16,7 +16,8 @@ XML = f"""
   <option timestep="0.001" integrator="implicitfast" cone="elliptic" impratio="3"/>
   <worldbody>
     <light pos="0 -0.4 3"/>
-    <geom name="mat" type="plane" size="4 4 0.1" friction="0.5 0.005 0.0001" solref="0.04 0.4" priority="1"/>
+    <geom name="mat" type="plane" size="4 4 0.1" friction="0.5 0.005 0.0001" solref="0.04 0.4" solimp="0.0001 0.95 0.02"
+      priority="1"/>
     <body name="ball" pos="0 0 0.5">
       <freejoint name="ball_joint"/>
       <geom name="ball" type="sphere" size="{RADIUS}" mass="0.4" friction="0.5 0.005 0.0001" solref="0.04 0.4"/>
