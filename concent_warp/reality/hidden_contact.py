@@ -140,8 +140,9 @@ def pad_friction(rig: Rig, magnitude: float) -> Hidden:
             geom.friction = [magnitude, *np.array(geom.friction)[1:]]
             geom.priority = 2
 
-    effect = HiddenEffect("pad_friction", edit=edit)
-    return Hidden("pad_friction", effect, {"coefficient": magnitude}, rig.pads)
+    m = rig.scene.model
+    fingers = tuple(m.body(m.geom(name).bodyid[0]).name for name in rig.pads)
+    return Hidden("pad_friction", HiddenEffect("pad_friction", edit=edit), {"coefficient": magnitude}, fingers)
 
 
 CONTACT: dict[str, Builder] = {
