@@ -14,6 +14,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+PLANE = wp.constant(int(mujoco.mjtGeom.mjGEOM_PLANE))
 PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
 
 
@@ -125,6 +126,50 @@ def anisotropic(
             d.xipos,
             d.subtree_com,
             d.cvel,
+        ],
+        outputs=[d.xfrc_applied],
+    )
+
+
+def pull(
+    m: mjw.Model,
+    d: mjw.Data,
+    geom: wp.array[Any],
+    point: wp.array[Any],
+    rounded: wp.array[Any],
+    still: wp.array[Any],
+    values: wp.array[Any],
+    gap: float,
+) -> None:
+    """Pull points of a body that lie within a gap of a plane or box that stands still towards it.
+
+    Args:
+        m: Model.
+        d: Data; `xfrc_applied` is added to.
+        geom: Geom of each point, shape (P,) int.
+        point: Points in the frames of their geoms [m], shape (P,) of vectors.
+        rounded: Whether the geom's first size is a radius about the point, shape (P,) bool.
+        still: Planes and boxes, shape (n,) int.
+        values: Force at each point [N], shape (N, 1).
+        gap: [m].
+    """
+    wp.launch(
+        pull_kernel,
+        dim=(d.nworld, geom.size, still.size),
+        inputs=[
+            geom,
+            point,
+            rounded,
+            still,
+            values,
+            gap,
+            m.geom_type,
+            m.geom_size,
+            m.geom_bodyid,
+            d.time,
+            d.geom_xpos,
+            d.geom_xmat,
+            d.xipos,
         ],
         outputs=[d.xfrc_applied],
     )
@@ -338,4 +383,72 @@ def anisotropic_kernel(
     speed = wp.sqrt(wp.dot(velocity, velocity) + smooth * smooth)
     force = wp.vec3(0.0, (1.0 - values[world, 0]) * friction[i][0] * pressed * velocity[1] / speed, 0.0)
     torque = wp.cross(position[i] - xipos[world, body], force)
+    wp.atomic_add(applied, world, body, wp.spatial_vector(force, torque))
+
+
+@wp.kernel
+def pull_kernel(
+    geom: wp.array[int],
+    point: wp.array[wp.vec3],
+    rounded: wp.array[bool],
+    still: wp.array[int],
+    values: wp.array2d[float],
+    gap: float,
+    kind: wp.array[int],
+    size: wp.array2d[wp.vec3],
+    body_of: wp.array[int],
+    time: wp.array[float],
+    position: wp.array2d[wp.vec3],
+    frame: wp.array2d[wp.mat33],
+    xipos: wp.array2d[wp.vec3],
+    applied: wp.array2d[wp.spatial_vector],
+):
+    """See `pull`; dim (N, P, n).
+
+    Args:
+        geom: Shape (P,).
+        point: Shape (P,).
+        rounded: Shape (P,).
+        still: Shape (n,).
+        values: Shape (N, 1).
+        gap: [m].
+        kind: Shape (ngeom,).
+        size: Shape (1 or N, ngeom).
+        body_of: Body of each geom, shape (ngeom,).
+        time: [s], shape (N,).
+        position: Of geoms [m], shape (N, ngeom).
+        frame: Of geoms, shape (N, ngeom).
+        xipos: Centres of mass [m], shape (N, nbody).
+        applied: Forces and torques on bodies, shape (N, nbody), added to.
+    """
+    world, i, k = wp.tid()
+    pulled = values[world, 0]
+    if pulled <= 0.0 or time[world] == 0.0:
+        return
+    mine = geom[i]
+    ground = still[k]
+    row = world % size.shape[0]
+    place = position[world, mine] + frame[world, mine] * point[i]
+    axes = frame[world, ground]
+    local = wp.transpose(axes) * (place - position[world, ground])
+    height = local[2]
+    up = wp.vec3(0.0, 0.0, 1.0)
+    if kind[ground] != PLANE:
+        beyond = wp.vec3(wp.abs(local[0]), wp.abs(local[1]), wp.abs(local[2])) - size[row, ground]
+        height = wp.max(beyond)
+        outside = int(beyond[0] > 0.0) + int(beyond[1] > 0.0) + int(beyond[2] > 0.0)
+        if outside > 1:
+            return
+        up = wp.vec3(0.0, 0.0, wp.sign(local[2]))
+        if beyond[0] >= beyond[1] and beyond[0] >= beyond[2]:
+            up = wp.vec3(wp.sign(local[0]), 0.0, 0.0)
+        elif beyond[1] >= beyond[2]:
+            up = wp.vec3(0.0, wp.sign(local[1]), 0.0)
+    radius = wp.where(rounded[i], size[row, mine][0], 0.0)
+    if height - radius >= gap:
+        return
+    normal = axes * up
+    body = body_of[mine]
+    force = -pulled * normal
+    torque = wp.cross(place - radius * normal - xipos[world, body], force)
     wp.atomic_add(applied, world, body, wp.spatial_vector(force, torque))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.contact_laws import AnisotropicForce
+from concent_warp.effects.contact_laws import AnisotropicForce, Pull
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import (
@@ -203,38 +203,25 @@ class Adhesion(SurfaceEffect):
 
     name = "adhesion"
     summary = (
-        "A force that pulls the body towards what it touches, at each contact point; over a gap of 1 mm, less where it "
-        "is below a tenth of the weight."
+        "A force that pulls each corner or end of the body towards planes and boxes that stand still, within 1 mm of "
+        "them."
     )
-    source = f"MuJoCo's adhesion of geoms ({MUJOCO})"
+    source = "constant pull over a short reach, in place of Dugdale's cohesive zone"
     signature = "lift-off and first slip too late; residual friction that does not go with the weight"
     confusions = ("sliding_friction", "mass")
     threshold = True
     GAP = 0.001
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Switch adhesion on, of next to no force."""
-        for n in self.target:
-            for geom in spec.body(n).geoms:
-                geom.adhesion = geom.adhesion or 1e-9
-
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One force for each contact point."""
+        """One force for each point."""
         weight = float(m.body_mass[self.ids(m)].sum() * np.linalg.norm(m.opt.gravity))
         scan = tuple(weight * x for x in (0.1, 0.3, 1.0, 3.0))
         return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
 
-    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Adhesion, and the gap that it acts across."""
-        return ("geom_adhesion", "geom_gap")
-
-    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Set both on the body's geoms. Contacts brake within the gap, so that there is none without a force."""
-        geoms, force = np.concatenate([geoms_of(m, b) for b in self.ids(m)]), max(float(values[0]), 1e-9)
-        weight = float(m.body_mass[self.ids(m)].sum() * np.linalg.norm(m.opt.gravity))
-        m.geom_adhesion[geoms] = force
-        m.geom_gap[geoms] = np.maximum(m.geom_gap[geoms], self.GAP * min(force / max(0.1 * weight, 1e-6), 1.0))
-        np.maximum.at(m.body_margin, m.geom_bodyid[geoms], m.geom_margin[geoms] + m.geom_gap[geoms])
+    def law(self, m: mujoco.MjModel) -> Law:
+        """The pull."""
+        moving = np.flatnonzero(np.isin(m.body_weldid, m.body_weldid[self.ids(m)]))
+        return Pull(m, moving, self.GAP)
 
 
 class PadFriction(Effect):

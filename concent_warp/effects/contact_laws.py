@@ -1,7 +1,8 @@
-"""Friction of a surface with a grain as a force beside MuJoCo's isotropic friction."""
+"""Forces at surfaces beside MuJoCo's contacts: friction of a surface with a grain, adhesion."""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     import mujoco_warp as mjw
     import warp as wp
 
+GEOM = mujoco.mjtGeom
 SMOOTH = 2e-3
 """Sliding speed [m/s] below which the force fades out."""
 
@@ -66,6 +68,89 @@ class AnisotropicForce(Law):
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
         laws.anisotropic(m, d, *self._device, values, SMOOTH)
+
+
+class Pull(Law):
+    """Pulls the points of a body that lie within a gap of a plane or box that stands still towards it.
+
+    The points are corners of boxes, ends of capsules, four points of each rim of cylinders, the outermost vertices of
+    meshes, and the nearest point of a sphere. The parameter is the force at each of them, shape (1,). It is not a
+    matter of MuJoCo's contacts, which a sliding body loses and finds again from step to step.
+    """
+
+    def __init__(self, m: mujoco.MjModel, bodies: np.ndarray, gap: float) -> None:
+        """Act on bodies, ids of shape (n,), within `gap` [m]."""
+        self.gap = gap
+        colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+        geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies) & colliding)
+        points = [outermost(m, int(g)) for g in geoms]
+        self.geom = np.repeat(geoms, [len(p) for p in points]).astype(np.int32)
+        self.point = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
+        """In the frame of its geom [m], shape (P, 3)."""
+        self.round = np.isin(m.geom_type[self.geom], [GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_CAPSULE])
+        """Whether the geom's first size is a radius about the point, shape (P,)."""
+        flat = np.isin(m.geom_type, [GEOM.mjGEOM_PLANE, GEOM.mjGEOM_BOX]) & colliding
+        self.still = np.intersect1d(standing_geoms(m), np.flatnonzero(flat)).astype(np.int32)
+        self._device: tuple[wp.array[Any], wp.array[Any], wp.array[Any], wp.array[Any]] | None = None
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        if values[0] <= 0 or not d.time:
+            return
+        radius = m.geom_size[self.geom, 0] * self.round
+        place = d.geom_xpos[self.geom] + np.einsum("pij,pj->pi", d.geom_xmat[self.geom].reshape(-1, 3, 3), self.point)
+        body = m.geom_bodyid[self.geom]
+        for g in self.still:
+            axes = d.geom_xmat[g].reshape(3, 3)
+            local = (place - d.geom_xpos[g]) @ axes
+            if m.geom_type[g] == GEOM.mjGEOM_PLANE:
+                height, normal = local[:, 2], np.tile(axes[:, 2], (len(local), 1))
+                over = np.ones(len(local), dtype=bool)
+            else:
+                beyond = np.abs(local) - m.geom_size[g]
+                face = beyond.argmax(axis=1)
+                row = np.arange(len(local))
+                height, normal = beyond[row, face], np.sign(local[row, face])[:, None] * axes.T[face]
+                over = (beyond > 0).sum(axis=1) <= 1
+            for i in np.flatnonzero(over & (height - radius < self.gap)):
+                force = -values[0] * normal[i]
+                arm = place[i] - radius[i] * normal[i] - d.xipos[body[i]]
+                d.xfrc_applied[body[i], :3] += force
+                d.xfrc_applied[body[i], 3:] += np.cross(arm, force)
+
+    def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
+        """See `Law.launch`."""
+        import warp as wp
+
+        from concent_warp.kernels import laws
+
+        if self._device is None:
+            self._device = (
+                wp.array(self.geom, dtype=int),
+                wp.array(self.point, dtype=wp.vec3),
+                wp.array(self.round, dtype=bool),
+                wp.array(self.still, dtype=int),
+            )
+        laws.pull(m, d, *self._device, values, self.gap)
+
+
+def outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Return the points of a geom that may touch a plane first, in its frame [m], shape (P, 3)."""
+    kind, (x, y, z) = int(m.geom_type[geom]), m.geom_size[geom]
+    sides = np.array(list(product((-1.0, 1.0), repeat=3)))
+    if kind == GEOM.mjGEOM_SPHERE:
+        return np.zeros((1, 3))
+    if kind == GEOM.mjGEOM_CAPSULE:
+        return np.array([[0, 0, -y], [0, 0, y]])
+    if kind == GEOM.mjGEOM_CYLINDER:
+        return np.array([[x * np.cos(a), x * np.sin(a), s * y] for s in (-1, 1) for a in np.arange(4) * np.pi / 2])
+    if kind == GEOM.mjGEOM_BOX:
+        return sides * [x, y, z]
+    if kind == GEOM.mjGEOM_MESH:
+        first = m.mesh_vertadr[m.geom_dataid[geom]]
+        vertices = m.mesh_vert[first : first + m.mesh_vertnum[m.geom_dataid[geom]]]
+        return vertices[np.unique((vertices @ sides.T).argmax(axis=0))].astype(float)
+    return np.zeros((0, 3))
 
 
 def normal_forces(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.ndarray:

@@ -130,6 +130,23 @@ def test_adhesion_holds_a_block_against_a_push_of_mu_times_weight_and_adhesion()
         assert (move(model, 0.3).qpos[-1, 0] < 0.01) == holds
 
 
+def test_adhesion_adds_to_what_a_sliding_block_rubs_with_whatever_has_priority():
+    for xml in (BLOCK, BLOCK.replace('friction="0.3" ', 'friction="0.3" priority="1" ', 1)):
+        block = move(world(xml, Adhesion("thing"), MASS * G / 4), 0.4, qvel=[0.5, 0, 0, 0, 0, 0])
+        assert block.qpos[-1, 0] == pytest.approx(0.5**2 / (2 * 0.3 * 2 * G), rel=0.03)
+
+
+@pytest.mark.parametrize("floor", ['type="plane" size="5 5 0.1"', 'type="box" pos="0 0 -0.5" size="1 1 0.5"'])
+@pytest.mark.parametrize(("height", "pulled"), [(0.0009, True), (0.0011, False)])
+def test_adhesion_reaches_over_a_gap_of_a_millimetre_and_no_farther(floor, height, pulled):
+    xml = BLOCK.replace('type="plane" size="5 5 0.1"', floor).replace(
+        'name="thing" pos', 'name="thing" gravcomp="1" pos'
+    )
+    block = move(world(xml, Adhesion("thing"), 0.1), 0.02, qpos=[0, 0, 0.02 + height, *UPRIGHT])
+    expected = -4 * 0.1 / MASS * (0.02 - 0.001) if pulled else 0.0
+    np.testing.assert_allclose(block.qvel[-1], [0, 0, expected, 0, 0, 0], atol=1e-9)
+
+
 def test_without_a_force_adhesion_leaves_falls_and_rebounds_as_they_were():
     start = {"qpos": [0, 0, 0.1, 0.9, 0.3, 0.2, 0.1], "qvel": [0.5, 0, -1, 3, 2, 1]}
     plain, null = move(world(BLOCK), 0.5, **start), move(world(BLOCK).add(Adhesion("thing")), 0.5, **start)
