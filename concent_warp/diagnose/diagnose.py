@@ -193,7 +193,8 @@ class Procedure:
         if not found:
             return found
         best = max(c.share(base) for c in found)
-        rough = [k for k, c in enumerate(found) if c.share(base) > NEAR * best and c.ratio > SETTLED]
+        hoped = [max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)]
+        rough = [k for k, c in enumerate(found) if hoped[k] > NEAR * best and c.ratio > SETTLED]
         polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
         for k, c in zip(rough, polished, strict=True):
             found[k] = c

@@ -23,6 +23,7 @@ from concent_warp.fit.least_squares import (
     huber_limit,
     huber_weight,
     projected,
+    trust,
 )
 from concent_warp.fit.observation import Window
 from concent_warp.fit.prediction import Prediction
@@ -193,7 +194,8 @@ def scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndar
         residuals = solver.p.residuals(solver.trials(moved, base.fit.offsets))
         rest = []
         for r, a, o in zip(residuals, base.fit.starts, base.fit.offsets, strict=True):
-            inner = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ r + o)
+            near = trust(o)
+            inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
             rest.append(r - a @ inner)
         gain = (before - total(base, rest)) / max(before, 1e-12)
         if gain > best:

@@ -27,10 +27,29 @@ WANTED = 3.0
 from value to value, so that smaller steps measure the jumps."""
 
 
-DAMPINGS = (1e-3, 1e-1, 3.0)
-"""Dampings that are tried in turn on initial states."""
-PROBE = 1.0
-"""Step of a finite difference of the initial state, in units of its spread."""
+DAMPINGS = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
+"""Dampings that are tried on initial states."""
+TRUSTED = 2.0
+"""Errors of initial states beyond this many times their spread count little more."""
+PROBE = (0.003, 1.0)
+"""Bounds of the step of a finite difference of the initial state, in units of its spread."""
+PROBE_FIRST = 0.3
+"""The step at first."""
+SEEN = (1.0, 3.0, 0.3)
+"""Mean change of the residuals that such a step aims at, in units of noise: an impact turns a small difference into a
+large one, and is straight over a small one only. The next one is taken where one leads no further."""
+LEFT = 1.05
+"""Residual over noise down to which others than the first are taken."""
+DRAWS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
+"""Spread of initial states that are drawn where derivatives lead no further, in standard deviations of the fit."""
+ROUNDS = 12
+"""How often the dependence on the initial states is computed, as long as it still helps."""
+RESTARTS, ODD = 4, 1.3
+"""How often a window is begun anew from a drawn initial state if its residual is this many times that of others."""
+REFIT_ROUNDS = 4
+"""The same within a step of the parameters."""
+FALL = 3e-3
+"""A window's initial state is found once a step lowers its cost by less than this share."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +62,7 @@ class FitCfg:
     """The fit ends when a step lowers the cost by less than this share."""
     damping: float = 1e-3
     """Damping at first, relative to the curvature."""
-    refits: int = 3
+    refits: int = 6
     """How often initial states may be fitted anew where a step does not bring what it promised."""
 
 
@@ -88,6 +107,18 @@ class _State:
     """How often initial states may still be fitted anew."""
 
 
+@dataclass(frozen=True)
+class _Look:
+    """What small changes of one window's initial state do."""
+
+    columns: np.ndarray
+    """dr / d(offset / spread), shape (n, 2 nv)."""
+    offsets: np.ndarray
+    """The states tried, one a row, shape (2 nv, 2 nv)."""
+    residuals: list[np.ndarray]
+    """Their residuals, each (n,)."""
+
+
 class Solver:
     """Fits the parameters of one prediction."""
 
@@ -99,66 +130,108 @@ class Solver:
         self.low = np.array([q.low for q in prediction.parameters])
         self.high = np.array([q.high for q in prediction.parameters])
         self.step = np.full(len(self.scale), STEP)
+        self.probe = [np.full(len(w.spread), PROBE_FIRST) for w in prediction.windows]
 
-    def start_sensitivity(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray] | None = None
-    ) -> tuple[np.ndarray, ...]:
-        """Return how the residuals depend on the initial states, dr / d(offset / spread), one (n, 2 nv) a window."""
-        trials = []
-        for w, window in enumerate(self.p.windows):
-            base = np.zeros(len(window.spread)) if offsets is None else offsets[w] * window.spread
-            trials.append(Trial(w, values, base))
-            for k, spread in enumerate(window.spread):
-                moved = base.copy()
-                moved[k] += PROBE * spread
-                trials.append(Trial(w, values, moved))
-        residuals = self.p.residuals(trials)
-        found, at = [], 0
-        for window in self.p.windows:
-            size = len(window.spread)
-            base = residuals[at]
-            columns = np.stack([(r - base) / PROBE for r in residuals[at + 1 : at + 1 + size]], axis=1)
-            wild = np.abs(columns).max(axis=0) > 0.5 * np.abs(base).max() + 1e2
+    def look_around(
+        self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
+    ) -> list[_Look]:
+        """Move each component of the initial state of some windows a little, and see what that does.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states of all windows, in units of their spread.
+            residuals: Residuals of all windows there.
+            windows: Which ones to look at.
+        """
+        trials, moved = [], []
+        for w in windows:
+            moved.append(offsets[w] + np.diag(self.probe[w]))
+            trials += [Trial(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
+        found, at = self.p.residuals(trials), 0
+        looks = []
+        for w, offset in zip(windows, moved, strict=True):
+            seen = found[at : at + len(offset)]
+            at += len(offset)
+            columns = np.stack([(r - residuals[w]) / h for r, h in zip(seen, self.probe[w], strict=True)], axis=1)
+            wild = np.abs(columns).max(axis=0) * self.probe[w] > 0.5 * np.abs(residuals[w]).max() + 1e2
             columns[:, wild] = 0.0
-            found.append(columns)
-            at += 1 + size
-        return tuple(found)
+            looks.append(_Look(columns, offset, seen))
+        return looks
 
     def refine_starts(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray], rounds: int = 3
+        self, values: np.ndarray, offsets: Sequence[np.ndarray], rounds: int = ROUNDS
     ) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
         """Fit the initial states alone, each window by itself, at fixed parameters.
 
         Args:
             values: Parameters, shape (P,).
             offsets: Errors of the initial states in units of their spread, where to start.
-            rounds: How often the dependence on the initial states is computed.
+            rounds: How often the dependence on the initial states is computed at most.
 
         Returns:
             The errors of the initial states, and how the residuals depend on them at the last round, see `Fit.starts`.
         """
-        offsets = [np.array(o) for o in offsets]
-        starts: tuple[np.ndarray, ...] = ()
+        offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
-        for _ in range(rounds):
-            starts = self.start_sensitivity(values, offsets)
+        self._settle(values, offsets, residuals, starts, range(len(offsets)), rounds, rng)
+        for _ in range(RESTARTS if rounds == ROUNDS else 0):
+            size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
+            odd = np.flatnonzero(size > ODD * max(1.0, float(np.median(size)))).tolist()
+            if not odd:
+                break
+            begin, found = list(offsets), dict(starts)
+            for w in odd:
+                begin[w] = rng.normal(size=len(offsets[w]))
+            there = self.p.residuals(self.trials(values, begin))
+            self._settle(values, begin, there, found, odd, rounds, rng)
             limit = huber_limit(residuals)
-            costs = [start_cost(r, o, limit) for r, o in zip(residuals, offsets, strict=True)]
-            open_windows = set(range(len(offsets)))
-            for damping in DAMPINGS:
-                chosen = sorted(open_windows)
-                moved = {
-                    w: offsets[w] + start_step(residuals[w], starts[w], offsets[w], limit, damping) for w in chosen
-                }
-                trials = [Trial(w, values, moved[w] * self.p.windows[w].spread) for w in chosen]
-                for w, r in zip(chosen, self.p.residuals(trials), strict=True):
-                    cost = start_cost(r, moved[w], limit)
-                    if cost < costs[w]:
-                        open_windows.discard(w)
-                        offsets[w], residuals[w], costs[w] = moved[w], r, cost
-                if not open_windows:
-                    break
-        return offsets, starts
+            for w in odd:
+                if start_cost(there[w], begin[w], limit) < start_cost(residuals[w], offsets[w], limit):
+                    offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
+        return offsets, tuple(starts[w] for w in range(len(offsets)))
+
+    def _settle(
+        self,
+        values: np.ndarray,
+        offsets: list[np.ndarray],
+        residuals: list[np.ndarray],
+        starts: dict[int, np.ndarray],
+        windows: Sequence[int],
+        rounds: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Take the initial states of some windows to where no step helps any more; writes into what it is given."""
+        unsettled, aim = list(windows), [0] * len(offsets)
+        for _ in range(rounds):
+            looks = self.look_around(values, offsets, residuals, unsettled)
+            limit = huber_limit(residuals)
+            tried, rows = [], []
+            for w, look in zip(unsettled, looks, strict=True):
+                there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
+                if np.mean(residuals[w] ** 2) > LEFT**2:
+                    there += around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
+                tried.append(there)
+                rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
+            found, moving, at = self.p.residuals(rows), [], 0
+            for k, (w, look) in enumerate(zip(unsettled, looks, strict=True)):
+                starts[w] = look.columns
+                there = [*tried[k], *look.offsets]
+                seen = [*found[at : at + len(tried[k])], *look.residuals]
+                at += len(tried[k])
+                cost = start_cost(residuals[w], offsets[w], limit)
+                costs = [start_cost(r, o, limit) for r, o in zip(seen, there, strict=True)]
+                best = int(np.argmin(costs))
+                if costs[best] < cost:
+                    offsets[w], residuals[w] = there[best], seen[best]
+                if costs[best] > (1 - FALL) * cost:
+                    aim[w] += 1 if np.mean(residuals[w] ** 2) > LEFT**2 else len(SEEN)
+                if aim[w] < len(SEEN):
+                    moving.append(w)
+                    change = np.sqrt(np.mean(look.columns**2, axis=0))
+                    self.probe[w] = np.clip(SEEN[aim[w]] / np.maximum(change, 1e-12), *PROBE)
+            unsettled = moving
+            if not unsettled:
+                break
 
     def polish(self, fit: Fit) -> Fit:
         """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
@@ -176,7 +249,7 @@ class Solver:
             others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
         """
         found = [self.refine_starts(fit.values, fit.offsets, rounds=1)]
-        found += [self.refine_starts(fit.values, offsets, rounds=2) for offsets in others]
+        found += [self.refine_starts(fit.values, offsets) for offsets in others]
         residuals = [self.p.residuals(self.trials(fit.values, offsets)) for offsets, _ in found]
         limit = huber_limit(residuals[0])
         offsets, starts = [], []
@@ -291,7 +364,7 @@ class Solver:
                 return _State(values, offsets, cost, state.starts, state.refits), max(damping / 5, 1e-6)
             if state.refits:
                 begin = state.offsets if cost > 2 * state.cost else offsets
-                refitted, starts = self.refine_starts(values, begin, rounds=1)
+                refitted, starts = self.refine_starts(values, begin, rounds=REFIT_ROUNDS)
                 again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values)
                 state = replace(state, refits=state.refits - 1)
                 if again < state.cost:
@@ -313,7 +386,7 @@ class Solver:
         """Return half the robust sum of squares, with the priors."""
         limit = huber_limit(residuals)
         total = sum(float(huber(r, limit).sum()) for r in residuals)
-        total += 0.5 * sum(float(o @ o) for o in offsets)
+        total += sum(far(o) for o in offsets)
         prior = self.prior(values)
         return total + 0.5 * float(prior @ prior)
 
@@ -333,9 +406,10 @@ class Solver:
         for piece, a, o in zip(linear, starts, offsets, strict=True):
             weight = huber_weight(piece.residual, limit)
             aw = a.T * weight
-            m = aw @ a + np.eye(a.shape[1]) * (1 + damping)
+            near = trust(o)
+            m = aw @ a + np.diag(near * (1 + damping))
             c = aw @ piece.jacobian
-            b = aw @ piece.residual + o
+            b = aw @ piece.residual + near * o
             jw = piece.jacobian.T * weight
             solved = np.linalg.solve(m, np.column_stack([c, b]))
             normal += jw @ piece.jacobian - c.T @ solved[:, :size]
@@ -356,15 +430,50 @@ class Solver:
 
 def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float) -> float:
     """Return the cost of one window with the prior of its initial state."""
-    return float(huber(residual, limit).sum() + 0.5 * offset @ offset)
+    return float(huber(residual, limit).sum()) + far(offset)
 
 
 def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limit: float, damping: float) -> np.ndarray:
     """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
     weighted = start.T * huber_weight(residual, limit)
     normal = weighted @ start
-    normal += np.diag(1.0 + damping * (1.0 + np.diag(normal)))
-    return -np.linalg.solve(normal, weighted @ residual + offset)
+    near = trust(offset)
+    normal += np.diag(near + damping * (near + np.diag(normal)))
+    return -np.linalg.solve(normal, weighted @ residual + near * offset)
+
+
+def around(
+    residual: np.ndarray,
+    start: np.ndarray,
+    offset: np.ndarray,
+    step: np.ndarray,
+    limit: float,
+    rng: np.random.Generator,
+) -> list[np.ndarray]:
+    """Return initial states drawn about one and about where a step leads, farthest where residuals tell least.
+
+    Time steps cut an impact's course into teeth, each with a minimum of its own: derivatives do not lead from one to
+    the next, draws do.
+    """
+    weighted = start.T * huber_weight(residual, limit)
+    factor = np.linalg.cholesky(weighted @ start + np.diag(trust(offset)))
+    return [
+        centre + size * np.linalg.solve(factor.T, rng.normal(size=len(offset)))
+        for size in DRAWS
+        for centre in (offset, step)
+    ]
+
+
+def far(offset: np.ndarray) -> float:
+    """Return the cost of an error of an initial state in units of its spread, by Cauchy's prior: half the square while
+    it is small, and hardly more for one that is far off. A state told in the middle of an impact may be.
+    """
+    return float(0.5 * TRUSTED**2 * np.log1p((offset / TRUSTED) ** 2).sum())
+
+
+def trust(offset: np.ndarray) -> np.ndarray:
+    """Return the weight of each component in iteratively reweighted least squares, see `far`."""
+    return 1.0 / (1.0 + (offset / TRUSTED) ** 2)
 
 
 def huber_limit(residuals: Sequence[np.ndarray]) -> float:
@@ -391,10 +500,11 @@ def projected(fit: Fit) -> list[Linear]:
     """
     found = []
     for piece, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
-        m = a.T @ a + np.eye(a.shape[1])
+        near = trust(o)
+        m = a.T @ a + np.diag(near)
         both = np.column_stack([piece.jacobian, piece.residual])
         inner = a.T @ both
-        inner[:, -1] += o
+        inner[:, -1] += near * o
         rest = both - a @ np.linalg.solve(m, inner)
         found.append(replace(piece, jacobian=rest[:, :-1], residual=rest[:, -1]))
     return found
