@@ -2,18 +2,22 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.registry import effect_class
+from concent_warp.fit import least_squares
 from concent_warp.fit.least_squares import (
     HUBER,
     Fit,
     Linear,
     Solver,
+    far,
     huber,
     huber_limit,
     huber_weight,
     projected,
     start_step,
+    trust,
 )
 from concent_warp.fit.prediction import Prediction
+from tests.fit.bouncing import SPREAD, bounced
 from tests.fit.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
 
@@ -111,11 +115,46 @@ def test_what_an_initial_state_can_take_up_is_projected_out():
 
 def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
     rng = np.random.default_rng(1)
-    a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -0.2])
+    a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -4.0])
     step = start_step(r, a, o, HUBER, 0.0)
-    stacked = np.vstack([a, np.eye(2)])
-    expected = -np.linalg.lstsq(stacked, np.concatenate([r, o]), rcond=None)[0]
+    root = np.sqrt(trust(o))
+    stacked = np.vstack([a, np.diag(root)])
+    expected = -np.linalg.lstsq(stacked, np.concatenate([r, root * o]), rcond=None)[0]
     np.testing.assert_allclose(step, expected, atol=1e-10)
+
+
+def test_the_prior_of_an_initial_state_and_its_weights_belong_together():
+    o, h = np.array([0.1, -1.0, 4.0, -30.0]), 1e-6
+    slope = [(far(o + h * e) - far(o - h * e)) / (2 * h) for e in np.eye(4)]
+    np.testing.assert_allclose(trust(o) * o, slope, rtol=1e-6)
+    assert far(np.array([0.01])) == pytest.approx(0.5 * 0.01**2, rel=1e-4)
+    assert far(np.array([100.0])) < 20.0
+
+
+def bounced_ratio() -> np.ndarray:
+    """Return residuals over those of the true initial states, falls told 3 spreads off; shape (falls,)."""
+    recording, errors = bounced(12, off=3.0, seed=1)
+    windows = windows_of(recording, length=10.0)
+    np.testing.assert_allclose(windows[0].spread, SPREAD)
+    solver = Solver(Prediction(drawing(recording), (), windows, threads=1))
+    values = np.zeros(0)
+    offsets, _ = solver.refine_starts(values, [np.zeros(4) for _ in windows])
+    found, true, told = (
+        np.array([np.sqrt(np.mean(r**2)) for r in solver.p.residuals(solver.trials(values, o))])
+        for o in (offsets, errors, [np.zeros(4) for _ in windows])
+    )
+    assert (told > 30 * true).all()
+    return found / true
+
+
+def test_initial_states_far_off_are_found_across_a_bounce():
+    assert (bounced_ratio() < 1.2).sum() >= 11
+
+
+def test_derivatives_alone_do_not_find_all_of_these(monkeypatch):
+    monkeypatch.setattr(least_squares, "DRAWS", ())
+    monkeypatch.setattr(least_squares, "RESTARTS", 0)
+    assert (bounced_ratio() < 1.2).sum() <= 9
 
 
 def test_sensitivities_are_those_of_finite_differences():
