@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -29,32 +32,32 @@ class LooseGear(Law):
         """Act on position-controlled actuators of single joints, ids of shape (n,); user data begin at `first`."""
         self.actuators = np.asarray(actuators, dtype=np.int32)
         self.first = first
-        self._joints: np.ndarray | None = None
         self._device: wp.array[Any] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
-        a, play, dt = self.actuators, float(values[0]), m.opt.timestep
+        self.bound(m, d, values)()
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        play = float(values[0])
         if play <= 0:
-            return
-        if self._joints is None:
-            self._joints = np.array([driven_joints(m, int(i))[0] for i in a])
-        dof = m.jnt_dofadr[self._joints]
-        gear, kp, bias = m.actuator_gear[a, 0], m.actuator_gainprm[a, 0], m.actuator_biasprm[a]
-        half, kv = 0.5 * play * np.abs(gear), np.maximum(-bias[:, 2], 1e-9 * kp)
-        speed = gear * d.qvel[dof]
-        command = within(d.ctrl[a], m.actuator_ctrlrange[a], m.actuator_ctrllimited[a])
-        error = command + (bias[:, 0] + bias[:, 1] * gear * d.qpos[m.jnt_qposadr[self._joints]]) / kp
-        force = kp * error + bias[:, 2] * speed
-        ahead = d.userdata[self.first + a] if d.time else np.clip(force / kp, -half, half)
-        alone = error + (ahead - error) * np.exp(-dt * kp / kv) - speed * dt
-        after = np.clip(alone, -half, half)
-        share = (alone - after) / np.where(alone == after, 1.0, alone - ahead)
-        d.userdata[self.first + a] = after
-        through = share * (kp * (error - after) + bias[:, 2] * speed)
-        limits, limited = m.actuator_forcerange[a], m.actuator_forcelimited[a]
-        change = within(through, limits, limited) - within(force, limits, limited)
-        np.add.at(d.qfrc_applied, dof, gear * change)
+            return lambda: None
+        gears = [Gear.of(m, int(a), play) for a in self.actuators]
+        ctrl, qpos, qvel, kept, applied = d.ctrl, d.qpos, d.qvel, d.userdata, d.qfrc_applied
+        first = self.first
+
+        def act() -> None:
+            begun = d.time > 0
+            for gear in gears:
+                error = min(max(ctrl[gear.actuator], gear.lowest), gear.highest) + gear.offset
+                error += gear.slope * qpos[gear.place]
+                speed = gear.gear * qvel[gear.dof]
+                slot = first + gear.actuator
+                through, kept[slot] = gear.through(error, speed, kept[slot] if begun else None)
+                applied[gear.dof] += through
+
+        return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
@@ -67,6 +70,79 @@ class LooseGear(Law):
         laws.loose_gear(m, d, self._device, self.first, values)
 
 
-def within(value: np.ndarray, limits: np.ndarray, limited: np.ndarray) -> np.ndarray:
-    """Return values, shape (n,), within limits, shape (n, 2), where they are limited, shape (n,) bool."""
-    return np.where(limited, np.minimum(np.maximum(value, limits[:, 0]), limits[:, 1]), value)
+@dataclass(frozen=True)
+class Gear:
+    """The numbers of one loose gear, see `LooseGear`; positions and forces as the actuator sees them."""
+
+    actuator: int
+    place: int
+    """Of the joint's position."""
+    dof: int
+    gear: float
+    kp: float
+    kv: float
+    lowest: float
+    """Of the command; infinite where it is not limited."""
+    highest: float
+    weakest: float
+    """Of the force."""
+    strongest: float
+    offset: float
+    """Error of the link at command and position 0, over kp."""
+    slope: float
+    """Change of that error with the joint's position."""
+    half: float
+    """Half the play."""
+    fading: float
+    """Share of the error that the rotor keeps over a free step."""
+    timestep: float
+
+    @classmethod
+    def of(cls, m: mujoco.MjModel, actuator: int, play: float) -> Gear:
+        """Return those of an actuator of a compiled model, with play [rad or m]."""
+        joint = driven_joints(m, actuator)[0]
+        gear, kp = float(m.actuator_gear[actuator, 0]), float(m.actuator_gainprm[actuator, 0])
+        constant, position, damping = (float(b) for b in m.actuator_biasprm[actuator, :3])
+        kv, dt = max(-damping, 1e-9 * kp), float(m.opt.timestep)
+        lowest, highest = limits_of(m.actuator_ctrllimited[actuator], m.actuator_ctrlrange[actuator])
+        weakest, strongest = limits_of(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator])
+        return cls(
+            actuator,
+            int(m.jnt_qposadr[joint]),
+            int(m.jnt_dofadr[joint]),
+            gear,
+            kp,
+            -damping,
+            lowest,
+            highest,
+            weakest,
+            strongest,
+            constant / kp,
+            position * gear / kp,
+            0.5 * play * abs(gear),
+            math.exp(-dt * kp / kv),
+            dt,
+        )
+
+    def through(self, error: float, speed: float, ahead: float | None) -> tuple[float, float]:
+        """Return what the play changes of the force on the joint [N m or N], and the rotor's lead after the step.
+
+        Args:
+            error: Of the link, as a position.
+            speed: Of the link.
+            ahead: The rotor's lead; None before the first step.
+        """
+        force, half = self.kp * error - self.kv * speed, self.half
+        if ahead is None:
+            ahead = min(max(force / self.kp, -half), half)
+        alone = error + (ahead - error) * self.fading - speed * self.timestep
+        after = min(max(alone, -half), half)
+        share = 0.0 if alone == after else (alone - after) / (alone - ahead)
+        pressed = share * (self.kp * (error - after) - self.kv * speed)
+        change = min(max(pressed, self.weakest), self.strongest) - min(max(force, self.weakest), self.strongest)
+        return self.gear * change, after
+
+
+def limits_of(limited: bool, bounds: np.ndarray) -> tuple[float, float]:
+    """Return the bounds, shape (2,), infinite where there are none."""
+    return (float(bounds[0]), float(bounds[1])) if limited else (-math.inf, math.inf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -41,9 +43,20 @@ class StribeckFriction(DofLaw):
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
-        middle = d.qvel[self.dof] + 0.5 * m.opt.timestep * d.qacc[self.dof]
-        ratio = middle / max(values[-1], 1e-6)
-        m.dof_frictionloss[self.dof] += np.maximum(values[:-1], 0.0) * np.exp(-ratio * ratio)
+        self.bound(m, d, values)()
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        loss, qvel, qacc, half = m.dof_frictionloss, d.qvel, d.qacc, 0.5 * m.opt.timestep
+        speed = max(float(values[-1]), 1e-6)
+        rows = [(int(i), max(float(extra), 0.0)) for i, extra in zip(self.dof, values[:-1], strict=True)]
+
+        def act() -> None:
+            for i, extra in rows:
+                ratio = (qvel[i] + half * qacc[i]) / speed
+                loss[i] += extra * math.exp(-ratio * ratio)
+
+        return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
@@ -63,8 +76,18 @@ class LoadFriction(DofLaw):
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
-        load = 0.5 * np.abs(d.qfrc_actuator[self.dof] + d.qfrc_bias[self.dof])
-        m.dof_frictionloss[self.dof] += np.maximum(values, 0.0) * load
+        self.bound(m, d, values)()
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        loss, motor, weight = m.dof_frictionloss, d.qfrc_actuator, d.qfrc_bias
+        rows = [(int(i), 0.5 * max(float(c), 0.0)) for i, c in zip(self.dof, values, strict=True)]
+
+        def act() -> None:
+            for i, share in rows:
+                loss[i] += share * abs(motor[i] + weight[i])
+
+        return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""

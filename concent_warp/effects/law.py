@@ -7,6 +7,7 @@ is still that of the step before.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
@@ -46,6 +47,10 @@ class Law:
             values: Parameters, shape (P,).
         """
         raise NotImplementedError
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """Return `apply` for the steps of one simulation; laws that are called often look up here what stays."""
+        return lambda: self.apply(m, d, values)
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """Launch the same in MuJoCo-Warp, for all worlds.

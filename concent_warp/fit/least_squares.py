@@ -37,16 +37,17 @@ PROBE_FIRST = 0.3
 """The step at first."""
 SEEN = (1.0, 3.0, 0.3)
 """Mean change of the residuals that such a step aims at, in units of noise: an impact turns a small difference into a
-large one, and is straight over a small one only. The next one is taken where one leads no further."""
-LEFT = 1.05
-"""Residual over noise down to which others than the first are taken."""
+large one, and is straight over a small one only. The next one is taken where an odd window gets no further."""
 DRAWS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
 """Spread of initial states that are drawn where derivatives lead no further, in standard deviations of the fit."""
 ROUNDS = 12
 """How often the dependence on the initial states is computed, as long as it still helps."""
-RESTARTS, ODD = 4, 1.3
-"""How often a window is begun anew from a drawn initial state if its residual is this many times that of others."""
-REFIT_ROUNDS = 4
+ODD = 1.2
+"""A window whose residual is this many times that of the others has probably not found its initial state: only for
+such ones more is tried than a few damped steps."""
+RESTARTS = 4
+"""How often such a window is begun anew from a drawn initial state."""
+REFIT_ROUNDS = 2
 """The same within a step of the parameters."""
 FALL = 3e-3
 """A window's initial state is found once a step lowers its cost by less than this share."""
@@ -62,7 +63,7 @@ class FitCfg:
     """The fit ends when a step lowers the cost by less than this share."""
     damping: float = 1e-3
     """Damping at first, relative to the curvature."""
-    refits: int = 6
+    refits: int = 3
     """How often initial states may be fitted anew where a step does not bring what it promised."""
 
 
@@ -202,13 +203,14 @@ class Solver:
     ) -> None:
         """Take the initial states of some windows to where no step helps any more; writes into what it is given."""
         unsettled, aim = list(windows), [0] * len(offsets)
+        odd = ODD * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
         for _ in range(rounds):
             looks = self.look_around(values, offsets, residuals, unsettled)
             limit = huber_limit(residuals)
             tried, rows = [], []
             for w, look in zip(unsettled, looks, strict=True):
                 there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
-                if np.mean(residuals[w] ** 2) > LEFT**2:
+                if np.mean(residuals[w] ** 2) > odd**2:
                     there += around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
                 tried.append(there)
                 rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
@@ -224,7 +226,7 @@ class Solver:
                 if costs[best] < cost:
                     offsets[w], residuals[w] = there[best], seen[best]
                 if costs[best] > (1 - FALL) * cost:
-                    aim[w] += 1 if np.mean(residuals[w] ** 2) > LEFT**2 else len(SEEN)
+                    aim[w] += 1 if np.mean(residuals[w] ** 2) > odd**2 else len(SEEN)
                 if aim[w] < len(SEEN):
                     moving.append(w)
                     change = np.sqrt(np.mean(look.columns**2, axis=0))

@@ -136,7 +136,7 @@ class MujocoEngine:
         if run.variants.qvel is not None:
             d.qvel[:] = run.variants.qvel[n]
         result = VariantResult.empty(m, run)
-        step = in_one_call if unwatched(m, run) and not laws else simulate
+        step = simulate if not unwatched(m, run) else in_one_loop if laws else in_one_call
         try:
             result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, laws)
         except mujoco.FatalError as error:
@@ -317,7 +317,7 @@ def simulate(
 
 def unwatched(m: mujoco.MjModel, run: Run) -> bool:
     """Return whether states and sensors are all that is asked for, so that MuJoCo may step on its own."""
-    plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and not m.na and not m.nmocap and not m.nuserdata
+    plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and not m.na and not m.nmocap
     return run.contacts == "none" and not len(run.body_ids) and run.steps > 0 and plain
 
 
@@ -352,6 +352,47 @@ def in_one_call(
     result.qvel[rows] = before[:, 1 + m.nq :]
     result.sensordata[rows] = sensordata[0, steps]
     return sane > run.steps
+
+
+def in_one_loop(
+    m: mujoco.MjModel,
+    d: mujoco.MjData,
+    run: Run,
+    ctrl: np.ndarray,
+    result: VariantResult,
+    laws: Sequence[tuple[Law, np.ndarray]],
+) -> bool:
+    """Do what `simulate` does where nothing but laws asks for a pause; what goes wrong is left to `simulate`."""
+    number = d.warning.number
+    start = d.qpos.copy(), d.qvel.copy(), d.userdata.copy()
+    base = [(getattr(m, name), getattr(m, name).copy()) for law, _ in laws for name in law.edits]
+    acting = [law.bound(m, d, values) for law, values in laws]
+    row_of = np.full(run.steps + 1, -1)
+    row_of[run.record] = np.arange(len(run.record))
+    rows, held = row_of.tolist(), d.ctrl
+    qpos, qvel, sensordata, applied, pushed = d.qpos, d.qvel, d.sensordata, d.qfrc_applied, d.xfrc_applied
+    for k, row in enumerate(rows):
+        if m.nu and k < run.steps:
+            held[:] = ctrl[k]
+        applied.fill(0.0)
+        pushed.fill(0.0)
+        for field, value in base:
+            field[:] = value
+        for act in acting:
+            act()
+        if row < 0:
+            mujoco.mj_step(m, d)
+            continue
+        result.qpos[row], result.qvel[row] = qpos, qvel
+        mujoco.mj_step(m, d)
+        result.sensordata[row] = sensordata
+    if number[OVERFLOW].any() or number[DIVERGED].any():
+        mujoco.mj_resetData(m, d)
+        for field, value in base:
+            field[:] = value
+        d.qpos[:], d.qvel[:], d.userdata[:] = start
+        return simulate(m, d, run, ctrl, result, laws)
+    return True
 
 
 def apply_laws(
