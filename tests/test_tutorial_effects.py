@@ -19,8 +19,6 @@ from concent_warp.cli import main
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 
-pytestmark = pytest.mark.skip(reason="to be brought in step with the diagnosis")
-
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tutorial_effects.md").read_text()
 STEP = re.compile(r"```console\n([^`]*)```\n+```text\n([^`]*)```")
@@ -89,6 +87,17 @@ def test_what_was_hidden_is_named_and_its_value_found(printed):
     assert low <= FRICTION <= high
     assert abs(added.values[0] - FRICTION) < 0.03 * FRICTION
     assert any("Missing: joint_friction" in text for text in printed.values())
+
+
+def test_the_front_page_tells_the_same_figures():
+    front = (ROOT / "README.md").read_text()
+    (found,) = re.findall(r"Missing: joint_friction \(torque\[hinge\] (.*? N m)\)", PAGE)
+    assert f"# joint friction, {found}\n" in front
+    (before,) = re.findall(r"hinge_position .*│ +([\d.]+) x │\n├.*\n│ marker_position .* 1.4 x", PAGE)
+    assert f"# the encoder sees {before} x its noise\n" in front
+    (change, after) = re.findall(r"hinge_position .* (-\d+ %) .*│ +([\d.]+) x │\n", PAGE)[0]
+    assert f"# {after} x noise: {change}\n" in front
+    assert "](docs/images/hidden_effect.png)" in front
 
 
 def test_the_recording_is_what_its_script_makes(tmp_path):
