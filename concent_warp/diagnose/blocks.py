@@ -20,8 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from concent_warp.fit.least_squares import PRIOR, Linear, huber_weight
+from concent_warp.fit.least_squares import PRIOR, Linear
 from concent_warp.fit.observation import Window
+from concent_warp.fit.robust import huber_weight
 
 FOLDS = 5
 """Parts that are held out in turn."""

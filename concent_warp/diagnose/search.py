@@ -13,20 +13,10 @@ import numpy as np
 
 from concent_warp.diagnose.blocks import Blocks, HeldOut, Sums, block_sums
 from concent_warp.effects.effect import Effect
-from concent_warp.fit.least_squares import (
-    HUBER,
-    Fit,
-    FitCfg,
-    Linear,
-    Solver,
-    huber,
-    huber_limit,
-    huber_weight,
-    projected,
-    trust,
-)
+from concent_warp.fit.least_squares import Fit, FitCfg, Linear, Solver, projected
 from concent_warp.fit.observation import Window
 from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.robust import HUBER, huber, huber_limit, huber_weight, trust
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 

@@ -10,22 +10,11 @@ import numpy as np
 from concent_warp.diagnose.blocks import block_sums, covariance, cut_blocks
 from concent_warp.diagnose.diagnosis import FittedParameter
 from concent_warp.errors import ModelError
-from concent_warp.fit.least_squares import (
-    HUBER,
-    PRIOR,
-    Fit,
-    FitCfg,
-    Linear,
-    Solver,
-    huber,
-    huber_limit,
-    projected,
-    start_cost,
-    start_step,
-)
+from concent_warp.fit.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected, start_cost, start_step
 from concent_warp.fit.observation import Window
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction, Trial
+from concent_warp.fit.robust import HUBER, huber, huber_limit
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName

@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.fit.prediction import Prediction, Trial
+from concent_warp.fit.robust import far, huber, huber_limit, huber_weight, trust
 
-HUBER = 4.0
-"""Residuals beyond this many times their spread count linearly."""
 PRIOR = 10.0
 """Weak prior of a parameter, in units of its typical scale."""
 STEP = 0.1
@@ -29,8 +28,6 @@ from value to value, so that smaller steps measure the jumps."""
 
 DAMPINGS = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
 """Dampings that are tried on initial states."""
-TRUSTED = 2.0
-"""Errors of initial states beyond this many times their spread count little more."""
 PROBE = (0.003, 1.0)
 """Bounds of the step of a finite difference of the initial state, in units of its spread."""
 PROBE_FIRST = 0.3
@@ -464,35 +461,6 @@ def around(
         for size in DRAWS
         for centre in (offset, step)
     ]
-
-
-def far(offset: np.ndarray) -> float:
-    """Return the cost of an error of an initial state in units of its spread, by Cauchy's prior: half the square while
-    it is small, and hardly more for one that is far off. A state told in the middle of an impact may be.
-    """
-    return float(0.5 * TRUSTED**2 * np.log1p((offset / TRUSTED) ** 2).sum())
-
-
-def trust(offset: np.ndarray) -> np.ndarray:
-    """Return the weight of each component in iteratively reweighted least squares, see `far`."""
-    return 1.0 / (1.0 + (offset / TRUSTED) ** 2)
-
-
-def huber_limit(residuals: Sequence[np.ndarray]) -> float:
-    """Return where Huber's loss turns linear: `HUBER` times the spread of the residuals, at least of the noise."""
-    pooled = np.concatenate(residuals)
-    return HUBER * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
-
-
-def huber(residual: np.ndarray, limit: float) -> np.ndarray:
-    """Return Huber's loss, half the square up to `limit` and a straight line beyond."""
-    size = np.abs(residual)
-    return np.where(size <= limit, 0.5 * residual**2, limit * (size - 0.5 * limit))
-
-
-def huber_weight(residual: np.ndarray, limit: float) -> np.ndarray:
-    """Return the weights of iteratively reweighted least squares."""
-    return np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
 
 
 def projected(fit: Fit) -> list[Linear]:

@@ -3,20 +3,9 @@ import pytest
 
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit import least_squares
-from concent_warp.fit.least_squares import (
-    HUBER,
-    Fit,
-    Linear,
-    Solver,
-    far,
-    huber,
-    huber_limit,
-    huber_weight,
-    projected,
-    start_step,
-    trust,
-)
+from concent_warp.fit.least_squares import Fit, Linear, Solver, projected, start_step
 from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.robust import HUBER, far, huber, huber_limit, huber_weight, trust
 from tests.fit.bouncing import SPREAD, bounced
 from tests.fit.swinging import DAMPING, NOISE, drawing, swung, windows_of
 

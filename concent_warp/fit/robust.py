@@ -1,0 +1,45 @@
+"""Losses by which single values far off do not decide a fit: Huber's of residuals, Cauchy's of initial states.
+
+Each comes with the weights of iteratively reweighted least squares (Holland and Welsch, Commun. Stat. 6, 1977): a
+weight times its argument is the slope of the loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+HUBER = 4.0
+"""Residuals beyond this many times their spread count linearly."""
+TRUSTED = 2.0
+"""Errors of initial states beyond this many times their spread count little more."""
+
+
+def far(offset: np.ndarray) -> float:
+    """Return the cost of an error of an initial state in units of its spread, by Cauchy's prior: half the square while
+    it is small, and hardly more for one that is far off. A state told in the middle of an impact may be.
+    """
+    return float(0.5 * TRUSTED**2 * np.log1p((offset / TRUSTED) ** 2).sum())
+
+
+def trust(offset: np.ndarray) -> np.ndarray:
+    """Return the weight of each component in iteratively reweighted least squares, see `far`."""
+    return 1.0 / (1.0 + (offset / TRUSTED) ** 2)
+
+
+def huber_limit(residuals: Sequence[np.ndarray]) -> float:
+    """Return where Huber's loss turns linear: `HUBER` times the spread of the residuals, at least of the noise."""
+    pooled = np.concatenate(residuals)
+    return HUBER * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
+
+
+def huber(residual: np.ndarray, limit: float) -> np.ndarray:
+    """Return Huber's loss, half the square up to `limit` and a straight line beyond."""
+    size = np.abs(residual)
+    return np.where(size <= limit, 0.5 * residual**2, limit * (size - 0.5 * limit))
+
+
+def huber_weight(residual: np.ndarray, limit: float) -> np.ndarray:
+    """Return the weights of iteratively reweighted least squares."""
+    return np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
