@@ -9,6 +9,7 @@ from concent_warp.diagnose.diagnose import DiagnosisCfg
 from concent_warp.diagnose.search import Screened
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
+from tests.diagnose.same_results import assert_same
 from tests.fit.swinging import drawing, swung
 
 CFG = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
@@ -23,23 +24,6 @@ def recording():
 def done(recording, tmp_path_factory):
     folder = tmp_path_factory.mktemp("checkpoint") / "new"
     return folder, diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
-
-
-def assert_same(found, expected):
-    """Compare results in JSON: all exactly, but numbers to 1e-9, for their last digits depend on memory."""
-    assert type(found) is type(expected)
-    if isinstance(found, dict):
-        assert found.keys() == expected.keys()
-        for key, value in found.items():
-            assert_same(value, expected[key])
-    elif isinstance(found, list):
-        assert len(found) == len(expected)
-        for one, other in zip(found, expected, strict=True):
-            assert_same(one, other)
-    elif isinstance(found, float):
-        assert found == pytest.approx(expected, rel=1e-9, nan_ok=True)
-    else:
-        assert found == expected
 
 
 def counted(monkeypatch):
