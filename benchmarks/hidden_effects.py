@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -29,6 +30,8 @@ from concent_warp.errors import ConcentError
 from concent_warp.model import Model, write_text
 
 OUT = Path("runs/hidden_effects")
+SHIFT = 700
+"""Of the seeds of the page."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,9 @@ class Args:
     """Only data sets that hide one of these."""
     names: tuple[str, ...] = ()
     """Only data sets of these names."""
-    shift: int = 0
-    """Added to every seed: other data of the same kind, for work on the method, which must not see the page's."""
+    shift: int = SHIFT
+    """Added to every seed. Another than the page's makes other data of the same kind, for work on the method, which
+    must not see the page's."""
     jobs: int = len(os.sched_getaffinity(0))
     """Data sets at a time."""
     out: Path = OUT
@@ -60,6 +64,7 @@ def main(args: Args) -> None:
     chosen = [c for c in cases() if wanted(c, args)]
     if not args.report:
         todo = [replace(c, seed=c.seed + args.shift) for c in chosen if not path(args.out, c).is_file()]
+        random.Random(0).shuffle(todo)  # so that what is done when it is stopped is a fair part of the whole
         begun = time.monotonic()
         with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
             futures = {pool.submit(study, case, args.out): case for case in todo}
@@ -68,7 +73,7 @@ def main(args: Args) -> None:
                 left = (time.monotonic() - begun) * (len(todo) - k - 1) / (k + 1)
                 print(f"{k + 1:3d}/{len(todo)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
     rows = [json.loads(path(args.out, c).read_text()) for c in chosen if path(args.out, c).is_file()]
-    if args.report or not (args.rigs or args.effects or args.names or args.shift or len(args.kinds) < 4):
+    if args.report or not (args.rigs or args.effects or args.names or args.shift != SHIFT or len(args.kinds) < 4):
         write_report(rows, len(cases()), args.host or machine_line(machine()))
 
 

@@ -121,6 +121,8 @@ class Procedure:
         base = self.baseline()
         nodes, detectable = [base], ()
         for step in range(self.cfg.additions):
+            if step and nodes[-1].ratio ** 2 < 1 + self.cfg.least_gain:
+                break  # what is left beyond the noise is less than an effect must take away
             self._done = 0.1 + 0.85 * step / self.cfg.additions
             best, smallest = self.addition(nodes[-1], step)
             detectable = detectable or smallest
@@ -312,7 +314,7 @@ EXPLAINED = 1.1
 """Residual over noise at which a candidate has left little to others."""
 DISTANT = 0.3
 """Share of the best gain below which a promise is not worth a fit any more."""
-NEAR = 0.4
+NEAR = 0.7
 """Share of the best gain from which on a candidate is worth a second fit."""
 SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
@@ -393,11 +395,11 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
 
 
 def plausibility(base: Node, c: Candidate, f: Finding) -> float:
-    """Return twice the log posterior, up to a constant: the gain, less Schwarz's cost of parameters and their prior."""
+    """Return twice the log posterior, up to a constant: the gain, less Schwarz's cost of parameters and the priors."""
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    return float(c.gain(base).sum() - len(scale) * np.log(base.blocks.count) - away @ away)
+    return float(c.gain(base).sum() - len(scale) * np.log(base.blocks.count) - away @ away - c.effect.rarity)
 
 
 def detectable_size(base: Node, s: Screened, critical: float) -> Detectable | None:

@@ -209,6 +209,7 @@ class Adhesion(SurfaceEffect):
     source = "constant pull over a short reach, in place of Dugdale's cohesive zone"
     signature = "lift-off and first slip too late; residual friction that does not go with the weight"
     confusions = ("sliding_friction", "mass")
+    rarity = 6.0
     threshold = True
     GAP = 0.001
 

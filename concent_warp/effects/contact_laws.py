@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -95,28 +96,56 @@ class Pull(Law):
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
-        if values[0] <= 0 or not d.time:
-            return
-        radius = m.geom_size[self.geom, 0] * self.round
-        place = d.geom_xpos[self.geom] + np.einsum("pij,pj->pi", d.geom_xmat[self.geom].reshape(-1, 3, 3), self.point)
-        body = m.geom_bodyid[self.geom]
-        for g in self.still:
-            axes = d.geom_xmat[g].reshape(3, 3)
-            local = (place - d.geom_xpos[g]) @ axes
-            if m.geom_type[g] == GEOM.mjGEOM_PLANE:
-                height, normal = local[:, 2], np.tile(axes[:, 2], (len(local), 1))
-                over = np.ones(len(local), dtype=bool)
-            else:
-                beyond = np.abs(local) - m.geom_size[g]
-                face = beyond.argmax(axis=1)
-                row = np.arange(len(local))
-                height, normal = beyond[row, face], np.sign(local[row, face])[:, None] * axes.T[face]
-                over = (beyond > 0).sum(axis=1) <= 1
-            for i in np.flatnonzero(over & (height - radius < self.gap)):
-                force = -values[0] * normal[i]
-                arm = place[i] - radius[i] * normal[i] - d.xipos[body[i]]
-                d.xfrc_applied[body[i], :3] += force
-                d.xfrc_applied[body[i], 3:] += np.cross(arm, force)
+        self.bound(m, d, values)()
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        strength = float(values[0])
+        if strength <= 0:
+            return lambda: None
+        parts = []
+        for g in np.unique(self.geom):
+            mine = self.geom == g
+            radius = float(m.geom_size[g, 0]) if self.round[mine][0] else 0.0
+            points = self.point[mine].astype(float)
+            reach = float(np.linalg.norm(points, axis=1).max()) + radius + self.gap
+            body = m.geom_bodyid[g]
+            pose = d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3)
+            parts.append((*pose, points, radius, reach, d.xipos[body], d.xfrc_applied[body]))
+        still = [
+            (d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3), None if m.geom_type[g] == GEOM.mjGEOM_PLANE else half)
+            for g, half in ((int(g), m.geom_size[g].copy()) for g in self.still)
+        ]
+
+        def act() -> None:
+            if not d.time:
+                return
+            for centre, turn, points, radius, reach, middle, applied in parts:
+                for origin, axes, half in still:
+                    away = (centre - origin) @ axes
+                    if half is None:
+                        if away[2] > reach:
+                            continue
+                        local = points @ (turn.T @ axes) + away
+                        height, normal = local[:, 2], axes[:, 2]
+                        near = np.flatnonzero(height - radius < self.gap)
+                        normals = [normal] * len(near)
+                    else:
+                        if (np.abs(away) > half + reach).any():
+                            continue
+                        local = points @ (turn.T @ axes) + away
+                        beyond = np.abs(local) - half
+                        face = beyond.argmax(axis=1)
+                        row = np.arange(len(local))
+                        over = (beyond > 0).sum(axis=1) <= 1
+                        near = np.flatnonzero(over & (beyond[row, face] - radius < self.gap))
+                        normals = [np.sign(local[i, face[i]]) * axes[:, face[i]] for i in near]
+                    for i, normal in zip(near, normals, strict=True):
+                        x, y, z = centre + turn @ points[i] - radius * normal - middle
+                        fx, fy, fz = -strength * normal
+                        applied += (fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
+
+        return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""

@@ -32,6 +32,7 @@ class TimeBase(MeasurementEffect):
     summary = "The instrument's clock shows t (1 + scale) at time t."
     signature = "all motion faster or slower by the same share; free fall with another g"
     confusions = ("latency", "length_scale", "air_drag", "gravity_tilt")
+    rarity = 4.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One scale."""

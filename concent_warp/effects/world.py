@@ -120,6 +120,7 @@ class Wind(AirEffect):
     source = AirDrag.source
     signature = "a residual force along one direction on light bodies in flight"
     confusions = ("gravity_tilt", "air_drag")
+    rarity = 6.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Velocity of the wind along each axis of the world."""

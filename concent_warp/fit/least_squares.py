@@ -42,8 +42,12 @@ ROUNDS = 12
 ODD = 1.2
 """A window whose residual is this many times that of the others has probably not found its initial state: only for
 such ones more is tried than a few damped steps."""
+NOISE = 1.05
+"""Residual over noise at which an initial state leaves nothing to be wished for."""
 RESTARTS = 4
 """How often such a window is begun anew from a drawn initial state."""
+LEAPS, LEAP, WORTH = 4, (1.0, 3.0), 5e-3
+"""How often parameters are led on at most, over how many of their steps, and for what gain."""
 REFIT_ROUNDS = 2
 """The same within a step of the parameters."""
 FALL = 3e-3
@@ -169,12 +173,19 @@ class Solver:
         Returns:
             The errors of the initial states, and how the residuals depend on them at the last round, see `Fit.starts`.
         """
+        found, starts, _ = self._refined(values, offsets, range(len(offsets)), rounds)
+        return found, tuple(starts[w] for w in range(len(offsets)))
+
+    def _refined(
+        self, values: np.ndarray, offsets: Sequence[np.ndarray], windows: Sequence[int], rounds: int
+    ) -> tuple[list[np.ndarray], dict[int, np.ndarray], list[np.ndarray]]:
+        """Fit the initial states of some windows; returns all states, the dependence of those, and all residuals."""
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
-        self._settle(values, offsets, residuals, starts, range(len(offsets)), rounds, rng)
+        self._settle(values, offsets, residuals, starts, windows, rounds, rng)
         for _ in range(RESTARTS if rounds == ROUNDS else 0):
             size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
-            odd = np.flatnonzero(size > ODD * max(1.0, float(np.median(size)))).tolist()
+            odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))]
             if not odd:
                 break
             begin, found = list(offsets), dict(starts)
@@ -186,7 +197,7 @@ class Solver:
             for w in odd:
                 if start_cost(there[w], begin[w], limit) < start_cost(residuals[w], offsets[w], limit):
                     offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
-        return offsets, tuple(starts[w] for w in range(len(offsets)))
+        return offsets, starts, residuals
 
     def _settle(
         self,
@@ -235,10 +246,25 @@ class Solver:
     def polish(self, fit: Fit) -> Fit:
         """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
 
-        Initial states that have made up for a wrong parameter do not always find back on their own.
+        Initial states that have made up for a wrong parameter do not always find back on their own, and hold it there:
+        so the parameters are then led on by steps after each of which the initial states are fitted anew.
         """
-        fresh = self.better_starts(fit, [[np.zeros_like(o) for o in fit.offsets]])
-        return self.fit(fresh.values, fresh.offsets, fresh.starts)
+        measured = [np.zeros_like(o) for o in fit.offsets]
+        fresh = self.better_starts(fit, [measured])
+        best = self.fit(fresh.values, fresh.offsets, fresh.starts)
+        for _ in range(LEAPS if len(fit.values) else 0):
+            if np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2) < NOISE**2:
+                break
+            move, _ = self.solve(best.linear, best.starts, best.offsets, best.values, self.cfg.damping)
+            found = best
+            for size in LEAP:
+                values = self.inside(best.values + size * move * self.scale)
+                there = self.better_starts(replace(best, values=values), [measured])
+                found = min(found, there, key=lambda f: f.cost)
+            if found.cost > (1 - WORTH) * best.cost:
+                break
+            best = found
+        return best
 
     def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]]) -> Fit:
         """Return a fit at the same parameters with the best initial state of each window that is found.
@@ -247,19 +273,20 @@ class Solver:
             fit: The fit.
             others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
         """
-        found = [self.refine_starts(fit.values, fit.offsets, rounds=1)]
-        found += [self.refine_starts(fit.values, offsets) for offsets in others]
-        residuals = [self.p.residuals(self.trials(fit.values, offsets)) for offsets, _ in found]
-        limit = huber_limit(residuals[0])
-        offsets, starts = [], []
-        for w in range(len(self.p.windows)):
-            costs = [start_cost(r[w], o[w], limit) for r, (o, _) in zip(residuals, found, strict=True)]
-            best = int(np.argmin(costs))
-            offsets.append(found[best][0][w])
-            starts.append(found[best][1][w])
+        everywhere = range(len(self.p.windows))
+        offsets, starts, residuals = self._refined(fit.values, fit.offsets, everywhere, 1)
+        limit = huber_limit(residuals)
+        unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > NOISE**2]
+        for begin in others if unsettled else ():
+            there, found, left = self._refined(fit.values, begin, unsettled, ROUNDS)
+            for w in unsettled:
+                if start_cost(left[w], there[w], limit) < start_cost(residuals[w], offsets[w], limit):
+                    offsets[w], starts[w], residuals[w] = there[w], found[w], left[w]
         linear = self.linearise(fit.values, offsets)
         cost = self.cost([piece.residual for piece in linear], offsets, fit.values)
-        return replace(fit, offsets=tuple(offsets), starts=tuple(starts), linear=linear, cost=cost)
+        return replace(
+            fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in everywhere), linear=linear, cost=cost
+        )
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
         """Return one trial a window."""
