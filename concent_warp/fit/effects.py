@@ -23,6 +23,8 @@ UNKNOWN = 0.5
 """A parameter whose standard deviation is this share of its weak prior's was not measured."""
 ALIKE = 0.98
 """Correlation of two parameters from which on the data say little of each by itself."""
+AT_NOISE = 1.05
+"""Residual over noise below which there is nothing to be explained, and chance decides which of two is smaller."""
 NORMAL = 1.96
 """Standard deviations of a 95 % interval."""
 
@@ -111,7 +113,7 @@ def fit_effects(
     parameters, correlation = fitted_parameters(solver, fit, pieces, windows)
     remarks = doubts(solver, fit, parameters, correlation)
     before, after = noise_ratio(given), noise_ratio(found)
-    if after > before:
+    if after > max(before, AT_NOISE):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     return FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),

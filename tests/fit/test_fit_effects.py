@@ -45,6 +45,15 @@ def test_the_fall_of_the_error_is_told_by_channel(recording):
     assert (channel.channel, channel.before, channel.after) == ("angle", fitted.before, fitted.after)
 
 
+def test_a_fit_that_begins_at_the_noise_is_not_said_to_have_failed(recording):
+    model = model_with(recording, "joint_damping")
+    for _ in range(3):
+        fitted = fit_effects(model, recording)
+        assert fitted.after < 1.05
+        assert fitted.remarks == ()
+        model = fitted.model
+
+
 def test_intervals_cover_the_truth_about_as_often_as_they_say():
     covered = []
     for seed in range(12):
