@@ -107,7 +107,7 @@ def geometry_data(
     data: dict[str, Any] = {
         "bodies": sorted(last.bodies, key=lambda name: -int((state[last.of(name)] == "moved").sum())),
         "state": state.tolist(),
-        "facts": {body: facts(last, body, moved, state) for body in last.bodies},
+        "facts": {body: facts(last, body, moved, touched, gripped) for body in last.bodies},
     }
     for name, geometry in ((names[0], first), (names[-1], last)):
         data[name] = {
@@ -131,15 +131,15 @@ def touched_spheres(events: Mapping[str, ContactEventSequence], count: int) -> t
     return touched, gripped
 
 
-def facts(geometry: ContactGeometry, body: str, moved: np.ndarray, state: np.ndarray) -> str:
+def facts(geometry: ContactGeometry, body: str, moved: np.ndarray, touched: np.ndarray, gripped: np.ndarray) -> str:
     """Return a line on the spheres of a body."""
     rows = geometry.of(body)
-    counts = {kind: int((state[rows] == kind).sum()) for kind in ("moved", "gripped", "touched")}
-    text = f"{len(rows)} spheres; {counts['moved']} moved"
-    if counts["moved"]:
-        far = moved[rows][state[rows] == "moved"] * 1e3
+    far = moved[rows][moved[rows] > MOVED] * 1e3
+    text = f"{len(rows)} spheres; {len(far)} moved"
+    if len(far):
         text += f" by {far.mean():.1f} mm on average, {far.max():.1f} mm at most"
-    return f"{text}; {counts['gripped']} touched by the robot, {counts['touched']} touched by other things."
+    by_robot = gripped[rows].sum()
+    return f"{text}; {by_robot} touched by the robot, {(touched & ~gripped)[rows].sum()} by other things alone."
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:

@@ -51,11 +51,10 @@ def place_list(comparison: Comparison, shown: Collection[str]) -> str:
 
 
 def noise_words(comparison: Comparison) -> str:
-    """Return where the noise floors are from, in one sentence for each way."""
+    """Return where the noise floors are from; the way of most channels comes first, without their names."""
     found: dict[str, list[str]] = {}
     for channel in comparison.channels:
         source = comparison.summarise(comparison.after, channel).source
         found.setdefault(WORDS[source], []).append(words(channel))
-    if len(found) == 1:
-        return f"Noise: {next(iter(found))}."
-    return " ".join(f"Noise of {', '.join(channels)}: {how}." for how, channels in found.items())
+    (most, _), *others = sorted(found.items(), key=lambda item: -len(item[1]))
+    return "; ".join([f"Noise: {most}", *(f"of {', '.join(channels)}: {how}" for how, channels in others)]) + "."

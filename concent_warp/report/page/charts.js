@@ -87,13 +87,14 @@ class LineChart {
     for (const v of Chart.ticks(x.low, x.high, (right - left) / 80)) out += `<text class="tick" x="${x(v)}" y="${bottom + 17}" text-anchor="middle">${Chart.tick(v)}</text>`;
     out += `<text class="axis" x="${right}" y="${height - 5}" text-anchor="end">${Chart.escape(s.xlabel)}</text>`;
     if (s.noise && s.noise >= low && s.noise <= high) {
-      out += `<rect class="floor" x="${left}" width="${right - left}" y="${y(s.noise)}" height="${Math.max(bottom - y(s.noise), 0)}"/><line class="noise" x1="${left}" x2="${right}" y1="${y(s.noise)}" y2="${y(s.noise)}"/><text class="noise-name" x="${left + 5}" y="${y(s.noise) - 4}">noise floor</text>`;
+      out += `<rect class="floor" x="${left}" width="${right - left}" y="${y(s.noise)}" height="${Math.max(bottom - y(s.noise), 0)}"/><line class="noise" x1="${left}" x2="${right}" y1="${y(s.noise)}" y2="${y(s.noise)}"/>`;
     }
     for (const p of s.places || []) {
       const a = x(Math.max(p.start, x.low)), b = x(Math.min(p.end, x.high));
       out += `<rect class="place" x="${a}" y="${top}" width="${Math.max(b - a, 3)}" height="${bottom - top}"/>`;
     }
     for (const line of s.series) out += `<path class="line ${line.kind}" d="${this.path(line, low)}"/>`;
+    if (s.noise && s.noise >= low && s.noise <= high) out += `<text class="noise-name" x="${left + 5}" y="${y(s.noise) - 4}">noise floor</text>`;
     for (const p of s.places || []) out += badge((x(Math.max(p.start, x.low)) + x(Math.min(p.end, x.high))) / 2, top + 11, p.number);
     out += `<line class="axis-line" x1="${left}" x2="${right}" y1="${bottom}" y2="${bottom}"/><g class="cursor"></g>`;
     this.host.innerHTML = `<svg width="${width}" height="${height}" role="img" aria-label="${Chart.escape(s.label || "")}">${out}</svg><div class="tip" hidden></div>`;
