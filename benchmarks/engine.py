@@ -1,6 +1,7 @@
 """Steps per second of `WarpEngine.run` beside those of bare MuJoCo-Warp on the same model.
 
-    python benchmarks/engine.py --device cuda:0 --worlds 256 1024 4096 --output engine.json
+    python benchmarks/engine.py --device cuda:0 --output docs/benchmarks/data/engine_h200.json
+    python benchmarks/engine.py --table        # the page from the stored results
 
 The work is that of one generation of the evolution strategy: a demonstration of the shape sorter, replayed by many
 worlds whose spheres differ. *bare* is `mujoco_warp.step` captured in a graph and launched once a step, with the
@@ -17,14 +18,17 @@ import json
 import os
 import platform
 import time
+from datetime import date
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from pages import FOLDER, table, write_page
 
-from concent_warp.model import Model
+from concent_warp.model import Model, write_text
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
@@ -134,6 +138,51 @@ def measure(work: Work, device: str, worlds: int, repeats: int) -> dict[str, flo
     }
 
 
+def section(result: dict[str, Any]) -> str:
+    """Return what was measured on one device."""
+    rows = [
+        [
+            f"{r['worlds']:,}",
+            f"{r['bare_steps_per_second']:,.0f}",
+            f"{r['engine_steps_per_second']:,.0f}",
+            f"{r['engine_share_of_bare']:.1%}",
+            f"{r['engine_with_touched_share_of_bare']:.1%}",
+            f"{r['first_run_seconds']:.1f}",
+        ]
+        for r in result["warp"]
+    ]
+    head = [
+        "worlds",
+        "bare, steps/s",
+        "engine, steps/s",
+        "engine / bare",
+        "with contacts by sphere / bare",
+        "first run, s",
+    ]
+    versions = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
+    steps, limited = result["warp"][0]["steps"], sum(r["solver_limited_worlds"] for r in result["warp"])
+    text = f"""## {result["device"]}
+
+Measured {result["date"]} with {versions}. {result["spheres"]} spheres, {steps:,} steps a run, the fastest run counts.
+Worlds in which the solver was cut short: {limited}.
+
+{table(head, rows)}"""
+    if mujoco_rate := result.get("mujoco_steps_per_second"):
+        best = max(r["engine_steps_per_second"] for r in result["warp"])
+        text += f"""
+C MuJoCo on the {result["cpus"]} CPU cores of the same machine: {mujoco_rate:,.0f} steps/s. The engine at its best makes
+{best / mujoco_rate:.1f} times as many.
+"""
+    return text
+
+
+def page() -> str:
+    """Return the page of all stored results."""
+    results = [json.loads(path.read_text()) for path in sorted((FOLDER / "data").glob("engine_*.json"))]
+    about = (__doc__ or "").split("\n\n", 2)[2].strip()
+    return "\n\n".join(["# Engine", "Written by `benchmarks/engine.py`; do not edit.", about, *map(section, results)])
+
+
 def main() -> None:
     """Measure and report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -144,7 +193,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="runs of which the fastest counts")
     parser.add_argument("--mujoco-worlds", type=int, default=8, help="variants for C MuJoCo; 0 leaves it out")
     parser.add_argument("--output", type=Path, help="JSON file to write")
+    parser.add_argument("--table", action="store_true", help="write the page from the stored results, without runs")
     args = parser.parse_args()
+    if args.table:
+        write_page("engine", page())
+        return
 
     work = Work(args.spheres, args.duration)
     rows = []
@@ -156,7 +209,9 @@ def main() -> None:
         "processor": platform.processor() or platform.machine(),
         "cpus": len(os.sched_getaffinity(0)),
         "versions": {"mujoco": mujoco.__version__, "mujoco_warp": mjw.__version__, "warp": wp.__version__},
+        "date": date.today().isoformat(),
         "spheres": args.spheres,
+        "repeats": args.repeats,
         "warp": rows,
     }
     if args.mujoco_worlds:
@@ -165,9 +220,7 @@ def main() -> None:
         result["mujoco_steps_per_second"] = args.mujoco_worlds * work.steps / seconds
         print(json.dumps({"mujoco_steps_per_second": result["mujoco_steps_per_second"]}))
     if args.output is not None:
-        partial = args.output.with_name(f".{args.output.name}.partial")
-        partial.write_text(json.dumps(result, indent=2) + "\n")
-        partial.replace(args.output)
+        write_text(args.output, json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":
