@@ -26,7 +26,7 @@ class ConcentError(ValueError):
             sentence += f", found {found}" if expected is not None else f"; found {found}"
         if fix is not None:
             sentence += f"; {fix}"
-        super().__init__(sentence if sentence.endswith(".") else sentence + ".")
+        super().__init__(sentence if sentence.endswith((".", "?")) else sentence + ".")
 
 
 class RecordingError(ConcentError):

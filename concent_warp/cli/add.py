@@ -12,6 +12,7 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
+from concent_warp.cli.given_model import check_fits
 from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.effects.registry import effect_class, effects
@@ -74,6 +75,7 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
         from concent_warp.recording.load import load_recording
 
         recording = load_recording(arguments.fit).only(arguments.demonstrations)
+        check_fits(model, recording, arguments.model)
         with work_progress("fitting") as progress:
             fitted = fit_effects(added, recording, progress, window=arguments.window, engine=arguments.engine)
         added = fitted.model

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 from rich.markup import escape
 
+from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.summary import say_diverged
 from concent_warp.cli.terminal import say, say_written
@@ -20,9 +21,7 @@ from concent_warp.diagnose.phases import tell_a_task
 from concent_warp.diagnose.places import LEAST, alike
 from concent_warp.errors import EventsError
 from concent_warp.ground import extract_all
-from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
-from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import EngineName
 
 
@@ -61,9 +60,8 @@ class Arguments:
 def run(arguments: Arguments) -> Comparison:
     """Compare, and print or write what was asked for."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
-    models = {} if arguments.baseline is None else {"baseline": Model.load(arguments.baseline)}
-    own = Scene(recording.scene, source=recording.source)
-    models["model"] = Model(own) if arguments.model is None else Model.load(arguments.model)
+    models = {} if arguments.baseline is None else {"baseline": given_model(arguments.baseline, recording)}
+    models["model"] = given_model(arguments.model, recording)
     if arguments.html is not None:
         claim_file(arguments.html, overwrite=arguments.overwrite)
     events = {}
@@ -101,9 +99,9 @@ def say_noise(comparison: Comparison) -> None:
     found: dict[str, list[str]] = {}
     for channel in comparison.channels:
         found.setdefault(WORDS[comparison.summarise(comparison.after, channel).source], []).append(channel)
-    for words, channels in found.items():
-        of = f" of {', '.join(channels)}" if len(found) > 1 else ""
-        say(escape(f"noise{of}: {words}"))
+    (most, _), *others = sorted(found.items(), key=lambda item: -len(item[1]))
+    lines = [f"noise: {most}", *(f"noise of {', '.join(channels)}: {words}" for words, channels in others)]
+    say(escape("\n".join(lines)))
 
 
 def say_places(comparison: Comparison, most: int) -> None:

@@ -11,6 +11,7 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
+from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnose.candidates import candidates
@@ -23,7 +24,6 @@ from concent_warp.fit.effects import fit_effects
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
-from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import EngineName
 
 MOST_PLACES = 3
@@ -69,8 +69,7 @@ class Arguments:
 def run(arguments: Arguments) -> Diagnosis:
     """Diagnose, and print or write what was asked for."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
-    own = Scene(recording.scene, source=recording.source)
-    model = Model(own) if arguments.model is None else Model.load(arguments.model)
+    model = given_model(arguments.model, recording)
     check_numbers(arguments)
     check_effects(model, recording, arguments.effects)
     for path in (arguments.html, arguments.apply):

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.fit.geometry import FitCfg
@@ -67,7 +68,7 @@ def run(arguments: Arguments) -> Grounded:
 def starting_model(arguments: Arguments, recording: Recording) -> Model:
     """Return the model to start from."""
     if arguments.model is not None:
-        return Model.load(arguments.model)
+        return given_model(arguments.model, recording.only(arguments.demonstrations))
     scene = Scene(recording.scene, str(arguments.recording))
     if arguments.scene is not None:
         scene = Scene.from_mjcf(arguments.scene)

@@ -9,15 +9,14 @@ from pathlib import Path
 import tyro
 from rich.markup import escape
 
+from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnose.locate import locate
 from concent_warp.diagnose.location import Location
 from concent_warp.diagnose.shooting import WindowCfg
 from concent_warp.errors import RecordingError
-from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
-from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import EngineName
 
 
@@ -51,8 +50,7 @@ def run(arguments: Arguments) -> Location:
     if arguments.window is not None and not arguments.window > 0:
         raise RecordingError("a window must have a length", expected="--window above 0 s", found=arguments.window)
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
-    own = Scene(recording.scene, source=recording.source)
-    model = Model(own) if arguments.model is None else Model.load(arguments.model)
+    model = given_model(arguments.model, recording)
     for path in (arguments.html, arguments.png):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import tyro
 
+from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.rollout_file import save_rollout
@@ -37,7 +37,7 @@ class Arguments:
 def run(arguments: Arguments) -> list[Path]:
     """Replay and write a file for each demonstration."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
-    model = Model.load(arguments.model)
+    model = given_model(arguments.model, recording)
     out = arguments.out
     paths = {
         d.name: out if len(recording.demonstrations) == 1 else out.with_name(f"{out.stem}_{d.name}{out.suffix}")

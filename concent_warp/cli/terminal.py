@@ -61,7 +61,7 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
         def plain(share: float, text: str, left: float | None) -> None:
             nonlocal last
             spent = time.monotonic() - begun
-            if spent - last >= PLAIN_PERIOD:
+            if share > 0 and spent - last >= PLAIN_PERIOD:
                 last = spent
                 out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{time_left(share, spent, left)}")
 

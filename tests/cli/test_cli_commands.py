@@ -107,3 +107,42 @@ def test_files_are_not_overwritten_unasked(command, bench, tmp_path, capsys):
     assert main(arguments) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["compare", "--model"],
+        ["compare", "--baseline"],
+        ["events", "--model"],
+        ["replay", "--model"],
+        ["fit", "--model"],
+        ["diagnose", "--model"],
+        ["locate", "--model"],
+        ["add", "joint_friction", "--out", "more.toml", "--fit"],
+    ],
+    ids=" ".join,
+)
+def test_a_model_of_another_robot_is_called_that(bench, tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    other = tmp_path / "other.xml"
+    other.write_text(
+        "<mujoco><worldbody><body><joint name='hinge'/><geom size='.1'/></body></worldbody>"
+        "<actuator><motor name='motor' joint='hinge'/></actuator></mujoco>"
+    )
+    recording = str(bench / "demo.h5")
+    given = [*command, recording, "--model", str(other)] if command[0] == "add" else [command[0], recording, command[1]]
+    assert main(given if command[0] == "add" else [*given, str(other)]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "of another robot or scene" in error
+    assert "expected actuators ['drive'], found ['motor']" in error
+    assert [p.name for p in tmp_path.iterdir()] == ["other.xml"]
+
+
+def test_a_model_with_more_bodies_than_were_recorded_is_refused(bench, tmp_path, capsys):
+    model = Model.load(bench / "inset.toml")
+    more = tmp_path / "more.xml"
+    text = model.scene.xml.replace("</worldbody>", "<body><freejoint/><geom size='.1'/></body></worldbody>")
+    more.write_text(text)
+    assert main(["compare", str(bench / "demo.h5"), "--model", str(more)]) == 2
+    assert "8 positions in the state, found 15" in " ".join(capsys.readouterr().err.split())
