@@ -5,7 +5,8 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, is_dataclass
@@ -21,6 +22,8 @@ SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""
 CHECKPOINT = "checkpoint.npz"
 """File of the state of a fit."""
+FREE = ("out", "resume", "overwrite", "engine", "recording", "model", "scene")
+"""Settings that an interrupted run need not repeat to the letter: paths, and what does not decide the result."""
 INVOCATION: ContextVar[tuple[str, ...]] = ContextVar("INVOCATION", default=())
 """The command that is running and its arguments."""
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
@@ -87,12 +90,44 @@ def make_folder(folder: Path) -> None:
 
 
 def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
-    """Write the resolved settings, the command and the versions to the run folder, and return them."""
+    """Write the resolved settings, the command and the versions to the run folder, and return them.
+
+    Raises:
+        ConcentError: A run to go on with was begun with other settings; nothing in the folder has been touched then.
+    """
     import tomli_w
 
     document = {"command": command_line(), "versions": versions(), "settings": plain(settings)}
+    if (folder / CHECKPOINT).exists():
+        check_unchanged(folder / SETTINGS, document["settings"])
     write_text(folder / SETTINGS, tomli_w.dumps(document))
     return document
+
+
+def check_unchanged(path: Path, settings: Mapping[str, Any]) -> None:
+    """Refuse settings that differ from those in a settings file in what decides the result."""
+    try:
+        stored = tomllib.loads(path.read_text())
+    except (OSError, ValueError):
+        return
+    before, now = flat(stored.get("settings", {})), flat(settings)
+    differing = [n for n in sorted(before | now) if n.split(".")[0] not in FREE and before.get(n) != now.get(n)]
+    if differing:
+        raise ConcentError(
+            "this run was begun with other settings",
+            where=path.parent,
+            expected=", ".join(f"{name} {before.get(name)}" for name in differing),
+            found=", ".join(f"{name} {now.get(name)}" for name in differing),
+            fix=f"go on with `{resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
+        )
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
 
 
 def command_line() -> str:
@@ -102,8 +137,12 @@ def command_line() -> str:
 
 def resuming_command() -> str:
     """Return the command that goes on with the run that is running."""
-    kept = [argument for argument in INVOCATION.get() if argument not in ("--overwrite", "--resume")]
-    return shlex.join(["concent", *kept, "--resume"])
+    return resuming(["concent", *INVOCATION.get()])
+
+
+def resuming(command: Sequence[str]) -> str:
+    """Return a command so changed that it goes on with what it began."""
+    return shlex.join([*(part for part in command if part not in ("--overwrite", "--resume")), "--resume"])
 
 
 def versions() -> dict[str, str]:

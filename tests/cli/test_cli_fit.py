@@ -67,6 +67,16 @@ def test_a_folder_with_other_things_is_left_alone_even_with_overwrite(bench, tmp
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_a_run_is_not_resumed_with_other_settings_and_stays_as_it_is(bench, run, capsys):
+    before = {path.name: path.stat().st_mtime_ns for path in run.iterdir()}
+    assert fit(bench, run, "--resume", "--fit.generations", "4", "--fit.seed", "1") == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "expected fit.generations 3, fit.seed 0, found fit.generations 4, fit.seed 1" in error
+    assert "--fit.generations 3" in error
+    assert {path.name: path.stat().st_mtime_ns for path in run.iterdir()} == before
+    assert fit(bench, run, "--resume", "--engine", "mujoco") == 0
+
+
 def test_a_run_killed_while_it_wrote_its_settings_can_go_on(tmp_path):
     (tmp_path / ".settings.toml.partial").write_text("comm")
     claim_folder(tmp_path, overwrite=False, resume=True)
