@@ -10,7 +10,8 @@ import numpy as np
 from concent_warp.diagnose.blocks import block_sums, covariance, cut_blocks
 from concent_warp.diagnose.diagnosis import FittedParameter
 from concent_warp.errors import ModelError
-from concent_warp.fit.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected, start_cost, start_step
+from concent_warp.fit.initial_states import start_cost, start_step
+from concent_warp.fit.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected
 from concent_warp.fit.observation import Window
 from concent_warp.fit.observe import observe
 from concent_warp.fit.prediction import Prediction, Trial

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from concent_warp.fit.initial_states import ROUNDS, StartSearch, start_cost
 from concent_warp.fit.prediction import Prediction, Trial
 from concent_warp.fit.robust import far, huber, huber_limit, huber_weight, trust
 
@@ -26,32 +27,12 @@ WANTED = 3.0
 from value to value, so that smaller steps measure the jumps."""
 
 
-DAMPINGS = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
-"""Dampings that are tried on initial states."""
-PROBE = (0.003, 1.0)
-"""Bounds of the step of a finite difference of the initial state, in units of its spread."""
-PROBE_FIRST = 0.3
-"""The step at first."""
-SEEN = (1.0, 3.0, 0.3)
-"""Mean change of the residuals that such a step aims at, in units of noise: an impact turns a small difference into a
-large one, and is straight over a small one only. The next one is taken where an odd window gets no further."""
-DRAWS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
-"""Spread of initial states that are drawn where derivatives lead no further, in standard deviations of the fit."""
-ROUNDS = 12
-"""How often the dependence on the initial states is computed, as long as it still helps."""
-ODD = 1.2
-"""A window whose residual is this many times that of the others has probably not found its initial state: only for
-such ones more is tried than a few damped steps."""
 NOISE = 1.05
 """Residual over noise at which an initial state leaves nothing to be wished for."""
-RESTARTS = 4
-"""How often such a window is begun anew from a drawn initial state."""
 LEAPS, LEAP, WORTH = 4, (1.0, 3.0), 5e-3
 """How often parameters are led on at most, over how many of their steps, and for what gain."""
 REFIT_ROUNDS = 2
 """The same within a step of the parameters."""
-FALL = 3e-3
-"""A window's initial state is found once a step lowers its cost by less than this share."""
 
 
 @dataclass(frozen=True)
@@ -109,18 +90,6 @@ class _State:
     """How often initial states may still be fitted anew."""
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What small changes of one window's initial state do."""
-
-    columns: np.ndarray
-    """dr / d(offset / spread), shape (n, 2 nv)."""
-    offsets: np.ndarray
-    """The states tried, one a row, shape (2 nv, 2 nv)."""
-    residuals: list[np.ndarray]
-    """Their residuals, each (n,)."""
-
-
 class Solver:
     """Fits the parameters of one prediction."""
 
@@ -132,33 +101,7 @@ class Solver:
         self.low = np.array([q.low for q in prediction.parameters])
         self.high = np.array([q.high for q in prediction.parameters])
         self.step = np.full(len(self.scale), STEP)
-        self.probe = [np.full(len(w.spread), PROBE_FIRST) for w in prediction.windows]
-
-    def look_around(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
-    ) -> list[_Look]:
-        """Move each component of the initial state of some windows a little, and see what that does.
-
-        Args:
-            values: Parameters, shape (P,).
-            offsets: Errors of the initial states of all windows, in units of their spread.
-            residuals: Residuals of all windows there.
-            windows: Which ones to look at.
-        """
-        trials, moved = [], []
-        for w in windows:
-            moved.append(offsets[w] + np.diag(self.probe[w]))
-            trials += [Trial(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
-        found, at = self.p.residuals(trials), 0
-        looks = []
-        for w, offset in zip(windows, moved, strict=True):
-            seen = found[at : at + len(offset)]
-            at += len(offset)
-            columns = np.stack([(r - residuals[w]) / h for r, h in zip(seen, self.probe[w], strict=True)], axis=1)
-            wild = np.abs(columns).max(axis=0) * self.probe[w] > 0.5 * np.abs(residuals[w]).max() + 1e2
-            columns[:, wild] = 0.0
-            looks.append(_Look(columns, offset, seen))
-        return looks
+        self.search = StartSearch(prediction)
 
     def refine_starts(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], rounds: int = ROUNDS
@@ -173,75 +116,8 @@ class Solver:
         Returns:
             The errors of the initial states, and how the residuals depend on them at the last round, see `Fit.starts`.
         """
-        found, starts, _ = self._refined(values, offsets, range(len(offsets)), rounds)
+        found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), rounds)
         return found, tuple(starts[w] for w in range(len(offsets)))
-
-    def _refined(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray], windows: Sequence[int], rounds: int
-    ) -> tuple[list[np.ndarray], dict[int, np.ndarray], list[np.ndarray]]:
-        """Fit the initial states of some windows; returns all states, the dependence of those, and all residuals."""
-        offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
-        residuals = self.p.residuals(self.trials(values, offsets))
-        self._settle(values, offsets, residuals, starts, windows, rounds, rng)
-        for _ in range(RESTARTS if rounds == ROUNDS else 0):
-            size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
-            odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))]
-            if not odd:
-                break
-            begin, found = list(offsets), dict(starts)
-            for w in odd:
-                begin[w] = rng.normal(size=len(offsets[w]))
-            there = self.p.residuals(self.trials(values, begin))
-            self._settle(values, begin, there, found, odd, rounds, rng)
-            limit = huber_limit(residuals)
-            for w in odd:
-                if start_cost(there[w], begin[w], limit) < start_cost(residuals[w], offsets[w], limit):
-                    offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
-        return offsets, starts, residuals
-
-    def _settle(
-        self,
-        values: np.ndarray,
-        offsets: list[np.ndarray],
-        residuals: list[np.ndarray],
-        starts: dict[int, np.ndarray],
-        windows: Sequence[int],
-        rounds: int,
-        rng: np.random.Generator,
-    ) -> None:
-        """Take the initial states of some windows to where no step helps any more; writes into what it is given."""
-        unsettled, aim = list(windows), [0] * len(offsets)
-        odd = ODD * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
-        for _ in range(rounds):
-            looks = self.look_around(values, offsets, residuals, unsettled)
-            limit = huber_limit(residuals)
-            tried, rows = [], []
-            for w, look in zip(unsettled, looks, strict=True):
-                there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
-                if np.mean(residuals[w] ** 2) > odd**2:
-                    there += around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
-                tried.append(there)
-                rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
-            found, moving, at = self.p.residuals(rows), [], 0
-            for k, (w, look) in enumerate(zip(unsettled, looks, strict=True)):
-                starts[w] = look.columns
-                there = [*tried[k], *look.offsets]
-                seen = [*found[at : at + len(tried[k])], *look.residuals]
-                at += len(tried[k])
-                cost = start_cost(residuals[w], offsets[w], limit)
-                costs = [start_cost(r, o, limit) for r, o in zip(seen, there, strict=True)]
-                best = int(np.argmin(costs))
-                if costs[best] < cost:
-                    offsets[w], residuals[w] = there[best], seen[best]
-                if costs[best] > (1 - FALL) * cost:
-                    aim[w] += 1 if np.mean(residuals[w] ** 2) > odd**2 else len(SEEN)
-                if aim[w] < len(SEEN):
-                    moving.append(w)
-                    change = np.sqrt(np.mean(look.columns**2, axis=0))
-                    self.probe[w] = np.clip(SEEN[aim[w]] / np.maximum(change, 1e-12), *PROBE)
-            unsettled = moving
-            if not unsettled:
-                break
 
     def polish(self, fit: Fit) -> Fit:
         """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
@@ -274,11 +150,11 @@ class Solver:
             others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
         """
         everywhere = range(len(self.p.windows))
-        offsets, starts, residuals = self._refined(fit.values, fit.offsets, everywhere, 1)
+        offsets, starts, residuals = self.search.refined(fit.values, fit.offsets, everywhere, 1)
         limit = huber_limit(residuals)
         unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > NOISE**2]
         for begin in others if unsettled else ():
-            there, found, left = self._refined(fit.values, begin, unsettled, ROUNDS)
+            there, found, left = self.search.refined(fit.values, begin, unsettled, ROUNDS)
             for w in unsettled:
                 if start_cost(left[w], there[w], limit) < start_cost(residuals[w], offsets[w], limit):
                     offsets[w], starts[w], residuals[w] = there[w], found[w], left[w]
@@ -290,7 +166,7 @@ class Solver:
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
         """Return one trial a window."""
-        return [Trial(w, values, offset * self.p.windows[w].spread) for w, offset in enumerate(offsets)]
+        return self.search.trials(values, offsets)
 
     def linearise(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> tuple[Linear, ...]:
         """Return residuals and sensitivities at a point; `offsets` in units of their spread."""
@@ -452,42 +328,6 @@ class Solver:
                 sub = normal[np.ix_(free, free)] + damping * np.diag(curvature[free])
                 move[free] = -np.linalg.solve(sub, slope[free])
         return move, [-(s[:, size] + s[:, :size] @ move) for s in parts]
-
-
-def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float) -> float:
-    """Return the cost of one window with the prior of its initial state."""
-    return float(huber(residual, limit).sum()) + far(offset)
-
-
-def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limit: float, damping: float) -> np.ndarray:
-    """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
-    weighted = start.T * huber_weight(residual, limit)
-    normal = weighted @ start
-    near = trust(offset)
-    normal += np.diag(near + damping * (near + np.diag(normal)))
-    return -np.linalg.solve(normal, weighted @ residual + near * offset)
-
-
-def around(
-    residual: np.ndarray,
-    start: np.ndarray,
-    offset: np.ndarray,
-    step: np.ndarray,
-    limit: float,
-    rng: np.random.Generator,
-) -> list[np.ndarray]:
-    """Return initial states drawn about one and about where a step leads, farthest where residuals tell least.
-
-    Time steps cut an impact's course into teeth, each with a minimum of its own: derivatives do not lead from one to
-    the next, draws do.
-    """
-    weighted = start.T * huber_weight(residual, limit)
-    factor = np.linalg.cholesky(weighted @ start + np.diag(trust(offset)))
-    return [
-        centre + size * np.linalg.solve(factor.T, rng.normal(size=len(offset)))
-        for size in DRAWS
-        for centre in (offset, step)
-    ]
 
 
 def projected(fit: Fit) -> list[Linear]:

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit import least_squares
-from concent_warp.fit.least_squares import Fit, Linear, Solver, projected, start_step
+from concent_warp.fit import initial_states
+from concent_warp.fit.initial_states import start_step
+from concent_warp.fit.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.prediction import Prediction
 from concent_warp.fit.robust import HUBER, trust
 from tests.fit.bouncing import SPREAD, bounced
@@ -125,8 +126,8 @@ def test_initial_states_far_off_are_found_across_a_bounce():
 
 
 def test_derivatives_alone_do_not_find_all_of_these(monkeypatch):
-    monkeypatch.setattr(least_squares, "DRAWS", ())
-    monkeypatch.setattr(least_squares, "RESTARTS", 0)
+    monkeypatch.setattr(initial_states, "DRAWS", ())
+    monkeypatch.setattr(initial_states, "RESTARTS", 0)
     assert (bounced_ratio() < 1.2).sum() <= 9
 
 
