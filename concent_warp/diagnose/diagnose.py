@@ -162,7 +162,8 @@ class Procedure:
         screened = self.parallel(screen, [(base, e) for e in chosen], "screening", 0.5 * span)
         null = chance(base, screened, self.cfg.draws, self.cfg.seed)
         critical = float(np.quantile(null, 1 - self.cfg.level))
-        smallest = tuple(found for s in screened if (found := detectable_size(base, s, critical)) is not None)
+        needed = max(critical, self.cfg.least_gain)
+        smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
         fitted = self.fitted(base, screened, critical)
         findings = [self.finding(base, c, null, step, chosen) for c in fitted]
         rivals = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
@@ -402,14 +403,14 @@ def plausibility(base: Node, c: Candidate, f: Finding) -> float:
     return float(c.gain(base).sum() - len(scale) * np.log(base.blocks.count) - away @ away - c.effect.rarity)
 
 
-def detectable_size(base: Node, s: Screened, critical: float) -> Detectable | None:
+def detectable_size(base: Node, s: Screened, share: float) -> Detectable | None:
     """Return the smallest size of a candidate that the search would have found in half of all cases.
 
-    A parameter off its null value by x adds H x^2 to the error, which must exceed what chance reaches.
+    A parameter off its null value by x adds H x^2 to the error, of which it must be more than a share.
     """
     prediction = Prediction(base.model, (s.effect,), base.windows, engine=base.engine)
     normal = sum(piece.jacobian.T @ piece.jacobian for piece in s.pieces)
-    needed = max(critical, 0.0) * base.errors.sum()
+    needed = max(share, 0.0) * base.errors.sum()
     best = None
     for k in range(prediction.owned, len(prediction.parameters)):
         p, curvature = prediction.parameters[k], float(np.asarray(normal)[k, k])
