@@ -175,6 +175,10 @@ class Procedure:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         group = alike(base, good)
+        better = polish_candidate(base, group[0][0], thorough=True)
+        if better is not group[0][0] and (found := self.finding(base, better, null, step, chosen)).accepted:
+            findings[findings.index(group[0][1])] = found
+            group[0] = better, found
         self.groups.append(tuple(f.name for _, f in group))
         self.hypotheses.append({f.name: c.model for c, f in group})
         first = group[0][1]

@@ -204,10 +204,12 @@ def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> 
     return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
 
 
-def polish_candidate(base: Node, candidate: Candidate, cfg: FitCfg | None = None) -> Candidate:
+def polish_candidate(
+    base: Node, candidate: Candidate, cfg: FitCfg | None = None, *, thorough: bool = False
+) -> Candidate:
     """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1), cfg)
-    found = judged(base, candidate.effect, solver, solver.polish(candidate.fit))
+    found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough))
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 

@@ -29,6 +29,8 @@ from value to value, so that smaller steps measure the jumps."""
 
 NOISE = 1.05
 """Residual over noise at which an initial state leaves nothing to be wished for."""
+NEXT_TO_NOTHING = 3e-4
+"""Share of the cost that counts as a gain where values matter."""
 LEAPS, LEAP, WORTH = 4, (1.0, 3.0), 5e-3
 """How often parameters are led on at most, over how many of their steps, and for what gain."""
 REFIT_ROUNDS = 2
@@ -119,40 +121,43 @@ class Solver:
         found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), rounds)
         return found, tuple(starts[w] for w in range(len(offsets)))
 
-    def polish(self, fit: Fit) -> Fit:
+    def polish(self, fit: Fit, *, thorough: bool = False) -> Fit:
         """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
 
         Initial states that have made up for a wrong parameter do not always find back on their own, and hold it there:
-        so the parameters are then led on by steps after each of which the initial states are fitted anew.
+        so the parameters are then led on by steps after each of which the initial states are fitted anew; if
+        `thorough`, also where all but the noise is explained, for the sake of their values.
         """
         measured = [np.zeros_like(o) for o in fit.offsets]
         fresh = self.better_starts(fit, [measured])
         best = self.fit(fresh.values, fresh.offsets, fresh.starts)
+        noise, worth = (0.0, NEXT_TO_NOTHING) if thorough else (NOISE, WORTH)
         for _ in range(LEAPS if len(fit.values) else 0):
-            if np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2) < NOISE**2:
+            if np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2) < noise**2:
                 break
             move, _ = self.solve(best.linear, best.starts, best.offsets, best.values, self.cfg.damping)
             found = best
             for size in LEAP:
                 values = self.inside(best.values + size * move * self.scale)
-                there = self.better_starts(replace(best, values=values), [measured])
+                there = self.better_starts(replace(best, values=values), [measured], noise)
                 found = min(found, there, key=lambda f: f.cost)
-            if found.cost > (1 - WORTH) * best.cost:
+            if found.cost > (1 - worth) * best.cost:
                 break
             best = found
         return best
 
-    def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]]) -> Fit:
+    def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]], noise: float = NOISE) -> Fit:
         """Return a fit at the same parameters with the best initial state of each window that is found.
 
         Args:
             fit: The fit.
             others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
+            noise: Residual over noise of windows that need no others.
         """
         everywhere = range(len(self.p.windows))
         offsets, starts, residuals = self.search.refined(fit.values, fit.offsets, everywhere, 1)
         limit = huber_limit(residuals)
-        unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > NOISE**2]
+        unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > noise**2]
         for begin in others if unsettled else ():
             there, found, left = self.search.refined(fit.values, begin, unsettled, ROUNDS)
             for w in unsettled:
