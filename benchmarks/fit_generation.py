@@ -328,7 +328,10 @@ def page(results: dict[str, Any]) -> str:
             text += f"Converged: the best Chamfer distance is within {SETTLED - 1:.0%} of the last one.\n\n"
         found = {key: value for key, value in results.items() if key.startswith(kind)}
         for result in found.values():
-            text += f"{machine_line(result['machine'])} Start: {result['start']}.\n\n"
+            text += (
+                f"{machine_line(result['machine'])} Start: {result['start']}. {result.get('note', '')}".rstrip()
+                + "\n\n"
+            )
             text += (generation_table if kind == "generation" else fit_table)(result["rows"]) + "\n"
         if not any("device" in result["machine"] for result in found.values()):
             text += "Not measured on a GPU yet.\n\n"
