@@ -142,7 +142,7 @@ class ActuatorSaturation(DriveEffect):
         """One limit for all actuators of the target, as a share of the largest typical torque of each."""
         joints = np.array([driven_joints(m, a)[0] for a in self.ids(m)])
         top = float(np.max(20 * m.dof_M0[dof_of(m, joints)]))
-        scan = tuple(top * share for share in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2))
+        scan = tuple((top * np.geomspace(0.05, 20.0, 36)).tolist())  # a limit shows in a narrow range only
         slide = (m.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE)).all()
         return (Parameter("limit", "N" if slide else "N m", np.inf, 0.0, 100 * top, top, scan=scan),)
 
