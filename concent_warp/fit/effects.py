@@ -160,6 +160,10 @@ def rest(
     return [r + a @ start_step(r, a, o, limit, 0.0) for r, a, o in zip(residuals, starts, offsets, strict=True)]
 
 
+TELLING = 1.0
+"""By how much a trial value must lower the cost, half a sum of squares in units of noise, to be set out from."""
+
+
 def best_start(
     solver: Solver, given: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
 ) -> np.ndarray:
@@ -177,7 +181,8 @@ def best_start(
     residuals = [rest(solver, values, offsets, starts) for values in trials]
     limit = huber_limit(residuals[0])
     costs = [sum(start_cost(r, np.zeros(1), limit) for r in of_trial) for of_trial in residuals]
-    return trials[int(np.argmin(costs))]
+    best = int(np.argmin(costs))
+    return trials[best] if costs[best] < costs[0] - TELLING else trials[0]
 
 
 def fitted_parameters(
@@ -192,7 +197,8 @@ def fitted_parameters(
     for q, fitted, reach in zip(solver.p.parameters, fit.values, NORMAL * std * solver.scale, strict=True):
         value = float(fitted)
         low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
-        if np.isinf(q.null) and high >= q.high:  # a limit that is never reached may as well not be there
+        untold = high - low > 2 * NORMAL * UNKNOWN * PRIOR * q.scale
+        if np.isinf(q.null) and (high >= q.high or untold):  # a limit that is never reached may as well not be there
             high = q.null
         at_bound = value in (q.low, q.high) and q.null not in (value, high)
         found.append(FittedParameter(q.name, value, low, high, q.unit, q.null, at_bound))

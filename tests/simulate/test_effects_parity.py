@@ -59,7 +59,12 @@ def typical(effect: Effect, m) -> list[float]:
     if effect.name == "pad_friction":
         return [0.15]
     rows = effect.parameters(m)
-    return [p.scan[len(p.scan) // 2] if p.scan else min(p.null + p.scale, p.high) for p in rows]
+    # A limit must be low to act.
+    parts = [4 if np.isinf(p.null) else 2 for p in rows]
+    return [
+        p.scan[len(p.scan) // part] if p.scan else min(p.null + p.scale, p.high)
+        for p, part in zip(rows, parts, strict=True)
+    ]
 
 
 def on_every_target(model: Model, names: Sequence[str]) -> list[Effect]:
