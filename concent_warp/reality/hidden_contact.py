@@ -14,8 +14,6 @@ from concent_warp.reality.world import HiddenEffect
 
 FADE = 0.05
 """Turning speed below which torsional and rolling friction fade [rad/s]."""
-LEAST = 1e-5
-"""Coefficient that MuJoCo's contacts have at least."""
 
 
 def drawn_friction(rig: Rig) -> float:
@@ -55,24 +53,28 @@ def anisotropic_friction(rig: Rig, magnitude: float) -> Hidden:
 
 
 def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
-    """Return a torque of `magnitude` [m] times the normal force against turning about the normal, or across it."""
-    column, name = (2, "rolling_friction") if rolling else (1, "torsional_friction")
+    """Return a torque of `magnitude` [m] times the normal force against turning about the normal, or across it.
+
+    Friction against the other way of turning is as drawn. Both are laws of the world's own: MuJoCo's contacts, which
+    have one cone for sliding and turning and a least coefficient, take part in neither.
+    """
+    drawn = rig.scene.model.geom(rig.surface).friction[1:]
+    about, across = (drawn[0], magnitude) if rolling else (magnitude, drawn[1])
 
     def edit(spec: mujoco.MjSpec) -> None:
         for geom in (spec.geom(rig.surface), *spec.body(rig.body).geoms):
-            friction = np.array(geom.friction)
-            friction[column] = LEAST
-            geom.friction = friction
+            geom.condim = 3
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         body = model.body(rig.body).id
         normal = float(normal_forces(model, data, body, model.geom(rig.surface).id)[1].sum())
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        spin = velocity[:3] * np.array([rolling, rolling, not rolling])
-        data.xfrc_applied[body, 3:] -= (magnitude - LEAST) * normal * spin / np.hypot(np.linalg.norm(spin), FADE)
+        for coefficient, part in ((about, [0, 0, 1]), (across, [1, 1, 0])):
+            spin = velocity[:3] * part
+            data.xfrc_applied[body, 3:] -= coefficient * normal * spin / np.hypot(np.linalg.norm(spin), FADE)
 
-    return HiddenEffect(name, edit=edit, force=force)
+    return HiddenEffect("rolling_friction" if rolling else "torsional_friction", edit=edit, force=force)
 
 
 def torsional_friction(rig: Rig, magnitude: float) -> Hidden:

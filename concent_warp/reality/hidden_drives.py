@@ -85,6 +85,8 @@ def actuator_gain(rig: Rig, magnitude: float) -> Hidden:
             actuator = spec.actuator(d.actuator)
             actuator.gainprm = magnitude * np.array(actuator.gainprm)
             actuator.biasprm = magnitude * np.array(actuator.biasprm)
+            # What makes up for the drawing's step in damping goes with the damping.
+            spec.joint(d.joint).armature += (magnitude - 1.0) * rig.physics.armature.get(d.joint, 0.0)
 
     truth = each("gain", names(found), np.full(len(found), magnitude))
     return Hidden("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
