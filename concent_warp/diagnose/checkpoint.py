@@ -20,6 +20,7 @@ import numpy as np
 from concent_warp.diagnose.blocks import Sums
 from concent_warp.diagnose.diagnose import Diagnosis, DiagnosisCfg, Procedure, Progress, silent
 from concent_warp.diagnose.search import Candidate, Node, Screened
+from concent_warp.diagnose.settle import Look
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
@@ -28,7 +29,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Recording
 
 T = TypeVar("T")
-KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums)}
+KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums, Look)}
 """What results are made of, besides effects and models."""
 
 

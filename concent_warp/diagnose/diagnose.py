@@ -28,10 +28,12 @@ from concent_warp.diagnose.search import (
     extended,
     fit_candidate,
     node,
+    piecewise_candidate,
     polish_candidate,
     screen,
     strengthened,
 )
+from concent_warp.diagnose.settle import Look, law_errors, settled
 from concent_warp.diagnose.where import where
 from concent_warp.fit.effects import check_finite
 from concent_warp.fit.observe import channel_noises, observe
@@ -111,6 +113,7 @@ class Procedure:
         self.findings: list[Finding] = []
         self.groups: list[tuple[str, ...]] = []
         self.hypotheses: list[dict[str, Model]] = []
+        self.noise: dict[str, float] = {}
         self._done = 0.0
         self._began = time.monotonic()
 
@@ -150,6 +153,7 @@ class Procedure:
     def fitted_baseline(self, noise: Mapping[str, float]) -> Node:
         """Return the model as it is, fitted to readings of some noise."""
         cfg = self.cfg
+        self.noise = dict(noise)
         windows = observe(self.model, self.recording, length=cfg.window, noise=noise, engine=cfg.engine, seed=cfg.seed)
         self.progress(0.03, "fitting the model as it is")
         check_finite(Prediction(self.model, (), windows, engine=cfg.engine), self.model.scene.source)
@@ -175,8 +179,8 @@ class Procedure:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         group = alike(base, good)
-        better = polish_candidate(base, group[0][0], thorough=True)
-        if better is not group[0][0] and (found := self.finding(base, better, null, step, chosen)).accepted:
+        better = settled(base, polish_candidate(base, group[0][0], thorough=True), self.settling)
+        if (found := self.finding(base, better, null, step, chosen)).accepted:
             findings[findings.index(group[0][1])] = found
             group[0] = better, found
         self.groups.append(tuple(f.name for _, f in group))
@@ -211,6 +215,21 @@ class Procedure:
             if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
                 break
             found[leader] = better
+        return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
+
+    def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
+        """Return fitted candidates, those that explain most fitted anew by way of short windows, where there are."""
+        if max(w.end - w.start for w in base.windows) < 2 * PIECE:
+            return found
+        cfg = self.cfg
+        pieces = observe(base.model, self.recording, length=PIECE, noise=self.noise, engine=cfg.engine, seed=cfg.seed)
+        best = max(c.share(base) for c in found)
+        near = sorted((k for k, c in enumerate(found) if c.share(base) > HALF * best), key=lambda k: found[k].fit.cost)
+        again = self.parallel(
+            piecewise_candidate, [(base, found[k], pieces) for k in near[:FIRST]], "fitting piece by piece", 0.0
+        )
+        for k, c in zip(near, again, strict=False):
+            found[k] = c
         return found
 
     def finding(self, base: Node, c: Candidate, null: np.ndarray, step: int, among: Sequence[Any]) -> Finding:
@@ -257,6 +276,10 @@ class Procedure:
             self.progress(self._done + span * (i + 1) / max(len(tasks), 1), f"{text}, {i + 1} of {len(tasks)}")
         self._done += span
         return results
+
+    def settling(self, work: Callable[..., Look], tasks: Sequence[tuple[Any, ...]]) -> list[Look]:
+        """Do the looks around a fit, see `settled`."""
+        return self.parallel(work, tasks, "looking around", 0.0)
 
     def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
         """Yield the results of independent pieces of work in the tasks' order."""
@@ -325,6 +348,10 @@ SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
 QUIET = 0.25
 """Share of the blocks, those with the smallest residuals, that tell what noise there is at least."""
+PIECE = 0.4
+"""Length of the short windows by way of which fits are led out of a local minimum [s]."""
+HALF = 0.5
+"""Share of the best gain from which on that is worth a try, where no candidate explains the data."""
 ROUNDS, FINE = 3, 0.01
 """How often the best fit is taken up again, as long as its cost falls by the second number."""
 DOUBTFUL = 0.4
@@ -357,13 +384,18 @@ def quiet_ratios(base: Node) -> dict[str, float]:
 
 
 def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
-    """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks)."""
+    """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
+
+    With the law's own error, see `law_errors`.
+    """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.spread is None else c.spread
+    fresh = range(prediction.owned, len(prediction.parameters))
+    law = law_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
     found = []
-    for k in range(prediction.owned, len(prediction.parameters)):
+    for k in fresh:
         p, value = prediction.parameters[k], float(c.fit.values[k])
-        reach = 1.96 * spread[k] * p.scale
+        reach = 1.96 * np.hypot(spread[k] * p.scale, law[k - prediction.owned])
         low, high = max(value - reach, p.low), min(value + reach, p.high)
         bound = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
         at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bound)

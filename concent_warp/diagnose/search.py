@@ -82,6 +82,9 @@ class Candidate:
     ratio: float
     """Residual over noise that is left."""
     simulated: float
+    spread: np.ndarray | None = None
+    """Standard deviations of the parameters in units of their scale, shape (P,), where more than the linear ones are
+    known, see `concent_warp.diagnose.settle`."""
 
     def gain(self, base: Node) -> np.ndarray:
         """Return by how much the held-out error of each block falls against a node, shape (B,)."""
@@ -210,6 +213,22 @@ def polish_candidate(
     """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1), cfg)
     found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough))
+    return found if found.fit.cost < candidate.fit.cost else candidate
+
+
+def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Window]) -> Candidate:
+    """Take up the fit of a candidate from values that short windows lead to; the worse of the two is dropped.
+
+    Over long windows sticking and slipping make many minima; short ones, each with an initial state of its own, have
+    few (multiple shooting: Bock 1983).
+    """
+
+    def solver(windows: Sequence[Window]) -> Solver:
+        return Solver(Prediction(base.model, (candidate.effect,), windows, engine=base.engine, threads=1))
+
+    values = solver(pieces).fit(candidate.fit.values).values
+    long = solver(base.windows)
+    found = judged(base, candidate.effect, long, long.fit(values, base.fit.offsets, base.fit.starts))
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 

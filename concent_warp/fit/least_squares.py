@@ -169,6 +169,19 @@ class Solver:
             fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in everywhere), linear=linear, cost=cost
         )
 
+    def follow(self, fit: Fit, move: np.ndarray) -> list[np.ndarray]:
+        """Return the errors of the initial states that go with a step of the parameters, to first order.
+
+        Args:
+            fit: Where the step sets out.
+            move: The step, in units of the parameters' scale, shape (P,).
+        """
+        limit, found = huber_limit([piece.residual for piece in fit.linear]), []
+        for piece, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
+            aw = a.T * huber_weight(piece.residual, limit)
+            found.append(o - np.linalg.solve(aw @ a + np.diag(trust(o)), aw @ (piece.jacobian @ move)))
+        return found
+
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
         """Return one trial a window."""
         return self.search.trials(values, offsets)

@@ -1,0 +1,157 @@
+"""The values of an effect that was accepted: are there better ones nearby, and how sharply do the data tell them?
+
+Contacts make the cost rough: derivatives at a point neither lead to the lowest point nor tell how wide its valley is.
+So the cost is looked at some standard deviations away along the profile of each parameter, the other parameters where
+they are likeliest then and the initial states fitted anew (Bates and Watts, Nonlinear Regression Analysis and Its
+Applications, 1988, chapter 6). Where it is lower, the fit is taken up again. In the end a parabola through the looks of
+each parameter tells how sharp the minimum is over that distance, and how far off its middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from concent_warp.diagnose.blocks import covariance
+from concent_warp.diagnose.search import Candidate, Node, judged
+from concent_warp.fit.least_squares import Solver
+from concent_warp.fit.prediction import Prediction
+
+if TYPE_CHECKING:
+    from concent_warp.effects.effect import Parameter
+
+REACHES, FEW = ((-6.0, -2.0, 2.0, 6.0), (-3.0, 3.0)), 2
+"""How far to look, in standard deviations: with as many parameters as the second number at most, and with more."""
+ROUNDS = 4
+"""How often the dependence on the initial states is computed at a look."""
+WORTH = 1.0
+"""Fall of the cost, half a sum of squares in units of noise, for which a fit is taken up again."""
+HOPS, STRIDES = 3, 4
+"""How often that is done, and how often the way to there is gone on, twice as far each time."""
+WIDEST = 6.0
+"""By how much a flat valley widens an interval at most."""
+LAW_ERROR = 0.01
+"""Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """The cost some way from a fit, initial states fitted anew."""
+
+    parameter: int
+    """Along whose profile."""
+    reach: float
+    """How far, in standard deviations."""
+    values: np.ndarray
+    """Shape (P,)."""
+    offsets: tuple[np.ndarray, ...]
+    starts: tuple[np.ndarray, ...]
+    cost: float
+    expected: float
+    """By how much the cost would grow if it were quadratic."""
+
+
+def solver_of(base: Node, c: Candidate) -> Solver:
+    """Return what fits a candidate."""
+    return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine, threads=1))
+
+
+def ways(base: Node, c: Candidate) -> list[tuple[int, float]]:
+    """Return where to look: parameter of the candidate, and how far along its profile in standard deviations."""
+    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
+    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    fresh = range(prediction.owned, len(prediction.parameters))
+    found = []
+    for k in fresh:
+        p, value = prediction.parameters[k], c.fit.values[k]
+        for reach in REACHES[len(fresh) > FEW]:
+            if np.isfinite(value) and p.low <= value + reach * spread[k] * p.scale <= p.high:
+                found.append((k, reach))
+    return found
+
+
+def look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
+    """Look at the cost some way along the profile of a parameter."""
+    solver, known = solver_of(base, c), covariance(c.sums, base.blocks)
+    move = reach * known[parameter] / np.sqrt(known[parameter, parameter])
+    move = np.where(np.isfinite(c.fit.values), move, 0.0)
+    values = solver.inside(c.fit.values + move * solver.scale)
+    everywhere = range(len(base.windows))
+    offsets, starts, residuals = solver.search.refined(values, solver.follow(c.fit, move), everywhere, ROUNDS)
+    expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
+    cost = solver.cost(residuals, offsets, values)
+    return Look(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
+
+
+def taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
+    """Fit a candidate from where a look has found a lower cost; what is not better in the end is dropped."""
+    solver = solver_of(base, c)
+    found = judged(base, c.effect, solver, solver.fit(seen.values, seen.offsets, seen.starts))
+    return found if found.fit.cost < c.fit.cost else c
+
+
+def settled(
+    base: Node, c: Candidate, all_of: Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look]]
+) -> Candidate:
+    """Return a candidate with values that no look around betters, and with how sharply the data tell them.
+
+    Args:
+        base: What it was added to.
+        c: The candidate.
+        all_of: Does independent pieces of work.
+    """
+    for _ in range(HOPS):
+        seen = list(all_of(look, [(base, c, *way) for way in ways(base, c)]))
+        best = min(seen, key=lambda s: s.cost, default=None)
+        if best is None or best.cost > c.fit.cost - WORTH:
+            return replace(c, spread=spreads(base, c, seen))
+        for _ in range(STRIDES):
+            further = look(base, c, best.parameter, 2 * best.reach)
+            if further.cost > best.cost:
+                break
+            best = further
+        c = taken_up(base, c, best)
+    return replace(c, spread=spreads(base, c, all_of(look, [(base, c, *way) for way in ways(base, c)])))
+
+
+def spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
+    """Return the standard deviations of a candidate's parameters, in units of their scale, shape (P,).
+
+    Those of the linear fit, larger by what a parabola through the looks is flatter, and by how far its middle is off.
+    """
+    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    for k in {s.parameter for s in seen}:
+        mine = [s for s in seen if s.parameter == k]
+        at = np.array([s.reach for s in mine])
+        rise = np.array([s.cost for s in mine]) - c.fit.cost
+        linear, curved = parabola(at, rise)
+        expected = float(np.mean([s.expected / s.reach**2 for s in mine]))
+        flatter = WIDEST if curved <= 0 else np.clip(np.sqrt(expected / curved), 1.0, WIDEST)
+        off = WIDEST if curved <= 0 else min(abs(linear) / (2 * curved), float(np.abs(at).max()))
+        spread[k] *= np.hypot(flatter, off)
+    return spread
+
+
+def parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
+    """Return b and c of the parabola b x + c x^2 that fits points best; b is zero where they lie on one side only."""
+    both = at.min() < 0 < at.max()
+    columns = np.column_stack([at, at**2] if both else [at**2])
+    found = np.linalg.lstsq(columns, rise, rcond=None)[0]
+    return (float(found[0]), float(found[1])) if both else (0.0, float(found[0]))
+
+
+def law_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
+    """Return what is uncertain of an effect's values because simulations of one law differ, one standard deviation.
+
+    A share of the effect's size, the largest difference of a parameter from its null value in units of its scale: the
+    others are told no better than that. It is no property of the data: the fit of a law that acts in steps of time to
+    data from another simulation of the same law is off by about this much (type B: Guide to the Expression of
+    Uncertainty in Measurement, 2008, section 4.3).
+    """
+    scale = np.array([p.scale for p in parameters])
+    null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
+    finite = np.where(np.isfinite(values), values, null)
+    return LAW_ERROR * scale * float(np.abs((finite - null) / scale).max())
