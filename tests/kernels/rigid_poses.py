@@ -44,7 +44,7 @@ class Poses:
         quaternion = rng.normal(size=(worlds, bodies, 4))
         quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
         self.quaternion = quaternion.astype(np.float32).astype(float)
-        self.stage = rng.integers(0, stages, worlds)
+        self.stage: np.ndarray = np.array(rng.integers(0, stages, worlds))
         self.xpos = wp.zeros((worlds, bodies), dtype=wp.vec3, device=device)
         self.xquat = wp.zeros((worlds, bodies), dtype=wp.quat, device=device)
         self.stages = wp.zeros(worlds, dtype=wp.int32, device=device)

@@ -200,6 +200,7 @@ def test_captured_graph_follows_poses_and_stages(device):
     poses.position += 0.01
     poses.stage[:] = (poses.stage + 1) % 4
     poses.upload()
+    assert capture.graph is not None
     wp.capture_launch(capture.graph)
     poses.position = poses.position.astype(np.float32).astype(float)
     assert_matches(pairs, table, poses)
