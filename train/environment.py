@@ -1,0 +1,325 @@
+"""The vectorised environment, as rsl-rl wants one: everything on the device, and no wait for it in a step.
+
+A step: commands from the action; the simulator; distances of pairs and virtual collisions; rewards, ends of episodes
+and new initial states where episodes ended; poses and distances of what is there now; observation. On CUDA each part
+is a captured graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, cast
+
+import numpy as np
+import torch
+import warp as wp
+from concent_warp.kernels.contact_pairs import ContactPairs
+from concent_warp.train.cfg import EnvironmentCfg
+from concent_warp.train.observation import BaseObservation, Layout
+from concent_warp.train.physics import Graph, Physics
+from concent_warp.train.resets import InitialStates
+from concent_warp.train.reward import disturbance, effort, engineered, relative_pose
+from concent_warp.train.rotation import inverse, rotate
+from concent_warp.train.task import Task
+from concent_warp.train.virtual import virtual_collision
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+TERMS = ("reach", "action", "velocity", "disturb", "vcp", "failure")
+"""Terms of the reward, in the order of `Environment.terms`."""
+SPEED = 1e4
+"""Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
+EXTENT = 1e4
+"""Generalised position beyond which it does [rad or m]."""
+SUMS = (*TERMS, "steps", "episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
+SUMS = (*SUMS, "overflow")
+"""What is summed over steps and worlds between two calls of `Environment.read_log`."""
+
+
+class Environment(VecEnv):
+    """N worlds of a task."""
+
+    def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: InitialStates) -> None:
+        """Make the environment and start all worlds.
+
+        Args:
+            task: What is trained.
+            cfg: Its settings.
+            physics: The worlds, with the bodies, joints, actuators and sites of the task's model.
+            states: Initial states.
+        """
+        self.task, self.physics, self.layout = task, physics, Layout.of(task)
+        self.num_envs, self.num_actions, self.device = physics.worlds, task.robot.actions, physics.device
+        self.control_step = cfg.decimation * task.replay.timestep
+        """Time between actions [s]."""
+        self.max_episode_length = max(1, round(cfg.episode / self.control_step))
+        self.cfg = asdict(cfg)
+        self._settings, self._states = cfg, states
+        self._make_tables()
+        self._make_buffers()
+        self._base = BaseObservation(task, physics, cfg.observation.noise)
+        warp_device = wp.device_from_torch(self.device)
+        with wp.ScopedDevice(warp_device):
+            stage = wp.full(self.num_envs, task.stage, dtype=wp.int32)
+            self._observation = wp.zeros((self.num_envs, self.layout.size), dtype=float)
+            self._pairs = ContactPairs(
+                task.table,
+                *physics.poses(),
+                stage,
+                amplitude=(cfg.reward.far[0], cfg.reward.near[0]),
+                sigma=(cfg.reward.far[1], cfg.reward.near[1]),
+                features=cast(wp.array, self._observation[:, self.layout.base :]),
+            )
+            self._virtual = virtual_collision(task, physics, stage, cfg.virtual) if cfg.collision == "vcp" else None
+            self._measure()
+            capture = cfg.capture != "none"
+            self._measured = Graph(self._measure, warp_device, capture)
+            self._paired = Graph(self._pairs.launch, warp_device, capture)
+            pairs, virtual = self._pairs, self._virtual
+            self._distance, self._worst = wp.to_torch(pairs.distance), wp.to_torch(pairs.worst_distance)
+            self._reach, self._finite = wp.to_torch(pairs.reach), wp.to_torch(pairs.finite)
+            self._severe = None if virtual is None else wp.to_torch(virtual.severe)
+            self._penalty = self._none if virtual is None else wp.to_torch(virtual.reward)
+        self.observation = wp.to_torch(self._observation)
+        """The observation, shape (N, layout.size); overwritten by the next step."""
+        whole = cfg.capture == "step" and self.device.startswith("cuda")
+        self._command = captured(self._apply_action, whole)
+        self._judge = captured(self._judge_step, whole)
+        self._observe = captured(self._read_base, whole)
+        self.reset()
+
+    def _make_tables(self) -> None:
+        """Put on the device what does not change."""
+        task, cfg, m = self.task, self._settings, self.task.compiled
+        robot = task.robot
+
+        def real(values: Any) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
+
+        def index(values: Any) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.long, device=self.device)
+
+        self._arm, self._arm_qpos, self._arm_dof = index(robot.actuator), index(robot.qpos), index(robot.dof)
+        self._gripper = index(robot.gripper)
+        self._step, self._lead = real(robot.step), real(robot.lead)
+        ranges = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-np.inf, np.inf])
+        self._range = real(ranges)
+        self._objects = index(list(task.objects))
+        tool = int(m.site_bodyid[robot.tool])
+        self._held = torch.as_tensor(task.holds, device=self.device)
+        self._frame = index([tool if holds else 0 for holds in task.holds])
+        keeps = task.events.stages[task.stage].bodies[0] != "robot"
+        self._watched = torch.as_tensor(task.held[task.stage] & task.table.used[task.stage] & keeps, device=self.device)
+        self._place = None if task.place is None else real(task.place)
+        pool = self._states
+        self._pool = [real(values) for values in (pool.qpos, pool.qvel, pool.ctrl)]
+        self._success, self._dropped = cfg.success, cfg.dropped
+
+    def _make_buffers(self) -> None:
+        """Allocate what lives as long as the environment; graphs refer to it."""
+        n, device, m = self.num_envs, self.device, self.task.compiled
+        self.action = torch.zeros(n, self.num_actions, device=device)
+        self.reward = torch.zeros(n, device=device)
+        self.done = torch.zeros(n, dtype=torch.bool, device=device)
+        self.time_out = torch.zeros(n, dtype=torch.bool, device=device)
+        self.success = torch.zeros(n, dtype=torch.bool, device=device)
+        """Whether object 1 was in place at the end of the last step."""
+        self.terms = torch.zeros(n, len(TERMS), device=device)
+        """Weighted terms of the last reward, shape (N, len(TERMS))."""
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
+        self._return = torch.zeros(n, device=device)
+        self._sums = torch.zeros(len(SUMS), dtype=torch.float64, device=device)
+        self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
+        objects = len(self.task.objects)
+        self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
+        self._offence = torch.zeros(m.nq + m.nv + m.nu, device=device)
+        self._offended = torch.zeros((), dtype=torch.bool, device=device)
+        self._none = torch.zeros(n, device=device)
+
+    def reset(self) -> None:
+        """Start an episode in every world, at random places of the episode, so that they do not end all at once."""
+        with torch.no_grad():
+            self._start(torch.ones_like(self.done))
+            self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
+            self._return.zero_()
+            self._sums.zero_()
+            self._offended.zero_()
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Compute poses, distances and the observation that follow from the present state."""
+        with torch.no_grad():
+            self.physics.place()
+            self._paired.launch()
+            self._observe()
+
+    def get_observations(self) -> TensorDict:
+        """Return the observation of the present state; a copy, for rsl-rl keeps it through the next step."""
+        return TensorDict({"policy": self.observation.clone()}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Act for one step; see `rsl_rl.env.VecEnv.step`."""
+        with torch.no_grad():
+            self.action.copy_(actions)
+            self._command()
+            self.physics.advance()
+            self._measured.launch()
+            self._judge()
+            reward, done, time_out = self.reward.clone(), self.done.clone(), self.time_out.clone()
+            means = self.terms.mean(dim=0)
+            self.refresh()
+        log = {f"/reward/{name}": value for name, value in zip(TERMS, means.unbind(), strict=True)}
+        return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
+
+    def read_log(self) -> dict[str, float]:
+        """Return means since the last call, and start anew; this waits for the device.
+
+        Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
+        episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
+        were too small.
+        """
+        sums = dict(zip(SUMS, self._sums.tolist(), strict=True))
+        self._sums.zero_()
+        steps, episodes = max(sums["steps"], 1.0), max(sums["episodes"], 1.0)
+        per_step = {*TERMS, "overflow"}
+        means = {name: value / (steps if name in per_step else episodes) for name, value in sums.items()}
+        return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
+
+    def offending_state(self) -> dict[str, np.ndarray] | None:
+        """Return the state and commands at the start of the step in which a world first diverged, None if none has."""
+        if not bool(self._offended):
+            return None
+        m, values = self.task.compiled, self._offence.cpu().numpy()
+        return {"qpos": values[: m.nq], "qvel": values[m.nq : m.nq + m.nv], "ctrl": values[m.nq + m.nv :]}
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return everything that the future depends on besides the random number generators."""
+        p = self.physics
+        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
+        parts |= {"length": self.episode_length_buf, "return": self._return}
+        return {name: value.clone() for name, value in parts.items()}
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
+        """Bring back what `state` returned."""
+        p = self.physics
+        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
+        parts |= {"length": self.episode_length_buf, "return": self._return}
+        for name, value in parts.items():
+            value.copy_(state[name])
+        self.refresh()
+
+    def place(self) -> torch.Tensor:
+        """Return where object 1 is in the frame of object 2 [m], shape (N, 3)."""
+        position, quaternion = self.physics.position, self.physics.quaternion
+        first, second = self.task.objects[:2]
+        return rotate(inverse(quaternion[:, second]), position[:, first] - position[:, second])
+
+    def _apply_action(self) -> None:
+        """Turn the action into commands, and note what is compared with afterwards."""
+        p = self.physics
+        action = self.action.clamp_(-1, 1)
+        for copy, value in zip(self._before, (p.qpos, p.qvel, p.ctrl), strict=True):
+            copy.copy_(value)
+        for copy, value in zip(self._pose_before, self._object_poses(), strict=True):
+            copy.copy_(value)
+        joints = len(self._arm)
+        moved = p.ctrl[:, self._arm] + action[:, :joints] * self._step[:joints]
+        at = p.qpos[:, self._arm_qpos].float()
+        moved = torch.clamp(moved, at - self._lead, at + self._lead)
+        p.ctrl[:, self._arm] = moved.clamp(self._range[self._arm, 0], self._range[self._arm, 1])
+        if len(self._gripper):
+            opened = p.ctrl[:, self._gripper] + action[:, joints:] * self._step[joints:]
+            p.ctrl[:, self._gripper] = opened.clamp(self._range[self._gripper, 0], self._range[self._gripper, 1])
+
+    def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the objects' poses, in the hand for those that the stage holds: (N, O, 3) [m] and (N, O, 4)."""
+        position, quaternion = self.physics.position, self.physics.quaternion
+        return relative_pose(
+            position[:, self._objects],
+            quaternion[:, self._objects],
+            position[:, self._frame],
+            quaternion[:, self._frame],
+        )
+
+    def _measure(self) -> None:
+        """Launch what tells distances."""
+        self._pairs.launch()
+        if self._virtual is not None:
+            self._virtual.launch()
+
+    def _judge_step(self) -> None:
+        """Reward the step, end episodes, and start new ones in their worlds."""
+        p, cfg = self.physics, self._settings.reward
+        sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
+        diverged = ~sane
+        dropped = ((self._distance > self._dropped) & self._watched).any(dim=1) & sane
+        severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
+        failed = diverged | dropped | severe
+        if self._place is None:
+            self.success.copy_((self._worst < self._success) & sane)
+        else:
+            self.success.copy_(((self.place() - self._place).abs() < self._success).all(dim=1))
+        reach = engineered(cfg.engineered, self.place()) if cfg.kind == "engineered" else self._reach.sum(dim=1)
+        action, velocity = effort(cfg, self.action, p.qvel[:, self._arm_dof].float())
+        disturb = disturbance(cfg, self._pose_before, self._object_poses())
+        weighted = [cfg.reach * reach, *(cfg.regularisation * t for t in (action, velocity, disturb))]
+        weighted += [cfg.vcp * self._penalty, self._none]
+        terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
+        terms[:, -1] = -cfg.failure * failed
+        self.terms.copy_(terms)
+        self.reward.copy_(terms.sum(dim=1))
+
+        self.episode_length_buf += 1
+        self._return += self.reward
+        self.time_out.copy_((self.episode_length_buf >= self.max_episode_length) & ~failed)
+        self.done.copy_(failed | self.time_out)
+        self._note_offence(diverged)
+        ended = self.done.double()
+        overflow = (p.overflow != 0).double().sum()
+        counts = [self.success & self.time_out, self.time_out, dropped, severe & ~dropped, diverged]
+        sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
+        sums += [count.double().sum() for count in counts]
+        sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum(), overflow]
+        self._sums += torch.stack(sums)
+        p.overflow.zero_()
+        self._start(self.done)
+
+    def _note_offence(self, diverged: torch.Tensor) -> None:
+        """Keep the state before the step of the first world that diverged."""
+        world = diverged.to(torch.uint8).argmax()
+        state = torch.cat([values.index_select(0, world[None])[0].float() for values in self._before])
+        first = diverged.any() & ~self._offended
+        self._offence.copy_(torch.where(first, state, self._offence))
+        self._offended.logical_or_(first)
+
+    def _start(self, where: torch.Tensor) -> None:
+        """Draw new initial states in the worlds of a mask, shape (N,) bool."""
+        p = self.physics
+        rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
+        for state, pool in zip((p.qpos, p.qvel, p.ctrl), self._pool, strict=True):
+            state.copy_(torch.where(where[:, None], pool[rows].to(state.dtype), state))
+        p.warmstart.copy_(torch.where(where[:, None], 0.0, p.warmstart))
+        self.episode_length_buf.masked_fill_(where, 0)
+        self._return.masked_fill_(where, 0.0)
+
+    def _read_base(self) -> None:
+        """Write robot and objects to the observation; the slots are there already."""
+        self.observation[:, : self.layout.base] = self._base.read()
+
+
+def captured(part: Callable[[], None], capture: bool) -> Callable[[], None]:
+    """Return torch operations on fixed buffers as a CUDA graph, or as they are."""
+    if not capture:
+        return part
+    with torch.no_grad():
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(2):
+                part()
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            part()
+    return graph.replay

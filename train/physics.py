@@ -1,0 +1,255 @@
+"""The worlds that an environment acts on: states as torch tensors, either simulator behind one interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import mujoco
+import numpy as np
+import torch
+import warp as wp
+
+if TYPE_CHECKING:
+    from concent_warp.effects.law import Law
+
+
+class Physics(Protocol):
+    """N worlds of one model. The tensors are the simulator's own memory: what is written to them is the state."""
+
+    model: mujoco.MjModel
+    worlds: int
+    device: str
+    """Torch's name of the device."""
+    qpos: torch.Tensor
+    """Shape (N, nq)."""
+    qvel: torch.Tensor
+    """Shape (N, nv)."""
+    ctrl: torch.Tensor
+    """Shape (N, nu)."""
+    warmstart: torch.Tensor
+    """Accelerations that the solver starts from, shape (N, nv)."""
+    position: torch.Tensor
+    """Body origins [m], world frame, shape (N, nbody, 3)."""
+    quaternion: torch.Tensor
+    """Body orientations, wxyz, shape (N, nbody, 4)."""
+    site: torch.Tensor
+    """Site positions [m], world frame, shape (N, nsite, 3)."""
+    overflow: torch.Tensor
+    """Bits of buffers that were too small, shape (N,) int."""
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays, of `wp.vec3` and `wp.quat`, shape (N, nbody)."""
+        ...
+
+    def advance(self) -> None:
+        """Simulate the steps of one action, the commands held, and compute the poses that follow."""
+        ...
+
+    def place(self) -> None:
+        """Compute the poses that follow from the positions."""
+        ...
+
+
+@dataclass(frozen=True)
+class Actor:
+    """What acts on a world of C MuJoCo besides its commands: a hidden effect, say."""
+
+    force: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
+    """Called before every step; adds to `qfrc_applied` and `xfrc_applied`, which are cleared before it."""
+    command: Callable[[float, np.ndarray], np.ndarray] | None = None
+    """Maps time [s] and the command (nu,) to the one that acts."""
+
+
+class MujocoPhysics:
+    """Worlds of C MuJoCo, one after the other: for CPUs, and for worlds that are no model of ours."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        worlds: int,
+        decimation: int,
+        laws: Sequence[tuple[Law, np.ndarray]] = (),
+        actors: Sequence[Actor] = (),
+    ) -> None:
+        """Make the worlds.
+
+        Args:
+            model: Compiled model.
+            worlds: N.
+            decimation: Steps of one action.
+            laws: Force laws with their parameters, shape (P,) each.
+            actors: What else acts.
+        """
+        self.model, self.worlds, self.device = model, worlds, "cpu"
+        self._decimation, self._actors = decimation, tuple(actors)
+        self._data = [mujoco.MjData(model) for _ in range(worlds)]
+        self._laws = [[law.bound(model, d, values) for law, values in laws] for d in self._data]
+        self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
+        self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
+        self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
+        # Double precision, so that nothing of a state is lost on the way to the simulator and back.
+        self.qpos = torch.from_numpy(np.tile(model.qpos0, (worlds, 1)))
+        self.qvel = torch.zeros(worlds, model.nv, dtype=torch.float64)
+        self.warmstart = torch.zeros_like(self.qvel)
+        self.ctrl = torch.zeros(worlds, model.nu)
+        self.site = torch.zeros(worlds, model.nsite, 3)
+        self.overflow = torch.zeros(worlds, dtype=torch.int32)
+        arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
+        self._arrays = [tensor.numpy() for tensor in arrays]
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays."""
+        return self._xpos, self._xquat
+
+    def advance(self) -> None:
+        """Simulate the steps of one action."""
+        ctrl = self.ctrl.numpy().astype(float)
+        for i, d in enumerate(self._data):
+            self._write(i, d)
+            for _ in range(self._decimation):
+                command = ctrl[i]
+                if self._laws[i] or self._actors:
+                    d.qfrc_applied[:] = 0
+                    d.xfrc_applied[:] = 0
+                    for law in self._laws[i]:
+                        law()
+                    for actor in self._actors:
+                        command = command if actor.command is None else actor.command(d.time, command)
+                    for actor in self._actors:
+                        if actor.force is not None:
+                            actor.force(self.model, d)
+                d.ctrl[:] = command
+                mujoco.mj_step(self.model, d)
+            mujoco.mj_kinematics(self.model, d)
+            self._read(i, d)
+
+    def place(self) -> None:
+        """Compute the poses that follow from the positions."""
+        for i, d in enumerate(self._data):
+            self._write(i, d)
+            mujoco.mj_kinematics(self.model, d)
+            self._read(i, d)
+
+    def _write(self, i: int, d: mujoco.MjData) -> None:
+        """Put the tensors of a world into its data, if they have been changed since they were read off it."""
+        qpos, qvel, warmstart = (array[i] for array in self._arrays[:3])
+        if not (np.array_equal(qpos, d.qpos) and np.array_equal(qvel, d.qvel)):
+            mujoco.mj_resetData(self.model, d)
+            d.qpos[:], d.qvel[:], d.qacc_warmstart[:] = qpos, qvel, warmstart
+
+    def _read(self, i: int, d: mujoco.MjData) -> None:
+        """Put the data of a world into its tensors."""
+        values = (d.qpos, d.qvel, d.qacc_warmstart, d.xpos, d.xquat, d.site_xpos)
+        for array, value in zip(self._arrays, values, strict=True):
+            array[i] = value
+
+
+class WarpPhysics:
+    """Worlds of MuJoCo-Warp, stepped by a captured graph."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        worlds: int,
+        decimation: int,
+        laws: Sequence[tuple[Law, np.ndarray]] = (),
+        *,
+        device: str,
+        nconmax: int,
+        njmax: int,
+        factors: dict[str, np.ndarray] | None = None,
+        capture: bool = True,
+    ) -> None:
+        """Make the worlds and capture their step.
+
+        Args:
+            model: Compiled model.
+            worlds: N.
+            decimation: Steps of one action.
+            laws: Force laws with their parameters, shape (P,) each.
+            device: Warp's name of the device.
+            nconmax: Contacts a world, of a pool for all.
+            njmax: Constraint rows of each world.
+            factors: Values of model fields that differ between worlds, shape (N, ...) each.
+            capture: Whether steps are captured in a graph.
+        """
+        import mujoco_warp as mjw
+
+        self.model, self.worlds = model, worlds
+        self.device = str(wp.device_to_torch(wp.get_device(device)))
+        self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
+        factors = factors or {}
+        edited = sorted({name for law, _ in laws for name in law.edits})
+        with wp.ScopedDevice(self._warp_device):
+            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(sorted({*factors, *edited}), worlds))
+            self._model.opt.warn_overflow = 0
+            for name, values in factors.items():
+                target = wp.to_torch(getattr(self._model, name))
+                target.copy_(torch.as_tensor(values, dtype=torch.float32).reshape(target.shape))
+            self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
+            self._laws: list[tuple[Law, Any]] = [
+                (law, wp.array(np.tile(values, (worlds, 1)), dtype=float)) for law, values in laws
+            ]
+            self._data = d = mjw.make_data(model, nworld=worlds, nconmax=nconmax, njmax=njmax)
+            self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
+            self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
+            self.overflow = wp.to_torch(d.overflow)
+            start = wp.clone(d.qpos)
+            self._steps()  # loads the modules, which cannot be done while a graph is captured
+            self._advance = Graph(self._steps, self._warp_device, capture)
+            self._place = Graph(lambda: mjw.kinematics(self._model, self._data), self._warp_device, capture)
+            wp.copy(d.qpos, start)
+            d.qvel.zero_()
+            d.qacc_warmstart.zero_()
+            d.overflow.zero_()
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays."""
+        return self._data.xpos, self._data.xquat
+
+    def advance(self) -> None:
+        """Simulate the steps of one action."""
+        self._advance.launch()
+
+    def place(self) -> None:
+        """Compute the poses that follow from the positions."""
+        self._place.launch()
+
+    def _steps(self) -> None:
+        """Launch the steps of one action."""
+        for _ in range(self._decimation):
+            if self._laws:
+                for target, values in self._unedited:
+                    wp.copy(target, values)
+                self._data.qfrc_applied.zero_()
+                self._data.xfrc_applied.zero_()
+                for law, values in self._laws:
+                    law.launch(self._model, self._data, values)
+            self._mjw.step(self._model, self._data)
+        self._mjw.kinematics(self._model, self._data)
+
+
+class Graph:
+    """Warp launches, recorded once and replayed on the stream that torch works on."""
+
+    def __init__(self, launches: Callable[[], None], device: Any, capture: bool) -> None:
+        """Record `launches`, which must have run before, or keep them to be called as they are."""
+        self._launches, self._device, self._graph = launches, device, None
+        if capture:
+            with wp.ScopedDevice(device), wp.ScopedCapture() as captured:
+                launches()
+            self._graph = captured.graph
+
+    def launch(self) -> None:
+        """Launch."""
+        stream = None
+        if self._device.is_cuda:
+            stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self._device)))
+        with wp.ScopedDevice(self._device), wp.ScopedStream(stream):
+            if self._graph is None:
+                self._launches()
+            else:
+                wp.capture_launch(self._graph, stream=stream)

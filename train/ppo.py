@@ -1,0 +1,269 @@
+"""PPO through rsl-rl: training that can be stopped at any time and gone on with exactly."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.distribution import SquashedGaussian
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+
+CHECKPOINT = "checkpoint.pt"
+"""File of the latest state of a training in its run folder."""
+OFFENCE = "diverged.npz"
+"""File of the first state from which a world diverged."""
+
+
+class Trainee(Protocol):
+    """What PPO needs of an environment: rsl-rl's `VecEnv`, a log read once a round, and states to go on from."""
+
+    num_envs: int
+    num_actions: int
+    device: Any
+
+    def get_observations(self) -> TensorDict: ...  # noqa: D102
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]: ...  # noqa: D102
+    def read_log(self) -> dict[str, float]: ...  # noqa: D102
+    def offending_state(self) -> dict[str, np.ndarray] | None: ...  # noqa: D102
+    def state(self) -> dict[str, torch.Tensor]: ...  # noqa: D102
+    def restore(self, state: dict[str, torch.Tensor]) -> None: ...  # noqa: D102
+
+
+@dataclass
+class Round:
+    """What a round of collecting and updating came to."""
+
+    iteration: int
+    """Rounds done, this one included."""
+    steps: int
+    """Environment steps done in all."""
+    seconds: float
+    """Time spent in all [s], over all sittings."""
+    collecting: float
+    """Time of this round's steps [s]."""
+    updating: float
+    """Time of its update [s]."""
+    log: dict[str, float] = field(default_factory=dict)
+    """What the environment and the losses came to."""
+
+
+Report = Callable[[Round], None]
+
+
+class Trainer:
+    """A policy in training."""
+
+    def __init__(self, environment: Trainee, cfg: TrainCfg, folder: Path | None = None) -> None:
+        """Make policy and value function.
+
+        Args:
+            environment: What to train in.
+            cfg: Settings; of its environment part nothing is read.
+            folder: Run folder for checkpoints and TensorBoard; None keeps everything in memory.
+        """
+        self.environment, self.cfg, self.folder = environment, cfg, folder
+        self.device = str(environment.device)
+        seed_everything(cfg.seed)
+        self.algorithm = make_ppo(environment, cfg.ppo)
+        self.iteration, self.steps, self.seconds = 0, 0, 0.0
+        self.history: list[Round] = []
+
+    def learn(self, report: Report | None = None, *, seconds: float | None = None) -> Round | None:
+        """Train to the last round, to the target, or for some time, and return the last round.
+
+        A checkpoint is written every so many rounds, at the end, and when the training is interrupted.
+
+        Args:
+            report: Called after every round.
+            seconds: Time after which to stop [s].
+        """
+        begun = time.monotonic()
+        self.algorithm.train_mode()
+        observations = self.environment.get_observations()
+        last: Round | None = None
+        with self._writer() as write:
+            try:
+                while self.iteration < self.cfg.ppo.iterations:
+                    last, observations = self._round(observations)
+                    write(last)
+                    if report is not None:
+                        report(last)
+                    done = self.cfg.target is not None and last.log["success"] >= self.cfg.target
+                    if done or (seconds is not None and time.monotonic() - begun > seconds):
+                        break
+                    if self.iteration % self.cfg.checkpoint == 0:
+                        self.save()
+            finally:
+                self.save()
+        return last
+
+    def _round(self, observations: TensorDict) -> tuple[Round, TensorDict]:
+        """Collect and update once."""
+        ppo, environment = self.algorithm, self.environment
+        start = time.monotonic()
+        with torch.inference_mode():
+            for _ in range(self.cfg.ppo.steps):
+                actions = ppo.act(observations)
+                observations, rewards, dones, extras = environment.step(actions)
+                ppo.process_env_step(observations, rewards, dones, extras)
+            ppo.compute_returns(observations)
+        log = environment.read_log()
+        collected = time.monotonic()
+        losses = ppo.update()
+        end = time.monotonic()
+        self.iteration += 1
+        self.steps += self.cfg.ppo.steps * environment.num_envs
+        self.seconds += end - start
+        log |= {f"loss {name}": float(value) for name, value in losses.items()}
+        log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.mean())}
+        this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, log)
+        self.history.append(this)
+        self._keep_offence()
+        return this, observations
+
+    def _keep_offence(self) -> None:
+        """Save the first state from which a world diverged."""
+        if self.folder is None or (self.folder / OFFENCE).exists():
+            return
+        if self.history[-1].log.get("diverged worlds") and (state := self.environment.offending_state()) is not None:
+            np.savez(self.folder / OFFENCE, **state)  # pyright: ignore[reportArgumentType]
+
+    @contextlib.contextmanager
+    def _writer(self) -> Iterator[Report]:
+        """Give what writes a round to TensorBoard."""
+        if self.folder is None:
+            yield ignore
+            return
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        with SummaryWriter(str(self.folder), purge_step=self.steps + 1, flush_secs=10) as writer:
+
+            def write(this: Round) -> None:
+                for name, value in this.log.items():
+                    writer.add_scalar(name.replace(" ", "_"), value, this.steps, this.seconds)
+                rate = self.cfg.ppo.steps * self.environment.num_envs / (this.collecting + this.updating)
+                writer.add_scalar("steps_per_second", rate, this.steps, this.seconds)
+
+            yield write
+
+    def save(self) -> None:
+        """Write a checkpoint, in one piece or not at all."""
+        if self.folder is None:
+            return
+        document = {
+            **self.algorithm.save(),
+            "learning_rate": self.algorithm.learning_rate,
+            "iteration": self.iteration,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "environment": self.environment.state(),
+            "random": random_state(),
+        }
+        path = self.folder / CHECKPOINT
+        partial = path.with_name(f".{path.name}.partial")
+        torch.save(document, partial)
+        partial.replace(path)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint, as if training had not stopped."""
+        document = load_checkpoint(path, self.device)
+        try:
+            self.algorithm.load(document, None, True)
+        except RuntimeError as error:
+            raise TrainError("the checkpoint is of another network", where=path, found=str(error)[:200]) from None
+        self.algorithm.learning_rate = document["learning_rate"]
+        self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
+        self.environment.restore(document["environment"])
+        restore_random_state(document["random"])
+
+    def policy(self) -> Callable[[TensorDict], torch.Tensor]:
+        """Return the policy without exploration: from observations to actions, shape (N, A)."""
+        self.algorithm.eval_mode()
+        return self.algorithm.get_policy()
+
+
+def ignore(this: Round) -> None:
+    """Do nothing with a round."""
+    del this
+
+
+def make_ppo(environment: Trainee, cfg: PpoCfg) -> PPO:
+    """Return rsl-rl's PPO for an environment."""
+    network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
+    network["obs_normalization"] = cfg.normalise
+    squashed = {"class_name": SquashedGaussian, "init_std": cfg.std, "std_type": "log"}
+    settings = {
+        "num_steps_per_env": cfg.steps,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": {**network, "distribution_cfg": squashed},
+        "critic": dict(network),
+        "multi_gpu": None,
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": cfg.epochs,
+            "num_mini_batches": cfg.batches,
+            "clip_param": cfg.clip,
+            "gamma": cfg.discount,
+            "lam": cfg.lam,
+            "value_loss_coef": cfg.value,
+            "entropy_coef": cfg.entropy,
+            "learning_rate": cfg.learning_rate,
+            "schedule": cfg.schedule,
+            "desired_kl": cfg.divergence,
+            "max_grad_norm": cfg.gradient,
+        },
+    }
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints the networks
+        return PPO.construct_algorithm(
+            environment.get_observations(),
+            environment,  # pyright: ignore[reportArgumentType]
+            settings,
+            str(environment.device),
+        )
+
+
+def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Raises:
+        TrainError: It is missing or not one.
+    """
+    if not path.is_file():
+        raise TrainError("no such checkpoint", where=path, expected=f"a {CHECKPOINT} that concent train wrote")
+    try:
+        document = torch.load(path, map_location=device, weights_only=False)
+    except Exception as error:  # torch's reader raises whatever its parsers do
+        raise TrainError("not a checkpoint", where=path, found=f"{type(error).__name__}: {error}") from None
+    if not isinstance(document, dict) or "actor_state_dict" not in document:
+        raise TrainError("not a checkpoint of a training", where=path)
+    return document
+
+
+def seed_everything(seed: int) -> None:
+    """Seed all generators."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+    torch.manual_seed(seed)
+
+
+def random_state() -> dict[str, Any]:
+    """Return the state of torch's generators; nothing else draws while training."""
+    cuda = [state.cpu() for state in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else []
+    return {"cpu": torch.get_rng_state(), "cuda": cuda}
+
+
+def restore_random_state(state: dict[str, Any]) -> None:
+    """Bring back what `random_state` returned."""
+    torch.set_rng_state(state["cpu"].cpu())
+    if state["cuda"] and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all([one.cpu() for one in state["cuda"]])

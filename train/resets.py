@@ -1,0 +1,255 @@
+"""Initial states along the demonstration that keep the contact chain (paper, section 3.2.1 and appendix D).
+
+At a demonstrated moment the robot holds object 1 or does not, and object 1 touches object 2 or does not.
+
+1. No hand on an object: robot joints and objects are displaced each by themselves.
+2. Object 1 in the hand: both are moved as one, and inverse kinematics finds the joints.
+3. Object 1 in the hand and on object 2: all three move as one. Where object 2 is fixed to the world it cannot, and
+   states between cases 2 and 3 are drawn: as demonstrated on object 2, or displaced, and lifted off it.
+
+States whose inverse kinematics fails, whose displacement makes objects overlap, or whose chain breaks while they settle
+are discarded, and counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from concent_warp.train.cfg import ResetCfg, TrainError
+from concent_warp.train.inverse_kinematics import reach
+from concent_warp.train.task import Task
+
+from concent_warp.simulate.inputs import compile_model
+
+ROUNDS = 20
+"""Draws for each state wanted after which the search is given up."""
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """M states at rest to start episodes from."""
+
+    qpos: np.ndarray
+    """Shape (M, nq)."""
+    qvel: np.ndarray
+    """Shape (M, nv)."""
+    ctrl: np.ndarray
+    """Commands that hold the state, shape (M, nu)."""
+    time: np.ndarray
+    """Demonstrated moments that they came from [s], shape (M,)."""
+    case: np.ndarray
+    """Case of the paper's, 1..3, shape (M,) int."""
+    discarded: dict[str, int]
+    """How many were discarded, by reason."""
+
+
+def draw_states(
+    task: Task,
+    cfg: ResetCfg,
+    seed: int,
+    *,
+    count: int | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> InitialStates:
+    """Draw initial states of the task's stage.
+
+    Moments are drawn from shortly before the stage that precedes it to the stage's first contact; for states that are
+    not displaced, to the middle of the target event's window, so that some have all but reached it.
+
+    Args:
+        task: The task.
+        cfg: How far states are displaced, and what is discarded.
+        seed: Seed.
+        count: States wanted; those of the settings by default.
+        progress: Called with the share done.
+
+    Raises:
+        TrainError: Too few of the states drawn can be used.
+    """
+    return Drawing(task, cfg, seed).states(cfg.states if count is None else count, progress)
+
+
+class Drawing:
+    """Draws states one by one in C MuJoCo."""
+
+    def __init__(self, task: Task, cfg: ResetCfg, seed: int) -> None:
+        """Prepare to draw."""
+        self.task, self.cfg = task, cfg
+        self.rng = np.random.default_rng([seed, 1])
+        self.discarded: dict[str, int] = {"unreachable": 0, "overlapping": 0, "chain broken": 0}
+        self.m = task.compiled
+        self.d = mujoco.MjData(self.m)
+        # Overlaps are judged with all spheres: those left out of the physics must not start within another object.
+        self.full, sphere_geom = compile_model(task.model, None)
+        self.full_data = mujoco.MjData(self.full)
+        self.is_sphere = np.zeros(self.full.ngeom, dtype=bool)
+        self.is_sphere[sphere_geom] = True
+        self.free = [self.free_joint(body) for body in task.objects]
+        stage = task.events.stages[task.stage]
+        earlier = task.events.stages[task.stage - 1].start if task.stage else 0.0
+        self.window = max(earlier - cfg.before, 0.0), stage.start, stage.event.time
+        self.robot_bodies = {e.body for e in task.events.entities if e.role == "robot"}
+
+    def free_joint(self, body: int) -> int | None:
+        """Return where the position of a free body starts in qpos; None of a body that is not free."""
+        joint = self.m.body_jntadr[body]
+        free = joint >= 0 and self.m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        return int(self.m.jnt_qposadr[joint]) if free else None
+
+    def states(self, count: int, progress: Callable[[float], None] | None) -> InitialStates:
+        """Return `count` states."""
+        found: list[tuple[np.ndarray, np.ndarray, float, int]] = []
+        for _ in range(ROUNDS * count):
+            if (state := self.draw()) is not None:
+                found.append(state)
+                if progress is not None and len(found) % 32 == 0:
+                    progress(len(found) / count)
+            if len(found) == count:
+                break
+        else:
+            raise TrainError(
+                "too few initial states keep the contact chain",
+                expected=count,
+                found=f"{len(found)}, and discarded {self.discarded}",
+                fix="displace them less, with --environment.reset.position and .turn",
+            )
+        qpos, ctrl, time, case = zip(*found, strict=True)
+        rest = np.zeros((count, self.m.nv))
+        return InitialStates(np.array(qpos), rest, np.array(ctrl), np.array(time), np.array(case), self.discarded)
+
+    def draw(self) -> tuple[np.ndarray, np.ndarray, float, int] | None:
+        """Return positions, commands, demonstrated time and case of one state, or None where it is discarded."""
+        start, onset, end = self.window
+        kept = self.rng.random() < self.cfg.demonstrated
+        time = self.rng.uniform(start, end if kept else onset)
+        row = self.task.replay.row(time)
+        qpos, ctrl = self.task.replay.qpos[row].copy(), self.task.replay.ctrl[row].copy()
+        case = self.case(time)
+        robot = self.task.robot
+        if not kept:
+            move = self.displaced if case > 1 else self.scattered
+            if (moved := move(qpos, case)) is None:
+                self.discarded["unreachable"] += 1
+                return None
+            qpos = moved
+            if self.overlap(qpos) > self.cfg.overlap:
+                self.discarded["overlapping"] += 1
+                return None
+        # What the demonstrated commands lead the joints by is lag and pressing; at rest, they are where the joints are.
+        ctrl[robot.actuator] = np.clip(qpos[robot.qpos], *self.range_of(robot.actuator))
+        settled = self.settle(qpos, ctrl, holding=case > 1)
+        if settled is None:
+            self.discarded["chain broken"] += 1
+            return None
+        return settled, ctrl, time, case
+
+    def range_of(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the limits of commands."""
+        limited = self.m.actuator_ctrllimited[actuators].astype(bool)
+        low, high = self.m.actuator_ctrlrange[actuators].T
+        return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+    def case(self, time: float) -> int:
+        """Return the case of a demonstrated moment."""
+        names = [self.m.body(body).name for body in self.task.objects]
+        holding = touching = False
+        for contact in self.task.events.body_contacts:
+            if contact.start <= time < contact.end:
+                holding |= contact.a in self.robot_bodies and contact.b == names[0]
+                touching |= len(names) > 1 and {contact.a, contact.b} == set(names[:2])
+        return 1 + holding + (holding and touching)
+
+    def scattered(self, qpos: np.ndarray, case: int) -> np.ndarray:
+        """Return positions with the robot's joints and every free object displaced by themselves (case 1)."""
+        del case
+        robot, cfg = self.task.robot, self.cfg
+        moved = qpos.copy()
+        moved[robot.qpos] += self.rng.uniform(-cfg.joints, cfg.joints, len(robot.qpos))
+        limited = self.m.jnt_limited[robot.joint].astype(bool)
+        low, high = self.m.jnt_range[robot.joint].T
+        moved[robot.qpos] = np.where(limited, np.clip(moved[robot.qpos], low, high), moved[robot.qpos])
+        for address in self.free:
+            if address is not None:
+                place(moved, address, moved[address : address + 3], self.displacement(lift=False))
+        return moved
+
+    def displaced(self, qpos: np.ndarray, case: int) -> np.ndarray | None:
+        """Return positions with hand and objects moved as one, None where the hand cannot get there (cases 2 and 3)."""
+        together = case == 3 and self.free[1] is not None
+        moves = self.free[: 1 + together]
+        shift, turn = self.displacement(lift=not together)
+        d, robot = self.d, self.task.robot
+        d.qpos[:] = qpos
+        mujoco.mj_kinematics(self.m, d)
+        pivot = d.site_xpos[robot.tool].copy()
+        rotation = about_vertical(turn) @ d.site_xmat[robot.tool].reshape(3, 3)
+        joints = reach(self.m, d, robot, pivot + shift, rotation)
+        if joints is None:
+            return None
+        moved = qpos.copy()
+        moved[robot.qpos] = joints
+        for address in moves:
+            assert address is not None
+            place(moved, address, pivot, (shift, turn))
+        return moved
+
+    def displacement(self, *, lift: bool) -> tuple[np.ndarray, float]:
+        """Return a drawn shift [m], shape (3,), and a turn about the vertical [rad]."""
+        cfg = self.cfg
+        aside = self.rng.uniform(-cfg.position, cfg.position, 2)
+        up = self.rng.uniform(0, cfg.lift) if lift else 0.0
+        return np.array([*aside, up]), float(self.rng.uniform(-cfg.turn, cfg.turn))
+
+    def overlap(self, qpos: np.ndarray) -> float:
+        """Return the deepest penetration of a sphere in another object or the surroundings [m], 0 for none."""
+        d = self.full_data
+        d.qpos[:], d.qvel[:] = qpos, 0
+        mujoco.mj_fwdPosition(self.full, d)
+        robot = self.task.robot
+        hand = {int(self.full.site_bodyid[robot.tool])} | {self.full.body(n).id for n in self.robot_bodies}
+        deepest = 0.0
+        for contact in d.contact:
+            bodies = {int(self.full.geom_bodyid[g]) for g in contact.geom}
+            if self.is_sphere[contact.geom].any() and not bodies & hand:
+                deepest = max(deepest, -float(contact.dist))
+        return deepest
+
+    def settle(self, qpos: np.ndarray, ctrl: np.ndarray, *, holding: bool) -> np.ndarray | None:
+        """Return positions after the settling time, None where the state fell apart; `holding` watches the grasp."""
+        m, d = self.m, self.d
+        mujoco.mj_resetData(m, d)
+        d.qpos[:], d.ctrl[:] = qpos, ctrl
+        mujoco.mj_kinematics(m, d)
+        before = self.in_hand()
+        for _ in range(round(self.cfg.settle / m.opt.timestep)):
+            mujoco.mj_step(m, d)
+        mujoco.mj_kinematics(m, d)
+        if d.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(d.qpos).all():
+            return None
+        if holding and np.linalg.norm(self.in_hand() - before) > self.cfg.slip:
+            return None
+        return d.qpos.copy()
+
+    def in_hand(self) -> np.ndarray:
+        """Return object 1's origin in the frame of the tool [m], shape (3,)."""
+        d, tool = self.d, self.task.robot.tool
+        return d.site_xmat[tool].reshape(3, 3).T @ (d.xpos[self.task.objects[0]] - d.site_xpos[tool])
+
+
+def place(qpos: np.ndarray, address: int, pivot: np.ndarray, move: tuple[np.ndarray, float]) -> None:
+    """Turn and shift a free body in place, about a pivot [m], shape (3,)."""
+    shift, turn = move
+    pivot = np.array(pivot)
+    qpos[address : address + 3] = pivot + about_vertical(turn) @ (qpos[address : address + 3] - pivot) + shift
+    turned = np.zeros(4)
+    mujoco.mju_mulQuat(turned, np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), qpos[address + 3 : address + 7])
+    qpos[address + 3 : address + 7] = turned
+
+
+def about_vertical(angle: float) -> np.ndarray:
+    """Return the rotation by an angle [rad] about the vertical, shape (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
