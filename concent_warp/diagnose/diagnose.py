@@ -19,6 +19,7 @@ from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
 from concent_warp.diagnose.experiment import suggest
+from concent_warp.diagnose.flexible import unknown_force
 from concent_warp.diagnose.noise import UNDERESTIMATE
 from concent_warp.diagnose.search import (
     Candidate,
@@ -290,8 +291,9 @@ class Procedure:
         first, last = nodes[0].ratio, nodes[-1].ratio
         beyond = max(first**2 - 1.0, 1e-9)
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > self.cfg.adequate else 0.0
+        unknown = unknown_force(nodes, self.cfg, lambda work, tasks: run_all(work, tasks, self.cfg.jobs))
         verdict: Verdict = "none_needed"
-        if last > self.cfg.adequate:
+        if last > self.cfg.adequate or unknown is not None:
             verdict = "none_of_these"
         elif len(nodes) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
@@ -300,13 +302,14 @@ class Procedure:
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
             groups=tuple(self.groups),
             where=self.places(nodes[0]) if verdict != "none_needed" else (),
-            unexplained=unexplained,
+            unexplained=unexplained if unknown is None else max(unexplained, unknown.share),
             ratio=tuple(n.ratio for n in nodes),
             detectable=detectable,
             next_experiment=self.experiment() if verdict != "none_needed" else None,
             issues=tuple(issues),
             models=tuple(n.model for n in nodes),
             seed=self.cfg.seed,
+            unknown_force=unknown,
         )
 
     def experiment(self) -> str | None:

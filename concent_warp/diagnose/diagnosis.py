@@ -95,6 +95,29 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class UnknownForceFound:
+    """What a force of no known form explains of what the last model leaves."""
+
+    words: str
+    """What it acts on and depends on."""
+    gain: float
+    """Share of the held-out error that it takes away."""
+    p: float
+    """Probability that the best of such forces gains as much where nothing is missing."""
+    share: float
+    """What it takes away, of all that the first model left beyond the noise."""
+
+    @property
+    def sentence(self) -> str:
+        """What was seen, in words."""
+        return f"{self.words[0].upper()}{self.words[1:]} explains another {100 * self.gain:.0f} % of the error."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it in plain types."""
+        return {"words": self.words, "gain": self.gain, "p": self.p, "share": self.share}
+
+
+@dataclass(frozen=True)
 class Detectable:
     """The smallest size of an effect that this recording would have shown."""
 
@@ -128,6 +151,8 @@ class Diagnosis:
     """The model as given, its own parameters fitted, and after each addition."""
     versions: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
+    unknown_force: UnknownForceFound | None = None
+    """A force of no known form that explains part of what the last model leaves; None where there is none."""
 
     @property
     def model(self) -> Model:
@@ -147,6 +172,7 @@ class Diagnosis:
             "groups": [list(group) for group in self.groups],
             "where": [dict(place) for place in self.where],
             "unexplained": self.unexplained,
+            "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
             "ratio": list(self.ratio),
             "detectable": [
                 {"name": d.name, "parameter": d.parameter, "size": number(d.size), "unit": d.unit}
@@ -182,6 +208,8 @@ class Diagnosis:
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
             )
+        if self.unknown_force is not None:
+            said.append(self.unknown_force.sentence)
         if self.next_experiment:
             said.append(f"Next: {self.next_experiment}")
         return [*self.issues, *said]

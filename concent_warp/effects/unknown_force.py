@@ -1,0 +1,156 @@
+"""A force of no known form: bumps over position, velocity or place, each of its own size.
+
+It is no effect that is added to a model; it stands for what no effect in the library can do. Bumps are Gaussian,
+exp(-x^2 / 2) with x the distance from a centre in widths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.law import Law
+
+SMALLEST = 1e-12
+"""Sizes below this count as none."""
+
+
+class UnknownJointForce(Law):
+    """On each of some joints a force that depends on the joint's own position, or velocity.
+
+    Parameters are the sizes of the bumps over their scale, joint by joint, shape (n K,).
+    """
+
+    def __init__(self, of: np.ndarray, dof: np.ndarray, centre: np.ndarray, scale: np.ndarray, *, moving: bool) -> None:
+        """Lay out bumps.
+
+        Args:
+            of: Where in the positions, or the velocities if `moving`, each joint is, shape (n,) int.
+            dof: Its degree of freedom, shape (n,) int.
+            centre: Centres of the bumps, evenly spaced by their width [rad, m, rad/s or m/s], shape (n, K).
+            scale: [N m or N], shape (n,).
+            moving: Whether it depends on the velocity.
+        """
+        self.of, self.dof, self.centre, self.scale, self.moving = of, dof, centre, scale, moving
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return self.centre.size
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        del m
+        of, applied = d.qvel if self.moving else d.qpos, d.qfrc_applied
+        width = self.centre[:, 1] - self.centre[:, 0]
+        sizes = values.reshape(self.centre.shape) * self.scale[:, None]
+        rows = [
+            (int(self.of[i]), int(self.dof[i]), float(self.centre[i, k]), 1.0 / float(width[i]), float(sizes[i, k]))
+            for i, k in np.argwhere(np.abs(sizes) > SMALLEST)
+        ]
+
+        def act() -> None:
+            for at, dof, centre, narrow, size in rows:
+                x = (of[at] - centre) * narrow
+                applied[dof] += size * math.exp(-0.5 * x * x)
+
+        return act
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        self.bound(m, d, values)()
+
+
+Way = Literal["field", "brake", "drag", "turning"]
+"""How a force on a body acts: along each axis of the world by place; against the velocity by place, or by speed; as a
+torque against the turning by its rate."""
+STILL = 2e-3
+"""Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out."""
+
+
+class UnknownBodyForce(Law):
+    """On a free body a force that depends on where it is, or a resistance that depends on that or on its speed.
+
+    Parameters are the sizes of the bumps over their scale, shape (K,), or (3 K,) along x, y and z of each bump.
+    """
+
+    def __init__(
+        self, body: int, place: int, dof: int, centre: np.ndarray, width: float, scale: float, way: Way
+    ) -> None:
+        """Lay out bumps.
+
+        Args:
+            body: Id.
+            place: Of its free joint in the positions.
+            dof: Of its free joint.
+            centre: Centres [m], shape (K, 3), or [m/s or rad/s], shape (K, 1).
+            width: Of the bumps, in the same unit.
+            scale: [N or N m].
+            way: See `Way`.
+        """
+        self.body, self.place, self.dof = body, place, dof
+        self.centre, self.width, self.scale, self.way = centre, width, scale, way
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return len(self.centre) * (3 if self.way == "field" else 1)
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
+        del m
+        position, velocity = d.qpos[self.place : self.place + 3], d.qvel[self.dof : self.dof + 3]
+        rate, torque = d.qvel[self.dof + 3 : self.dof + 6], d.qfrc_applied[self.dof + 3 : self.dof + 6]
+        force = d.xfrc_applied[self.body, :3]
+        sizes = np.reshape(values, (len(self.centre), -1)) * self.scale
+        used = np.flatnonzero((np.abs(sizes) > SMALLEST).any(axis=1))
+        rows = [(self.centre[k], sizes[k]) for k in used]
+        narrow, way = 1.0 / self.width, self.way
+
+        def act() -> None:
+            for centre, size in rows:
+                moved = rate if way == "turning" else velocity
+                speed = math.sqrt(float(moved @ moved))
+                off = (position - centre if way in ("field", "brake") else speed - centre) * narrow
+                bump = math.exp(-0.5 * float(off @ off))
+                if way == "field":
+                    force[:] += bump * size
+                    continue
+                still = 10 * STILL if way == "turning" else STILL
+                (torque if way == "turning" else force)[:] -= bump * size[0] / math.hypot(speed, still) * moved
+
+        return act
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
+        """See `Law.apply`."""
+        self.bound(m, d, values)()
+
+
+class UnknownForce(Effect):
+    """A force of no known form, see this module; it is not registered."""
+
+    name = "unknown_force"
+    family = "world"
+    kind = "none"
+    summary = "A force that is a smooth function of where something is or of how fast it moves."
+    source = "Gaussian bumps"
+    signature = "anything that depends on place or speed"
+    engines = ("mujoco",)
+
+    def __init__(self, words: str, law: UnknownJointForce | UnknownBodyForce) -> None:
+        """Make it from a law that says what it depends on, and that in words."""
+        super().__init__()
+        self.words, self._law = words, law
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """The sizes of the bumps."""
+        return tuple(Parameter(f"size[{k}]", "-", 0.0, -100.0, 100.0, 1.0) for k in range(self._law.count))
+
+    def law(self, m: mujoco.MjModel) -> UnknownJointForce | UnknownBodyForce:  # noqa: ARG002
+        """The force."""
+        return self._law
