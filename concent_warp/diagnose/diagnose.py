@@ -33,6 +33,7 @@ from concent_warp.diagnose.search import (
     polish_candidate,
     screen,
     strengthened,
+    without,
 )
 from concent_warp.diagnose.settle import Look, law_errors, settled
 from concent_warp.diagnose.where import where
@@ -133,6 +134,7 @@ class Procedure:
             if best is None:
                 break
             nodes.append(extended(nodes[-1], best))
+        nodes = self.pruned(nodes)
         self.progress(1.0, "done")
         return self.conclude(nodes, detectable, issues)
 
@@ -181,9 +183,10 @@ class Procedure:
             return None, smallest
         group = alike(base, good)
         better = settled(base, polish_candidate(base, group[0][0], thorough=True), self.settling)
-        if (found := self.finding(base, better, null, step, chosen)).accepted:
-            findings[findings.index(group[0][1])] = found
-            group[0] = better, found
+        # What was accepted stays so: its gain is the evidence, even if a rough cost tells little of the value.
+        found = replace(self.finding(base, better, null, step, chosen), accepted=True, reason="")
+        findings[findings.index(group[0][1])] = found
+        group[0] = better, found
         self.groups.append(tuple(f.name for _, f in group))
         self.hypotheses.append({f.name: c.model for c, f in group})
         first = group[0][1]
@@ -191,6 +194,30 @@ class Procedure:
         self.findings.append(first)
         self.findings += [replace(f, accepted=False, reason=f.reason or "another one explains more") for f in rest]
         return group[0][0], smallest
+
+    def pruned(self, nodes: list[Node]) -> list[Node]:
+        """Return the nodes, with one more for each effect that those added after it have made superfluous."""
+        steps = list(range(len(nodes) - 1))
+        while len(steps) > 1:
+            last = nodes[-1]
+            owned = len(last.model.effects) - len(steps)
+            # The last one has just shown its worth beside all others.
+            tried = self.parallel(without, [(last, owned + k) for k in range(len(steps) - 1)], "leaving out", 0.0)
+            shares = [1 - last.errors.sum() / max(n.errors.sum(), 1e-12) for n in tried]
+            least = int(np.argmin(shares))
+            if shares[least] >= self.cfg.least_gain:
+                break
+            step = steps.pop(least)
+            nodes = [*nodes, tried[least]]
+            self.groups[step], self.hypotheses[step] = (), {}
+            self.findings = [
+                replace(f, accepted=False, reason="of no use beside those added later")
+                if f.accepted and f.step == step
+                else f
+                for f in self.findings
+            ]
+        self.groups = [group for group in self.groups if group]
+        return nodes
 
     def fitted(self, base: Node, screened: Sequence[Screened], critical: float) -> list[Candidate]:
         """Fit the promising candidates, the most promising first; once one leaves only noise, no distant others."""
@@ -421,8 +448,9 @@ def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
 def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[Candidate, Finding]]:
     """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
 
-    They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it.
-    Among equals those come first that need fewer parameters and smaller values of them.
+    They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it. Among
+    them those come first that need fewer parameters and smaller values of them; differences in what they leave count
+    by their own standard error, squared.
     """
     best = max(good, key=lambda pair: pair[1].gain)
     group = []
@@ -430,16 +458,17 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
         difference = c.errors - best[0].errors
         error = np.sqrt(len(difference)) * difference.std()
         if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
-            group.append((c, f))
-    return sorted(group, key=lambda pair: -plausibility(base, *pair))
+            behind = difference.sum() / error if error else 0.0
+            group.append((plausibility(base, c, f) - behind**2, c, f))
+    return [(c, f) for _, c, f in sorted(group, key=lambda ranked: -ranked[0])]
 
 
 def plausibility(base: Node, c: Candidate, f: Finding) -> float:
-    """Return twice the log posterior, up to a constant: the gain, less Schwarz's cost of parameters and the priors."""
+    """Return twice the log prior of a candidate, up to a constant: parameters (Schwarz), sizes (Cauchy) and rarity."""
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    return float(c.gain(base).sum() - len(scale) * np.log(base.blocks.count) - away @ away - c.effect.rarity)
+    return float(-len(scale) * np.log(base.blocks.count) - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 
 def detectable_size(base: Node, s: Screened, share: float) -> Detectable | None:

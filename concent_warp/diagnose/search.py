@@ -111,6 +111,14 @@ def node(model: Model, windows: Sequence[Window], blocks: Blocks, engine: Engine
     return assessed(model, windows, blocks, fit, engine)
 
 
+def without(last: Node, effect: int) -> Node:
+    """Return the node of a model less one of its effects, all that is left fitted again."""
+    model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
+    solver = Solver(Prediction(model, (), last.windows, engine=last.engine, threads=1))
+    fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
+    return assessed(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
+
+
 def assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> Node:
     """Return a fitted model as a node."""
     pieces = tuple(projected(fit))

@@ -3,8 +3,9 @@
 Contacts make the cost rough: derivatives at a point neither lead to the lowest point nor tell how wide its valley is.
 So the cost is looked at some standard deviations away along the profile of each parameter, the other parameters where
 they are likeliest then and the initial states fitted anew (Bates and Watts, Nonlinear Regression Analysis and Its
-Applications, 1988, chapter 6). Where it is lower, the fit is taken up again. In the end a parabola through the looks of
-each parameter tells how sharp the minimum is over that distance, and how far off its middle.
+Applications, 1988, chapter 6). Where it is lower, the fit is taken up again. Where it does not rise as derivatives
+promise, the looks go farther, until the valley shows through the roughness: in the end a parabola through the farthest
+ones tells how wide it is, how far off its middle, and how far off the roughness may have led.
 """
 
 from __future__ import annotations
@@ -23,18 +24,24 @@ from concent_warp.fit.prediction import Prediction
 if TYPE_CHECKING:
     from concent_warp.effects.effect import Parameter
 
-REACHES, FEW = ((-6.0, -2.0, 2.0, 6.0), (-3.0, 3.0)), 2
-"""How far to look, in standard deviations: with as many parameters as the second number at most, and with more."""
+NEAR, FARTHER, EXTENSIONS = 2.0, 3.0, 3
+"""How far to look at first, in standard deviations; how much farther then, and how often."""
 ROUNDS = 4
 """How often the dependence on the initial states is computed at a look."""
 WORTH = 1.0
 """Fall of the cost, half a sum of squares in units of noise, for which a fit is taken up again."""
 HOPS, STRIDES = 3, 4
 """How often that is done, and how often the way to there is gone on, twice as far each time."""
-WIDEST = 6.0
-"""By how much a flat valley widens an interval at most."""
+SHOWN, LEAST = 4.0, 1.0
+"""A valley shows where the cost has risen by so many times the roughness, and by the second number at least."""
+WIDEST = 100.0
+"""By how much a valley that never shows widens an interval."""
+ASTRAY = 0.5
+"""Share of the distance over which a valley rises by the roughness, squared, that counts as variance."""
 LAW_ERROR = 0.01
 """Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
+WIDTH_ONLY = float("inf")
+"""The same where nothing is taken up any more."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +61,41 @@ class Look:
     """By how much the cost would grow if it were quadratic."""
 
 
+AllOf = Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look]]
+"""Does independent pieces of work, and returns their results in order."""
+
+
 def solver_of(base: Node, c: Candidate) -> Solver:
     """Return what fits a candidate."""
     return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine, threads=1))
 
 
-def ways(base: Node, c: Candidate) -> list[tuple[int, float]]:
-    """Return where to look: parameter of the candidate, and how far along its profile in standard deviations."""
+def ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int, float]]:
+    """Return where to look next: parameter of the candidate, and how far along its profile in standard deviations.
+
+    Both sides of each parameter at first; farther on the sides where the valley does not show yet.
+    """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
-    fresh = range(prediction.owned, len(prediction.parameters))
     found = []
-    for k in fresh:
+    for k in range(prediction.owned, len(prediction.parameters)):
         p, value = prediction.parameters[k], c.fit.values[k]
-        for reach in REACHES[len(fresh) > FEW]:
+        rough = roughness(c, tried, k)
+        for side in (-1.0, 1.0):
+            mine = [s for s in tried if s.parameter == k and s.reach * side > 0]
+            far = max(mine, key=lambda s: abs(s.reach), default=None)
+            if far is not None and far.cost - c.fit.cost >= max(SHOWN * rough, LEAST):
+                continue
+            reach = side * NEAR if far is None else FARTHER * far.reach
             if np.isfinite(value) and p.low <= value + reach * spread[k] * p.scale <= p.high:
                 found.append((k, reach))
     return found
+
+
+def roughness(c: Candidate, tried: Sequence[Look], parameter: int) -> float:
+    """Return by how much the cost rises more than derivatives promise where it is looked at first, 0 if it does not."""
+    near = [s for s in tried if s.parameter == parameter and abs(s.reach) == NEAR]
+    return max(float(np.mean([s.cost - c.fit.cost - s.expected for s in near])), 0.0) if near else 0.0
 
 
 def look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
@@ -93,9 +118,7 @@ def taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
     return found if found.fit.cost < c.fit.cost else c
 
 
-def settled(
-    base: Node, c: Candidate, all_of: Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look]]
-) -> Candidate:
+def settled(base: Node, c: Candidate, all_of: AllOf) -> Candidate:
     """Return a candidate with values that no look around betters, and with how sharply the data tell them.
 
     Args:
@@ -104,7 +127,7 @@ def settled(
         all_of: Does independent pieces of work.
     """
     for _ in range(HOPS):
-        seen = list(all_of(look, [(base, c, *way) for way in ways(base, c)]))
+        seen = looks(base, c, all_of)
         best = min(seen, key=lambda s: s.cost, default=None)
         if best is None or best.cost > c.fit.cost - WORTH:
             return replace(c, spread=spreads(base, c, seen))
@@ -114,30 +137,49 @@ def settled(
                 break
             best = further
         c = taken_up(base, c, best)
-    return replace(c, spread=spreads(base, c, all_of(look, [(base, c, *way) for way in ways(base, c)])))
+    return replace(c, spread=spreads(base, c, looks(base, c, all_of, WIDTH_ONLY)))
+
+
+def looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[Look]:
+    """Look around a fit, farther where need be; stop where a lower cost is found."""
+    seen: list[Look] = []
+    for _ in range(1 + EXTENSIONS):
+        todo = ways(base, c, seen)
+        if not todo:
+            break
+        seen += all_of(look, [(base, c, *way) for way in todo])
+        if min(s.cost for s in seen) < c.fit.cost - worth:
+            break
+    return seen
 
 
 def spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
     """Return the standard deviations of a candidate's parameters, in units of their scale, shape (P,).
 
-    Those of the linear fit, larger by what a parabola through the looks is flatter, and by how far its middle is off.
+    Those of the linear fit, larger by what the valley is flatter, by how far its middle is off, and by how far the
+    roughness may have led astray.
     """
     spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
     for k in {s.parameter for s in seen}:
-        mine = [s for s in seen if s.parameter == k]
-        at = np.array([s.reach for s in mine])
-        rise = np.array([s.cost for s in mine]) - c.fit.cost
-        linear, curved = parabola(at, rise)
-        expected = float(np.mean([s.expected / s.reach**2 for s in mine]))
-        flatter = WIDEST if curved <= 0 else np.clip(np.sqrt(expected / curved), 1.0, WIDEST)
-        off = WIDEST if curved <= 0 else min(abs(linear) / (2 * curved), float(np.abs(at).max()))
-        spread[k] *= np.hypot(flatter, off)
+        mine, rough = [s for s in seen if s.parameter == k], roughness(c, seen, k)
+        far = [
+            max((s for s in mine if s.reach * side > 0), key=lambda s: abs(s.reach), default=None) for side in (-1, 1)
+        ]
+        ends = [s for s in far if s is not None]
+        at = np.array([s.reach for s in ends])
+        linear, curved = parabola(at, np.array([s.cost - c.fit.cost - rough for s in ends]))
+        if curved <= 0:
+            spread[k] *= WIDEST
+            continue
+        flatter = float(np.mean([s.expected / s.reach**2 for s in ends])) / curved
+        off = min(abs(linear) / (2 * curved), float(np.abs(at).max()))
+        spread[k] *= min(np.sqrt(max(flatter, 1.0) + off**2 + ASTRAY * rough / curved), WIDEST)
     return spread
 
 
 def parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
-    """Return b and c of the parabola b x + c x^2 that fits points best; b is zero where they lie on one side only."""
-    both = at.min() < 0 < at.max()
+    """Return b and c of the parabola b x + c x^2 through two points; b is zero where they lie on one side only."""
+    both = len(at) > 1
     columns = np.column_stack([at, at**2] if both else [at**2])
     found = np.linalg.lstsq(columns, rise, rcond=None)[0]
     return (float(found[0]), float(found[1])) if both else (0.0, float(found[0]))
