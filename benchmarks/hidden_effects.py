@@ -4,8 +4,9 @@ python benchmarks/hidden_effects.py                          # every data set th
 python benchmarks/hidden_effects.py --kinds null --rigs drop # some of them
 python benchmarks/hidden_effects.py --report                 # the page from what is done
 
-Each data set is diagnosed in a process of its own, as many at a time as `--jobs`; what is done is kept in `--out`, one
-file a data set, so that the command may be stopped and called again. The data are those of `hidden_effects_data.py`.
+Each data set is diagnosed in a process of its own, as many at a time as `--jobs`. What is done is kept in `--out`, one
+file a data set, and pieces of those under way, so that the command may be stopped and called again. The data are those
+of `hidden_effects_data.py`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from hidden_effects_data import DataSet, Kind, cases, make
 from hidden_effects_report import write_report
 from pages import machine, machine_line
 
-from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnose.diagnose import DiagnosisCfg
 from concent_warp.errors import ConcentError
 from concent_warp.model import Model, write_text
 
@@ -50,6 +52,8 @@ class Args:
     must not see the page's."""
     jobs: int = len(os.sched_getaffinity(0))
     """Data sets at a time."""
+    each: int = 1
+    """Processes of each diagnosis."""
     out: Path = OUT
     """Where the results lie."""
     report: bool = False
@@ -67,7 +71,7 @@ def main(args: Args) -> None:
         random.Random(0).shuffle(todo)  # so that what is done when it is stopped is a fair part of the whole
         begun = time.monotonic()
         with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
-            futures = {pool.submit(study, case, args.out): case for case in todo}
+            futures = {pool.submit(study, case, args.out, args.each): case for case in todo}
             for k, future in enumerate(as_completed(futures)):
                 result = future.result()
                 left = (time.monotonic() - begun) * (len(todo) - k - 1) / (k + 1)
@@ -92,7 +96,7 @@ def path(out: Path, case: DataSet) -> Path:
     return out / f"{case.name}.json"
 
 
-def study(case: DataSet, out: Path) -> dict[str, Any]:
+def study(case: DataSet, out: Path, jobs: int = 1) -> dict[str, Any]:
     """Diagnose one data set and keep the result."""
     data = make(case)
     result: dict[str, Any] = {
@@ -109,7 +113,8 @@ def study(case: DataSet, out: Path) -> dict[str, Any]:
     }
     begun = time.perf_counter()
     try:
-        found = diagnose(Model(data.scene), data.recording, DiagnosisCfg(jobs=1, seed=case.seed, explain=False))
+        cfg = DiagnosisCfg(jobs=jobs, seed=case.seed, explain=False)
+        found = diagnose_with_checkpoint(Model(data.scene), data.recording, out / "pieces" / case.name, cfg)
         result |= found.to_json()
     except ConcentError as error:
         result |= {"error": str(error)}

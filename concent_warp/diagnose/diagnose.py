@@ -202,7 +202,8 @@ class Procedure:
             last = nodes[-1]
             owned = len(last.model.effects) - len(steps)
             # The last one has just shown its worth beside all others.
-            tried = self.parallel(without, [(last, owned + k) for k in range(len(steps) - 1)], "leaving out", 0.0)
+            self.progress(self._done, "leaving out one at a time")
+            tried = list(run_all(without, [(last, owned + k) for k in range(len(steps) - 1)], self.cfg.jobs))
             shares = [1 - last.errors.sum() / max(n.errors.sum(), 1e-12) for n in tried]
             least = int(np.argmin(shares))
             if shares[least] >= self.cfg.least_gain:

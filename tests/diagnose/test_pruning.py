@@ -1,6 +1,7 @@
 import pytest
 
 from concent_warp.diagnose.blocks import cut_blocks
+from concent_warp.diagnose.checkpoint import CheckpointedProcedure
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.diagnose.search import extended, fit_candidate, node, polish_candidate, screen, without
 from concent_warp.effects.registry import effect_class
@@ -20,9 +21,11 @@ def nodes():
     return recording, found
 
 
-def procedure(recording, nodes):
+def procedure(recording, nodes, folder=None):
     cfg = DiagnosisCfg(jobs=1)
     made = Procedure(nodes[0].model, recording, cfg, silent)
+    if folder is not None:
+        made = CheckpointedProcedure(nodes[0].model, recording, cfg, silent, folder, "key")
     for last in nodes[1:]:
         # What a search leaves behind after each addition.
         name = last.model.effects[-1].effect.name
@@ -39,9 +42,10 @@ def test_a_model_without_one_of_its_effects_is_fitted_again(nodes):
     assert alone.ratio == pytest.approx(last.ratio, rel=0.02)
 
 
-def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(nodes):
+@pytest.mark.parametrize("kept", [False, True])
+def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(nodes, kept, tmp_path):
     recording, found = nodes
-    made = procedure(recording, found)
+    made = procedure(recording, found, tmp_path if kept else None)
     after = made.pruned(list(found))
     assert [a.effect.name for a in after[-1].model.effects] == ["joint_damping"]
     assert len(after) == len(found) + 1
