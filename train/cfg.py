@@ -99,6 +99,8 @@ class RewardCfg:
     """The same for turning it [1/rad]."""
     failure: float = 5.0
     """Fixed penalty of an episode that ends in failure."""
+    scale: float = 0.05
+    """Factor on all of it, so that values are of order 1, which the value function learns sooner."""
     engineered: EngineeredCfg = field(default_factory=EngineeredCfg)
 
 
@@ -110,6 +112,8 @@ class CollisionCfg:
     """Distance below which spheres outside the physics are penalised [m]."""
     severe: float = 0.006
     """Penetration of one of them that ends the episode [m]."""
+    slack: float = 0.0005
+    """How deep contacts of the physics are, too: left-out spheres are taken to be smaller by so much [m]."""
     depth: float = 10.0
     """Penalty of a penetration [1/m], summed over the spheres."""
     band: float = 0.01

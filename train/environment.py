@@ -7,7 +7,7 @@ is a captured graph.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, cast
 
@@ -123,10 +123,12 @@ class Environment(VecEnv):
         self.reward = torch.zeros(n, device=device)
         self.done = torch.zeros(n, dtype=torch.bool, device=device)
         self.time_out = torch.zeros(n, dtype=torch.bool, device=device)
+        self.failure = torch.zeros(n, 3, dtype=torch.bool, device=device)
+        """Whether the last step ended in a drop, a severe virtual collision or divergence, shape (N, 3)."""
         self.success = torch.zeros(n, dtype=torch.bool, device=device)
         """Whether object 1 was in place at the end of the last step."""
         self.terms = torch.zeros(n, len(TERMS), device=device)
-        """Weighted terms of the last reward, shape (N, len(TERMS))."""
+        """Weighted terms of the last reward before it is scaled, shape (N, len(TERMS))."""
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self._return = torch.zeros(n, device=device)
         self._sums = torch.zeros(len(SUMS), dtype=torch.float64, device=device)
@@ -146,6 +148,17 @@ class Environment(VecEnv):
             self._sums.zero_()
             self._offended.zero_()
             self.refresh()
+
+    def start_from(self, rows: Sequence[int]) -> None:
+        """Start an episode in every world from the states of these rows, one each."""
+        index = torch.as_tensor(np.asarray(rows), device=self.device)
+        p = self.physics
+        for state, pool in zip((p.qpos, p.qvel, p.ctrl), self._pool, strict=True):
+            state.copy_(pool[index].to(state.dtype))
+        p.warmstart.zero_()
+        self.episode_length_buf.zero_()
+        self._return.zero_()
+        self.refresh()
 
     def refresh(self) -> None:
         """Compute poses, distances and the observation that follow from the present state."""
@@ -256,6 +269,7 @@ class Environment(VecEnv):
         dropped = ((self._distance > self._dropped) & self._watched).any(dim=1) & sane
         severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
         failed = diverged | dropped | severe
+        self.failure.copy_(torch.stack([dropped, severe & ~dropped, diverged], dim=1))
         if self._place is None:
             self.success.copy_((self._worst < self._success) & sane)
         else:
@@ -268,7 +282,7 @@ class Environment(VecEnv):
         terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
         terms[:, -1] = -cfg.failure * failed
         self.terms.copy_(terms)
-        self.reward.copy_(terms.sum(dim=1))
+        self.reward.copy_(cfg.scale * terms.sum(dim=1))
 
         self.episode_length_buf += 1
         self._return += self.reward
@@ -277,7 +291,7 @@ class Environment(VecEnv):
         self._note_offence(diverged)
         ended = self.done.double()
         overflow = (p.overflow != 0).double().sum()
-        counts = [self.success & self.time_out, self.time_out, dropped, severe & ~dropped, diverged]
+        counts = [self.success & self.time_out, self.time_out, *self.failure.unbind(dim=1)]
         sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
         sums += [count.double().sum() for count in counts]
         sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum(), overflow]

@@ -125,7 +125,7 @@ class Trainer:
         self.steps += self.cfg.ppo.steps * environment.num_envs
         self.seconds += end - start
         log |= {f"loss {name}": float(value) for name, value in losses.items()}
-        log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.mean())}
+        log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
         this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, log)
         self.history.append(this)
         self._keep_offence()

@@ -33,7 +33,8 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     for body in geometry.bodies:
         left = geometry.of(body)[~task.collidable[geometry.of(body)]]
         if len(left):
-            sets.append(SphereSet(m.body(body).id, geometry.position[left], geometry.radius[left]))
+            radius = np.maximum(geometry.radius[left] - cfg.slack, 0.0)
+            sets.append(SphereSet(m.body(body).id, geometry.position[left], radius))
     links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
     tool = int(m.site_bodyid[task.robot.tool])
     links |= {i for i in range(m.nbody) if i == tool or int(m.body_parentid[i]) in links | {tool}}

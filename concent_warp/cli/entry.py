@@ -20,6 +20,8 @@ COMMANDS = {
     "compare": "compare a model, or two, with a recording",
     "locate": "find where a model lacks forces: by joint, and on which place of which object",
     "diagnose": "find which physical effect a model lacks, with the evidence, or why none can be named",
+    "train": "train a policy to bring about the contact events of a demonstration",
+    "evaluate": "count how often a trained policy succeeds, in simulation and in the stand-in world",
     "add": "add a physical effect to a model, and fit it to a recording",
 }
 """Names of the commands, each a module of this package, with what they do."""

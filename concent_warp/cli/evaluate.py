@@ -1,0 +1,91 @@
+"""``concent evaluate``: how often a trained policy succeeds, in simulation and in the stand-in world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from concent_warp.cli.terminal import progress_bar, quiet_warp, say
+from concent_warp.reality.world import WorldCfg
+from concent_warp.scene.shape_sorter import ShapeSorterCfg
+from concent_warp.train.cfg import EnvironmentCfg, TrainError
+
+if TYPE_CHECKING:
+    from concent_warp.train.environment import Environment
+    from concent_warp.train.evaluate import Evaluation
+    from concent_warp.train.resets import InitialStates
+    from concent_warp.train.task import Task
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Run a trained policy from many initial states that it was not trained from, and count successes.
+
+    In the stand-in world shapes are exact, friction cones elliptic and steps fine; the policy has seen none of it.
+    """
+
+    checkpoint: Path
+    """Run folder of a training, or its checkpoint file."""
+    world: Literal["simulation", "reality", "both"] = "both"
+    """Where to run the policy."""
+    episodes: int = 200
+    """Initial states, of which each is run once in each world."""
+    seed: int = 0
+    """Seed of the initial states."""
+    device: str | None = None
+    """Warp's name of the device for the simulation."""
+    shapes: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
+    reality: WorldCfg = field(default_factory=WorldCfg)
+
+
+def run(arguments: Arguments) -> dict[str, Evaluation]:
+    """Evaluate and print."""
+    quiet_warp()
+    import torch
+
+    from concent_warp.train.evaluate import evaluate
+    from concent_warp.train.ppo import CHECKPOINT, Trainer, load_checkpoint
+    from concent_warp.train.run import Run
+    from concent_warp.train.worlds import make_environment
+
+    if arguments.episodes < 1:
+        raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
+    path = arguments.checkpoint / CHECKPOINT if arguments.checkpoint.is_dir() else arguments.checkpoint
+    made = Run.load(path.parent)
+    task = made.task()
+    states = made.evaluation_states(task, arguments.episodes, arguments.seed)
+    torch.manual_seed(arguments.seed)
+    found: dict[str, Evaluation] = {}
+    for world in ("simulation", "reality") if arguments.world == "both" else (arguments.world,):
+        cfg = replace(made.cfg.environment, worlds=min(arguments.episodes, made.cfg.environment.worlds))
+        if world == "reality":
+            environment = real_environment(task, cfg, states, arguments)
+        else:
+            environment = make_environment(task, cfg, states, device=arguments.device)
+        trainer = Trainer(environment, made.cfg)
+        weights = load_checkpoint(path, str(environment.device))
+        trainer.algorithm.load(weights, {"actor": True}, True)
+        with progress_bar(world) as progress:
+            found[world] = evaluate(environment, trainer.policy(), states, progress=progress)
+        say(f"{world}: {found[world].sentence()}")
+    return found
+
+
+def real_environment(task: Task, cfg: EnvironmentCfg, states: InitialStates, arguments: Arguments) -> Environment:
+    """Return the stand-in world with the policy's senses and commands, its block to come to rest in the hole."""
+    from concent_warp.train.environment import Environment
+    from concent_warp.train.physics import MujocoPhysics
+
+    model = arguments.reality.build(task.model.scene).compile()
+    bodies = [task.compiled.body(i).name for i in range(task.compiled.nbody)]
+    if [model.body(i).name for i in range(model.nbody)] != bodies or model.nq != task.compiled.nq:
+        raise TrainError("the stand-in world has other bodies than the model", where=task.model.scene.source)
+    shapes = arguments.shapes
+    if task.place is not None:
+        task = replace(task, place=np.array([0.0, 0.0, shapes.floor + shapes.block_size / 2]))
+    steps = round(cfg.decimation * task.replay.timestep / arguments.reality.timestep)
+    physics = MujocoPhysics(model, cfg.worlds, steps)
+    return Environment(task, replace(cfg, collision="full"), physics, states)

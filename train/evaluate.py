@@ -1,0 +1,101 @@
+"""How often a policy succeeds: one episode from each initial state, judged by geometry at its end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from concent_warp.train.environment import Environment
+from concent_warp.train.resets import InitialStates
+from tensordict import TensorDict
+
+Policy = Callable[[TensorDict], torch.Tensor]
+FAILURES = ("dropped", "severe", "diverged")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcomes of E episodes."""
+
+    success: np.ndarray
+    """Whether each ended with object 1 in place, shape (E,) bool."""
+    outcome: tuple[str, ...]
+    """"success", "missed" where time was up, or what made it fail."""
+    length: np.ndarray
+    """Steps of each, shape (E,) int."""
+
+    @property
+    def rate(self) -> float:
+        """Share of successes."""
+        return float(self.success.mean())
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the share."""
+        return wilson(int(self.success.sum()), len(self.success))
+
+    def counts(self) -> dict[str, int]:
+        """Return how many episodes came to each outcome."""
+        return {name: self.outcome.count(name) for name in sorted(set(self.outcome))}
+
+    def sentence(self) -> str:
+        """Return the result in words."""
+        low, high = self.interval
+        others = ", ".join(f"{count} {name}" for name, count in self.counts().items() if name != "success")
+        text = f"{int(self.success.sum())} of {len(self.success)} succeed: {self.rate:.1%} ({low:.1%} to {high:.1%})"
+        return f"{text}; {others}" if others else text
+
+
+def evaluate(
+    environment: Environment, policy: Policy, states: InitialStates, *, progress: Callable[[float], None] | None = None
+) -> Evaluation:
+    """Run one episode from each of the states that an environment was made with.
+
+    Args:
+        environment: The worlds.
+        policy: From observations to actions, without exploration.
+        states: The environment's initial states.
+        progress: Called with the share done.
+    """
+    count, worlds = len(states.qpos), environment.num_envs
+    success, length = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
+    outcome = ["missed"] * count
+    steps = int(environment.max_episode_length)
+    for first in range(0, count, worlds):
+        rows = np.arange(first, first + worlds) % count
+        environment.start_from(rows.tolist())
+        observation = environment.get_observations()
+        open_ = np.ones(worlds, dtype=bool)
+        for k in range(steps):
+            with torch.inference_mode():
+                observation, _, done, _ = environment.step(policy(observation))
+            ended = done.cpu().numpy() & open_
+            for world in np.flatnonzero(ended):
+                if first + world >= count:
+                    continue
+                row = first + world
+                failed = environment.failure[world].cpu().numpy()
+                success[row] = bool(environment.success[world]) and not failed.any()
+                outcome[row] = FAILURES[int(failed.argmax())] if failed.any() else outcome[row]
+                outcome[row] = "success" if success[row] else outcome[row]
+                length[row] = k + 1
+            open_ &= ~ended
+            if progress is not None:
+                progress((first + worlds * (k + 1) / steps) / (math.ceil(count / worlds) * worlds))
+            if not open_.any():
+                break
+    return Evaluation(success, tuple(outcome), length)
+
+
+def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
+    """Return Wilson's interval of a share (Wilson, J. Am. Stat. Assoc. 22, 1927), 95 % by default."""
+    if trials == 0:
+        return 0.0, 1.0
+    share = successes / trials
+    centre = share + z * z / (2 * trials)
+    spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    scale = 1 + z * z / trials
+    return max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0)
