@@ -89,10 +89,11 @@ def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> Unk
     first, last = nodes[0], dealt_in_turn(replace(nodes[-1], engine="mujoco"))
     if last.ratio > cfg.adequate or last.ratio**2 < 1 + LEAST:
         return None
-    screened = results(screen, [(last, force) for force in forces(last)])
-    tried = [weighed(last, s, share) for s in screened for share in SHARES]
-    if not tried:
+    screened = list(results(screen, [(last, force) for force in forces(last)]))
+    if not screened:
         return None
+    tried = [weighed(last, s, share) for s in screened for share in SHARES]
+    tried += [together(last, screened, share) for share in SHARES]
     gains = [linear_gain(last, s.pieces, last.pieces, last.errors) for s in tried]
     best = int(np.argmax(gains))
     gain = gains[best]
@@ -101,7 +102,8 @@ def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> Unk
         return None
     null = chance(last, tried, cfg.draws, cfg.seed)
     p = float((1 + np.sum(null >= gain)) / (len(null) + 1))
-    force = tried[best].effect
+    # Several forces at once are named by the one that explains most by itself.
+    force = tried[int(np.argmax(gains[: len(SHARES) * len(screened)]))].effect
     assert isinstance(force, UnknownForce)
     return UnknownForceFound(force.words, gain, p, min(share, 1.0)) if p <= cfg.level else None
 
@@ -126,6 +128,17 @@ def weighed(base: Node, s: Screened, share: float) -> Screened:
     factor = np.where(seen, np.sqrt(each / np.maximum(square, 1e-30)) / PRIOR, 0.0)
     scale = np.concatenate([np.ones(own), factor])
     return replace(s, pieces=tuple(replace(piece, jacobian=piece.jacobian * scale) for piece in s.pieces))
+
+
+def together(base: Node, screened: Sequence[Screened], share: float) -> Screened:
+    """Return all forces at once, each expected to explain as much, together a share of the error."""
+    own = base.pieces[0].jacobian.shape[1]
+    parts = [weighed(base, s, share / len(screened)).pieces for s in screened]
+    pieces = tuple(
+        replace(same[0], jacobian=np.hstack([same[0].jacobian[:, :own], *(p.jacobian[:, own:] for p in same)]))
+        for same in zip(*parts, strict=True)
+    )
+    return replace(screened[0], pieces=pieces)
 
 
 def forces(base: Node) -> list[Effect]:
