@@ -109,8 +109,7 @@ class Environment(VecEnv):
         tool = int(m.site_bodyid[robot.tool])
         self._held = torch.as_tensor(task.holds, device=self.device)
         self._frame = index([tool if holds else 0 for holds in task.holds])
-        keeps = task.events.stages[task.stage].bodies[0] != "robot"
-        self._watched = torch.as_tensor(task.held[task.stage] & task.table.used[task.stage] & keeps, device=self.device)
+        self._watched = torch.as_tensor(task.held[task.stage] & task.keeps, device=self.device)
         self._place = None if task.place is None else real(task.place)
         pool = self._states
         self._pool = [real(values) for values in (pool.qpos, pool.qvel, pool.ctrl)]

@@ -11,8 +11,14 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.simulate.mujoco_engine import quiet_warnings
+
 if TYPE_CHECKING:
     from concent_warp.effects.law import Law
+
+
+UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+"""Warnings after which MuJoCo resets a world to its reference pose."""
 
 
 class Physics(Protocol):
@@ -104,8 +110,13 @@ class MujocoPhysics:
         return self._xpos, self._xquat
 
     def advance(self) -> None:
-        """Simulate the steps of one action."""
+        """Simulate the steps of one action. A world that MuJoCo resets as unstable is left not finite instead."""
         ctrl = self.ctrl.numpy().astype(float)
+        with quiet_warnings():
+            self._advance(ctrl)
+
+    def _advance(self, ctrl: np.ndarray) -> None:
+        """Simulate the steps of one action, the commands of shape (N, nu) held."""
         for i, d in enumerate(self._data):
             self._write(i, d)
             for _ in range(self._decimation):
@@ -124,6 +135,8 @@ class MujocoPhysics:
                 mujoco.mj_step(self.model, d)
             mujoco.mj_kinematics(self.model, d)
             self._read(i, d)
+            if any(d.warning[kind].number for kind in UNSTABLE):
+                self._arrays[0][i] = np.nan
 
     def place(self) -> None:
         """Compute the poses that follow from the positions."""

@@ -57,7 +57,8 @@ def draw_states(
     """Draw initial states of the task's stage.
 
     Moments are drawn from shortly before the stage that precedes it to the stage's first contact; for states that are
-    not displaced, to the middle of the target event's window, so that some have all but reached it.
+    not displaced, to the middle of the target event's window, so that some have all but reached it. Where the stage
+    begins with object 1 in the hand, so do all its states.
 
     Args:
         task: The task.
@@ -125,6 +126,8 @@ class Drawing:
         start, onset, end = self.window
         kept = self.rng.random() < self.cfg.demonstrated
         time = self.rng.uniform(start, end if kept else onset)
+        while self.task.keeps and self.case(time) == 1:
+            time = self.rng.uniform(start, end if kept else onset)
         row = self.task.replay.row(time)
         qpos, ctrl = self.task.replay.qpos[row].copy(), self.task.replay.ctrl[row].copy()
         case = self.case(time)

@@ -49,9 +49,10 @@ def choose(events: ContactEventSequence, stage: Stage, count: int) -> list[Conta
     ranked = [*opening, *(bodies for bodies in ordered if bodies not in opening)]
     share = dict.fromkeys(ranked[:count], 1)
     for favoured in (opening, ranked):
-        while sum(share.values()) < count and any(share.get(b, 0) < len(ordered[b]) for b in favoured):
-            fewest = min((b for b in favoured if share.get(b, 0) < len(ordered[b])), key=lambda b: share.get(b, 0))
-            share[fewest] = share.get(fewest, 0) + 1
+        while room := [b for b in favoured if b in share and share[b] < len(ordered[b])]:
+            if sum(share.values()) == count:
+                break
+            share[min(room, key=lambda bodies: share[bodies])] += 1
     return [pair for bodies in ranked for pair in ordered[bodies][: share.get(bodies, 0)]]
 
 

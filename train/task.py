@@ -117,6 +117,11 @@ class Task:
         )
 
     @property
+    def keeps(self) -> bool:
+        """Whether the stage begins with object 1 in the hand, which is to stay there."""
+        return self.events.stages[self.stage].bodies[0] != "robot" and bool(self.held[self.stage].any())
+
+    @property
     def holds(self) -> tuple[bool, ...]:
         """Whether the stage's target event has the robot touch each object."""
         touched = self.table.body_b[self.stage][self.held[self.stage]]

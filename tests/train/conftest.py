@@ -1,0 +1,23 @@
+import pytest
+import torch
+from concent_warp.train.environment import Environment
+from concent_warp.train.resets import InitialStates, draw_states
+from concent_warp.train.task import Task
+from concent_warp.train.worlds import make_environment
+from small_insertion import SETTINGS, make_task
+
+
+@pytest.fixture(scope="session")
+def task() -> Task:
+    return make_task()
+
+
+@pytest.fixture(scope="session")
+def states(task: Task) -> InitialStates:
+    return draw_states(task, SETTINGS.reset, 0, count=40)
+
+
+@pytest.fixture
+def environment(task: Task, states: InitialStates) -> Environment:
+    torch.manual_seed(0)
+    return make_environment(task, SETTINGS, states, device="cpu")

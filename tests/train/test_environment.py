@@ -1,0 +1,173 @@
+"""Bookkeeping of the vectorised environment."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.environment import TERMS, Environment
+from concent_warp.train.physics import WarpPhysics
+from concent_warp.train.worlds import drawn_fields, make_environment, make_physics
+from small_insertion import SETTINGS
+
+
+def still(environment: Environment) -> torch.Tensor:
+    return torch.zeros(environment.num_envs, environment.num_actions)
+
+
+def start(environment: Environment) -> None:
+    environment.start_from(list(range(environment.num_envs)))
+    environment.read_log()
+
+
+def test_episode_that_runs_its_time_is_a_time_out_and_no_failure(environment):
+    start(environment)
+    for _ in range(environment.max_episode_length - 1):
+        _, _, done, extras = environment.step(still(environment))
+        assert not done.any()
+        assert not extras["time_outs"].any()
+    _, _, done, extras = environment.step(still(environment))
+    assert done.all()
+    assert extras["time_outs"].all()
+    assert not environment.failure.any()
+    log = environment.read_log()
+    assert log["time outs"] == 1.0
+    assert log["length"] == environment.max_episode_length
+    assert (environment.episode_length_buf == 0).all()
+
+
+def test_letting_go_is_a_failure_and_no_time_out(environment):
+    start(environment)
+    opening = still(environment)
+    opening[:, -1] = 1.0
+    environment.physics.ctrl[:, -1] = 0.03
+    ended = torch.zeros(environment.num_envs, dtype=torch.bool)
+    for _ in range(environment.max_episode_length - 1):
+        _, reward, done, extras = environment.step(opening)
+        assert not extras["time_outs"].any()
+        fallen = environment.failure[:, 0]
+        assert (done >= fallen).all()
+        expected = -environment.cfg["reward"]["failure"] * done.float()
+        torch.testing.assert_close(environment.terms[:, TERMS.index("failure")], expected)
+        torch.testing.assert_close(reward, environment.cfg["reward"]["scale"] * environment.terms.sum(dim=1))
+        ended |= fallen
+        environment.physics.ctrl[:, -1] = 0.03
+    # Blocks low in the hole have nowhere to fall.
+    assert ended.float().mean() > 0.5
+
+
+def test_world_that_diverges_is_reset_counted_and_kept_apart(environment):
+    start(environment)
+    before = environment.physics.qvel.clone()
+    environment.physics.qvel[3, 0] = 1e9
+    _, reward, done, extras = environment.step(still(environment))
+    assert done.nonzero().ravel().tolist() == [3]
+    assert not extras["time_outs"].any()
+    assert environment.failure[3].tolist() == [False, False, True]
+    assert torch.isfinite(reward).all()
+    assert torch.isfinite(environment.observation).all()
+    assert environment.read_log()["diverged worlds"] == 1
+    offence = environment.offending_state()
+    assert offence is not None
+    assert offence["qvel"][0] == pytest.approx(1e9)
+    np.testing.assert_allclose(offence["qvel"][1:], before[3, 1:], atol=1e-6)
+
+
+def test_ended_worlds_start_from_initial_states_and_show_them(environment, states):
+    start(environment)
+    environment.episode_length_buf[::2] = environment.max_episode_length
+    observation, _, done, _ = environment.step(still(environment))
+    assert done[::2].all()
+    assert not done[1::2].any()
+    qpos = environment.physics.qpos.numpy()
+    nearest = np.abs(qpos[:, None] - states.qpos[None]).max(axis=2).min(axis=1)
+    assert nearest[::2].max() < 1e-6
+    shown = observation["policy"][:, environment.layout.columns("object 1")][:, :3]
+    np.testing.assert_allclose(shown[::2], qpos[::2, :3], atol=1e-6)
+
+
+def test_returned_observations_are_copies(environment):
+    observation = environment.get_observations()["policy"]
+    kept = observation.clone()
+    environment.step(torch.ones(environment.num_envs, environment.num_actions))
+    torch.testing.assert_close(observation, kept, rtol=0, atol=0)
+
+
+def test_actions_step_commands_within_range_and_lead(environment, task):
+    start(environment)
+    before = environment.physics.ctrl.clone()
+    environment.step(torch.full((environment.num_envs, environment.num_actions), 0.5))
+    moved = environment.physics.ctrl[:, :3] - before[:, :3]
+    np.testing.assert_allclose(moved, 0.5 * 0.004, atol=1e-6)
+    for _ in range(20):
+        at = environment.physics.qpos[:, task.robot.qpos].float()
+        done = environment.step(torch.full((environment.num_envs, environment.num_actions), -7.0))[2]
+        ahead = (environment.physics.ctrl[:, :3] - at).abs()[~done]
+        assert (ahead <= 0.015 + 1e-6).all()
+        assert (environment.physics.ctrl[:, 3] >= -0.01 - 1e-7).all()
+
+
+def test_success_is_block_in_its_demonstrated_place(environment, task):
+    start(environment)
+    block = environment.physics.qpos[:, :3]
+    box = task.compiled.body("box").pos
+    block[:] = torch.as_tensor(box + task.place)
+    block[1::2, 2] += 0.006
+    environment.physics.place()
+    off = (environment.place() - torch.as_tensor(task.place)).abs().max(dim=1).values
+    assert (off[::2] < 1e-6).all()
+    assert (off[1::2] > 0.005).all()
+    environment.physics.qvel.zero_()
+    environment.step(still(environment))
+    assert environment.success[::2].float().mean() > environment.success[1::2].float().mean()
+
+
+def test_saved_state_is_gone_on_with_exactly(environment):
+    start(environment)
+    environment.step(0.3 * torch.ones(environment.num_envs, environment.num_actions))
+    state = environment.state()
+    first = environment.step(still(environment))[0]["policy"]
+    environment.step(still(environment))
+    environment.restore(state)
+    again = environment.step(still(environment))[0]["policy"]
+    torch.testing.assert_close(first, again, rtol=0, atol=0)
+
+
+def test_both_simulators_give_the_same_steps(task, states):
+    cfg = replace(SETTINGS, worlds=4, decimation=2)
+    found = []
+    for engine in ("mujoco", "warp"):
+        torch.manual_seed(0)
+        environment = make_environment(task, replace(cfg, engine=engine), states, device="cpu")
+        start(environment)
+        for _ in range(5):
+            observation, reward, _, _ = environment.step(0.2 * torch.ones(4, environment.num_actions))
+        found.append((observation["policy"], reward))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=2e-3)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=2e-3)
+
+
+def test_randomised_fields_differ_between_worlds_and_are_used(task):
+    cfg = replace(SETTINGS.randomisation, friction=(0.5, 1.5), stiffness=(0.8, 1.2))
+    fields = drawn_fields(task.compiled, 4, cfg, 0)
+    ratio = fields["geom_friction"][:, :, 0] / task.compiled.geom_friction[:, 0]
+    assert ((ratio > 0.5) & (ratio < 1.5)).all()
+    assert len(np.unique(ratio[:, 0].round(9))) == 4
+    np.testing.assert_allclose(ratio, ratio[:, :1] * np.ones_like(ratio))
+    gain, bias = fields["actuator_gainprm"][..., 0], fields["actuator_biasprm"][..., 1]
+    np.testing.assert_allclose(gain, -bias)
+    physics = make_physics(task, replace(SETTINGS, worlds=4, engine="warp", randomisation=cfg), device="cpu")
+    assert isinstance(physics, WarpPhysics)
+    start_qpos = physics.qpos.clone()
+    physics.ctrl[:, :3] = 0.05
+    physics.advance()
+    moved = (physics.qpos - start_qpos)[:, task.robot.qpos[0]]
+    assert len(torch.unique(moved)) == 4
+
+
+def test_collidable_spheres_are_those_of_the_events(task):
+    spheres = [g for g in range(task.compiled.ngeom) if task.compiled.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE]
+    touched = {e.name for e in task.events.entities if e.sphere is not None}
+    assert {task.compiled.geom(g).name for g in spheres} == touched
+    assert 0 < len(touched) < len(task.collidable)
