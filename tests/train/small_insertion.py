@@ -102,7 +102,7 @@ def make_demonstration(model: Model) -> Demonstration:
     }
     qpos = model.scene.model.qpos0.copy()
     qpos[[9, 10, 11]] = HIGH, OPEN, OPEN
-    return Demonstration("show", action=action, qpos=qpos)
+    return Demonstration("demo_0", action=action, qpos=qpos)
 
 
 def make_events(model: Model, demonstration: Demonstration) -> ContactEventSequence:

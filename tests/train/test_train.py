@@ -1,0 +1,127 @@
+"""Training to success, going on exactly, and losing nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.environment import Environment
+from concent_warp.train.evaluate import evaluate, wilson
+from concent_warp.train.ppo import CHECKPOINT, OFFENCE, Round
+from concent_warp.train.run import Run, train
+from concent_warp.train.worlds import make_environment
+from small_insertion import SETTINGS, make_demonstration, make_model
+
+from concent_warp.cli import main
+from concent_warp.events.extract import extract
+from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.recording import Recording
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+
+LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
+SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
+
+
+@pytest.fixture(scope="module")
+def made() -> Run:
+    model = make_model()
+    recording = Recording(model.scene.xml, (make_demonstration(model),))
+    events = extract(model, recording[0], MujocoEngine(model, threads=1))
+    cfg = TrainCfg(environment=replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8)), ppo=SHORT)
+    return Run(model, recording, events, cfg)
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return torch.load(folder / CHECKPOINT, weights_only=False)["actor_state_dict"]
+
+
+@pytest.mark.slow
+def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
+    cfg = TrainCfg(environment=SETTINGS, ppo=LEARNING)
+    trainer, last = train(replace(made, cfg=cfg), None, device="cpu")
+    assert last is not None
+    assert last.seconds < 120
+    task = made.task()
+    states = replace(made, cfg=cfg).evaluation_states(task, 64, 0)
+    environment = make_environment(task, SETTINGS, states, device="cpu")
+    torch.manual_seed(1)
+    untrained = evaluate(environment, lambda o: 2 * torch.rand(len(o["policy"]), 4) - 1, states)
+    trained = evaluate(environment, trainer.policy(), states)
+    assert untrained.rate < 0.3
+    assert trained.rate >= 0.8
+
+
+def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, tmp_path):
+    train(made, tmp_path / "whole", device="cpu")
+    half = replace(made, cfg=replace(made.cfg, ppo=replace(SHORT, iterations=2)))
+    train(half, tmp_path / "parts", device="cpu")
+    _, last = train(made, tmp_path / "parts", device="cpu", resume=True)
+    assert last is not None
+    assert (last.iteration, last.steps) == (4, 64)
+    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    for name, value in whole.items():
+        torch.testing.assert_close(parts[name], value, rtol=0, atol=0)
+
+
+def test_interruption_keeps_what_was_learnt(made, tmp_path):
+    def interrupt(this: Round) -> None:
+        if this.iteration == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(made, tmp_path, device="cpu", report=interrupt)
+    _, last = train(made, tmp_path, device="cpu", resume=True)
+    assert last is not None
+    assert last.iteration == 4
+
+
+def test_other_settings_and_foreign_files_are_refused_on_resuming(made, tmp_path):
+    train(made, tmp_path, device="cpu")
+    other = replace(made, cfg=replace(made.cfg, environment=replace(made.cfg.environment, decimation=5)))
+    with pytest.raises(TrainError, match="decimation 10"):
+        train(other, tmp_path, device="cpu", resume=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"nothing")
+    with pytest.raises(TrainError, match="not a checkpoint"):
+        train(made, tmp_path, device="cpu", resume=True)
+
+
+def test_first_diverged_state_is_saved(made, tmp_path, monkeypatch):
+    step = Environment.step
+
+    def kicked(self, actions):
+        self.physics.qvel[1, 0] = 1e9
+        return step(self, actions)
+
+    monkeypatch.setattr(Environment, "step", kicked)
+    _, last = train(made, tmp_path, device="cpu")
+    assert last is not None
+    assert last.log["diverged worlds"] > 0
+    assert (tmp_path / OFFENCE).is_file()
+
+
+def test_interval_is_wilsons():
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert wilson(10, 10)[1] == pytest.approx(1.0)
+    assert wilson(10, 10)[0] == pytest.approx(0.7225, abs=1e-4)
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+
+
+def test_commands_train_and_evaluate(made, tmp_path, capsys):
+    write_hdf5(made.recording, tmp_path / "demo.h5")
+    made.model.save(tmp_path / "model.toml")
+    made.events.save(tmp_path / "events.json")
+    options = f"--model {tmp_path}/model.toml --events {tmp_path}/events.json --out {tmp_path}/run --device cpu"
+    options += " --worlds 4 --iterations 2 --ppo.steps 4 --ppo.hidden 16 --environment.reset.states 8"
+    options += " --environment.reset.turn 0 --environment.action.gripper-actuators grip --environment.episode 0.5"
+    assert main(["train", f"{tmp_path}/demo.h5", *options.split(), "--reward", "engineered"]) == 0
+    cfg = TrainCfg.load(tmp_path / "run" / "train.toml")
+    assert cfg.environment.reward.kind == "engineered"
+    assert cfg.environment.worlds == 4
+    capsys.readouterr()
+    assert main(["evaluate", "--checkpoint", f"{tmp_path}/run", "--episodes", "4", "--device", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "simulation: " in said
+    assert "reality: " in said
+    assert "of 4 succeed" in said
+    assert main(["evaluate", "--checkpoint", f"{tmp_path}/nothing"]) == 2
