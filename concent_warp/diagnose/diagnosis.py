@@ -105,16 +105,23 @@ class UnknownForceFound:
     p: float
     """Probability that the best of such forces gains as much where nothing is missing."""
     share: float
-    """What it takes away, of all that the first model left beyond the noise."""
+    """What it takes away, more than an effect does, of all that the first model left beyond the noise."""
+    instead: float | None = None
+    """Share of the held-out error that the effect takes away that was added where the force explains more; None where
+    it is what the last model leaves."""
 
     @property
     def sentence(self) -> str:
         """What was seen, in words."""
-        return f"{self.words[0].upper()}{self.words[1:]} explains another {100 * self.gain:.0f} % of the error."
+        words, gain = f"{self.words[0].upper()}{self.words[1:]}", 100 * self.gain
+        if self.instead is None:
+            return f"{words} explains another {gain:.0f} % of the error."
+        added = f"the effect that was added explains {100 * self.instead:.0f} %"
+        return f"{words} explains {gain:.0f} % of an error of which {added}."
 
     def to_json(self) -> dict[str, Any]:
         """Return it in plain types."""
-        return {"words": self.words, "gain": self.gain, "p": self.p, "share": self.share}
+        return {"words": self.words, "gain": self.gain, "p": self.p, "share": self.share, "instead": self.instead}
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 
-from concent_warp.diagnose.blocks import FOLDS, HeldOut, block_sums
+from concent_warp.diagnose.blocks import FOLDS, HeldOut, block_sums, sign_flip_p
 from concent_warp.diagnose.diagnosis import UnknownForceFound
-from concent_warp.diagnose.search import Node, Screened, chance, linear_gain, screen
+from concent_warp.diagnose.search import Node, Screened, chance, screen, with_residuals
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, free_bodies, name, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
@@ -76,36 +77,76 @@ Results = Callable[[Callable[..., Screened], Sequence[tuple[Any, ...]]], Iterabl
 
 
 def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> UnknownForceFound | None:
-    """Return what a force of no known form explains; None where that is little, or no more than chance would.
+    """Return a force of no known form that explains what effects do not; None where there is none beyond chance.
 
-    Where the last model leaves little more than noise there is nothing to explain, and where it leaves much more than
-    noise it is not needed to tell that something is missing: there nothing is simulated.
+    It is looked for in what the last model leaves, unless that is little more than noise; and, where several effects
+    had to be added, in what each of them found: there it must explain more than the effect that was added.
+    Where the last model leaves much more than noise none is needed to tell that something is missing.
 
     Args:
         nodes: The first model and those after each addition.
         cfg: Settings.
         results: See `Results`.
     """
-    first, last = nodes[0], dealt_in_turn(replace(nodes[-1], engine="mujoco"))
-    if last.ratio > cfg.adequate or last.ratio**2 < 1 + LEAST:
+    first, last = nodes[0], nodes[-1]
+    runs = all("mujoco" in added.effect.engines for added in last.model.effects)
+    if last.ratio > cfg.adequate or not runs:
         return None
-    screened = list(results(screen, [(last, force) for force in forces(last)]))
+    lacked = max(max(first.ratio, last.ratio) ** 2 - 1, LEAST)
+    if last.ratio**2 >= 1 + LEAST and (found := best_force(last, None, lacked, cfg, results)) is not None:
+        return found
+    effects = [len(n.model.effects) for n in nodes]
+    if any(after <= before for before, after in pairwise(effects)):
+        return None  # some were left out again: what each found is not what the last ones explain
+    for before, after in reversed(list(pairwise(nodes[1:]))):
+        if (found := best_force(before, after, lacked, cfg, results)) is not None:
+            return found
+    return None
+
+
+def best_force(
+    base: Node, rival: Node | None, lacked: float, cfg: Settings, results: Results
+) -> UnknownForceFound | None:
+    """Return the force that explains most of what a node leaves.
+
+    Args:
+        base: The node.
+        rival: One with an effect more, that the force must beat.
+        lacked: What the first model left beyond the noise, as a mean of squared residuals over noise.
+        cfg: Settings.
+        results: See `Results`.
+    """
+    base = dealt_in_turn(replace(base, engine="mujoco"))
+    left = base.errors if rival is None else dealt_in_turn(rival).errors
+    instead = 1 - float(left.sum() / base.errors.sum())
+    screened = list(results(screen, [(base, force) for force in forces(base)]))
     if not screened:
         return None
-    tried = [weighed(last, s, share) for s in screened for share in SHARES]
-    tried += [together(last, screened, share) for share in SHARES]
-    gains = [linear_gain(last, s.pieces, last.pieces, last.errors) for s in tried]
+    tried = [weighed(base, s, share) for s in screened for share in SHARES]
+    tried += [together(base, screened, share) for share in SHARES]
+    errors = [held_out(base, s) for s in tried]
+    gains = [1 - float(e.sum() / base.errors.sum()) for e in errors]
     best = int(np.argmax(gains))
-    gain = gains[best]
-    share = gain * last.ratio**2 / (max(first.ratio, last.ratio) ** 2 - 1)
-    if gain < LEAST or share < FORM:
+    more = gains[best] - instead
+    share = more * base.ratio**2 / lacked
+    if more < LEAST or share < FORM:
         return None
-    null = chance(last, tried, cfg.draws, cfg.seed)
-    p = float((1 + np.sum(null >= gain)) / (len(null) + 1))
+    null = chance(base, tried, cfg.draws, cfg.seed)
+    p = float((1 + np.sum(null >= gains[best])) / (len(null) + 1))
+    if rival is not None:
+        p = max(p, sign_flip_p(left - errors[best], np.random.default_rng(cfg.seed)))
+    if p > cfg.level:
+        return None
     # Several forces at once are named by the one that explains most by itself.
     force = tried[int(np.argmax(gains[: len(SHARES) * len(screened)]))].effect
     assert isinstance(force, UnknownForce)
-    return UnknownForceFound(force.words, gain, p, min(share, 1.0)) if p <= cfg.level else None
+    return UnknownForceFound(force.words, gains[best], p, min(share, 1.0), None if rival is None else instead)
+
+
+def held_out(base: Node, s: Screened) -> np.ndarray:
+    """Return the held-out error of each block, shape (B,), after a linear step with the sensitivities."""
+    pieces = with_residuals(s.pieces, base.pieces)
+    return HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
 
 
 def dealt_in_turn(base: Node) -> Node:

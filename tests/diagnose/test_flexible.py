@@ -9,7 +9,7 @@ import pytest
 from concent_warp.diagnose.blocks import cut_blocks
 from concent_warp.diagnose.candidates import candidates
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
-from concent_warp.diagnose.flexible import LEAST, forces, unknown_force
+from concent_warp.diagnose.flexible import LEAST, best_force, forces, unknown_force
 from concent_warp.diagnose.search import extended, fit_candidate, node, screen
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce
@@ -23,14 +23,14 @@ FRICTION = 0.6
 CFG = DiagnosisCfg(effects=("joint_damping", "joint_friction", "actuator_gain"), jobs=1, explain=False)
 
 
-def rail(friction=0.0):
+def rail(friction=0.0, damping=0.0):
     stiff = f'frictionloss="{friction}" solreffriction="0.003 1" solimpfriction="0.99 0.99 0.001"' if friction else ""
     return f"""
     <mujoco>
       <option timestep="0.002" integrator="implicitfast"/>
       <worldbody>
         <body name="cart">
-          <joint name="rail" type="slide" axis="1 0 0" {stiff}/>
+          <joint name="rail" type="slide" axis="1 0 0" damping="{damping}" {stiff}/>
           <geom type="box" size="0.05 0.05 0.05" mass="1"/>
         </body>
       </worldbody>
@@ -39,9 +39,9 @@ def rail(friction=0.0):
     </mujoco>"""
 
 
-def ridden(friction=0.0, force=None, seconds=5.0, seed=0):
+def ridden(friction=0.0, damping=0.0, force=None, seconds=5.0, seed=0):
     """Ride to and fro at several speeds; `force` is one on the cart by its place [m]."""
-    m = mujoco.MjModel.from_xml_string(rail(friction))
+    m = mujoco.MjModel.from_xml_string(rail(friction, damping))
     d = mujoco.MjData(m)
     rng = np.random.default_rng(seed)
     time = m.opt.timestep * np.arange(round(seconds / m.opt.timestep) + 1)
@@ -102,6 +102,24 @@ def test_the_verdict_then_is_none_of_these_and_says_so(partly):
     assert said.unexplained >= said.unknown_force.share
     assert said.to_json()["unknown_force"]["gain"] == said.unknown_force.gain
     assert any("depends on the position of rail explains another" in s for s in said.sentences())
+
+
+def test_a_force_that_beats_the_effect_which_was_added_is_seen(partly):
+    (_, friction) = partly
+    damping = fit_candidate(friction, screen(friction, effect_class("joint_damping")("rail")))
+    found = best_force(friction, extended(friction, damping), 1.0, CFG, one_by_one)
+    assert found is not None
+    assert found.instead is not None
+    assert found.gain > found.instead + LEAST
+    assert found.instead == pytest.approx(damping.share(friction), abs=0.02)
+    assert "of which the effect that was added explains" in found.sentence
+
+
+def test_a_second_effect_that_is_there_is_not_beaten():
+    nodes = nodes_of(ridden(friction=FRICTION, damping=1.0), "joint_friction", "joint_damping")
+    assert nodes[1].ratio ** 2 > 1 + 2 * LEAST
+    assert nodes[2].ratio < 1.05
+    assert unknown_force(nodes, CFG, one_by_one) is None
 
 
 def test_nothing_is_seen_where_nothing_is_hidden():
