@@ -450,8 +450,7 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
     """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
 
     They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it. Among
-    them those come first that need fewer parameters and smaller values of them; differences in what they leave count
-    by their own standard error, squared.
+    them those come first that leave less, need fewer parameters and smaller values of them, see `plausibility`.
     """
     best = max(good, key=lambda pair: pair[1].gain)
     group = []
@@ -459,17 +458,22 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
         difference = c.errors - best[0].errors
         error = np.sqrt(len(difference)) * difference.std()
         if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
-            behind = difference.sum() / error if error else 0.0
-            group.append((plausibility(base, c, f) - behind**2, c, f))
-    return [(c, f) for _, c, f in sorted(group, key=lambda ranked: -ranked[0])]
+            group.append((c, f))
+    return sorted(group, key=lambda pair: -plausibility(base, *pair))
 
 
 def plausibility(base: Node, c: Candidate, f: Finding) -> float:
-    """Return twice the log prior of a candidate, up to a constant: parameters (Schwarz), sizes (Cauchy) and rarity."""
+    """Return twice the log posterior of a candidate, up to a constant.
+
+    Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
+    a Cauchy prior of sizes, and how rare the effect is.
+    """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    return float(-len(scale) * np.log(base.blocks.count) - 2 * np.log1p(away**2).sum() - c.effect.rarity)
+    blocks = base.blocks.count
+    fit = -blocks * np.log(max(c.errors.sum(), 1e-12)) - len(scale) * np.log(blocks)
+    return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 
 def detectable_size(base: Node, s: Screened, share: float) -> Detectable | None:
