@@ -221,6 +221,19 @@ class Environment(VecEnv):
             value.copy_(state[name])
         self.refresh()
 
+    def parts(self) -> tuple[Callable[[], None], ...]:
+        """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
+        pairs of what is there now, observation.
+        """
+
+        def poses_and_pairs() -> None:
+            self.physics.place()
+            self._paired.launch()
+
+        return (
+            self._command, self.physics.advance, self._measured.launch, self._judge, poses_and_pairs, self._observe,
+        )  # fmt: skip
+
     def place(self) -> torch.Tensor:
         """Return where object 1 is in the frame of object 2 [m], shape (N, 3)."""
         position, quaternion = self.physics.position, self.physics.quaternion

@@ -219,6 +219,11 @@ class WarpPhysics:
             d.qacc_warmstart.zero_()
             d.overflow.zero_()
 
+    @property
+    def simulator(self) -> tuple[Any, Any]:
+        """MuJoCo-Warp's model and data, for measurements of its own."""
+        return self._model, self._data
+
     def poses(self) -> tuple[wp.array, wp.array]:
         """Return positions and orientations as Warp arrays."""
         return self._data.xpos, self._data.xquat
