@@ -81,6 +81,7 @@ class Environment(VecEnv):
             self._reach, self._finite = wp.to_torch(pairs.reach), wp.to_torch(pairs.finite)
             self._severe = None if virtual is None else wp.to_torch(virtual.severe)
             self._penalty = self._none if virtual is None else wp.to_torch(virtual.reward)
+        wp.synchronize_device(warp_device)
         self.observation = wp.to_torch(self._observation)
         """The observation, shape (N, layout.size); overwritten by the next step."""
         whole = cfg.capture == "step" and self.device.startswith("cuda")
@@ -302,7 +303,7 @@ class Environment(VecEnv):
         self.done.copy_(failed | self.time_out)
         self._note_offence(diverged)
         ended = self.done.double()
-        overflow = (p.overflow != 0).double().sum()
+        overflow = ((p.overflow & p.dropping) != 0).double().sum()
         counts = [self.success & self.time_out, self.time_out, *self.failure.unbind(dim=1)]
         sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
         sums += [count.double().sum() for count in counts]

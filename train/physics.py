@@ -43,7 +43,9 @@ class Physics(Protocol):
     site: torch.Tensor
     """Site positions [m], world frame, shape (N, nsite, 3)."""
     overflow: torch.Tensor
-    """Bits of buffers that were too small, shape (N,) int."""
+    """Bits of what went wrong in the simulator, shape (N,) int."""
+    dropping: int
+    """Those of the bits that say that contacts were dropped because a buffer was too small."""
 
     def poses(self) -> tuple[wp.array, wp.array]:
         """Return positions and orientations as Warp arrays, of `wp.vec3` and `wp.quat`, shape (N, nbody)."""
@@ -101,7 +103,7 @@ class MujocoPhysics:
         self.warmstart = torch.zeros_like(self.qvel)
         self.ctrl = torch.zeros(worlds, model.nu)
         self.site = torch.zeros(worlds, model.nsite, 3)
-        self.overflow = torch.zeros(worlds, dtype=torch.int32)
+        self.overflow, self.dropping = torch.zeros(worlds, dtype=torch.int32), 0
         arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
         self._arrays = [tensor.numpy() for tensor in arrays]
 
@@ -201,6 +203,7 @@ class WarpPhysics:
             for name, values in factors.items():
                 target = wp.to_torch(getattr(self._model, name))
                 target.copy_(torch.as_tensor(values, dtype=torch.float32).reshape(target.shape))
+            wp.synchronize_device(self._warp_device)
             self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
             self._laws: list[tuple[Law, Any]] = [
                 (law, wp.array(np.tile(values, (worlds, 1)), dtype=float)) for law, values in laws
@@ -209,7 +212,8 @@ class WarpPhysics:
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
-            self.overflow = wp.to_torch(d.overflow)
+            self.overflow, bits = wp.to_torch(d.overflow), mjw.OverflowType
+            self.dropping = int(bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD)
             start = wp.clone(d.qpos)
             self._steps()  # loads the modules, which cannot be done while a graph is captured
             self._advance = Graph(self._steps, self._warp_device, capture)
@@ -218,6 +222,7 @@ class WarpPhysics:
             d.qvel.zero_()
             d.qacc_warmstart.zero_()
             d.overflow.zero_()
+        wp.synchronize_device(self._warp_device)
 
     @property
     def simulator(self) -> tuple[Any, Any]:
@@ -256,6 +261,7 @@ class Graph:
     def __init__(self, launches: Callable[[], None], device: Any, capture: bool) -> None:
         """Record `launches`, which must have run before, or keep them to be called as they are."""
         self._launches, self._device, self._graph = launches, device, None
+        self._streams: dict[int, wp.Stream] = {}
         if capture:
             with wp.ScopedDevice(device), wp.ScopedCapture() as captured:
                 launches()
@@ -265,7 +271,10 @@ class Graph:
         """Launch."""
         stream = None
         if self._device.is_cuda:
-            stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self._device)))
+            current = torch.cuda.current_stream(wp.device_to_torch(self._device))
+            if current.cuda_stream not in self._streams:
+                self._streams[current.cuda_stream] = wp.stream_from_torch(current)
+            stream = self._streams[current.cuda_stream]
         with wp.ScopedDevice(self._device), wp.ScopedStream(stream):
             if self._graph is None:
                 self._launches()
