@@ -35,8 +35,9 @@ class ActionCfg:
     """Largest step of a slide joint's command [m]."""
     gripper: float = 0.003
     """Largest step of the gripper's command [m]: small enough that exploring does not drop what is held at once."""
-    turn_lead: float = 0.06
-    """How far a hinge joint's command may run ahead of the joint [rad]: with the stiffness, the largest force."""
+    turn_lead: float = 0.03
+    """How far a hinge joint's command may run ahead of the joint [rad]: with the stiffness, the largest force. A policy
+    that may press harder turns the object in the hand where a real rim stops it."""
     slide_lead: float = 0.015
     """The same for slide joints [m]."""
 
@@ -110,12 +111,13 @@ class CollisionCfg:
 
     margin: float = 0.002
     """Distance below which spheres outside the physics are penalised [m]."""
-    severe: float = 0.006
+    severe: float = 0.004
     """Penetration of one of them that ends the episode [m]."""
     slack: float = 0.0005
     """How deep contacts of the physics are, too: left-out spheres are taken to be smaller by so much [m]."""
-    depth: float = 10.0
-    """Penalty of a penetration [1/m], summed over the spheres."""
+    depth: float = 50.0
+    """Penalty of a penetration [1/m], summed over the spheres. Too little, and the policy learns to go through what the
+    physics leaves out."""
     band: float = 0.01
     """Penalty of a sphere in touch, falling to 0 at the margin."""
 
@@ -136,6 +138,9 @@ class ResetCfg:
     """Largest upward displacement of what is held [m]."""
     turn: float = 0.15
     """Half width of the rotation about the vertical [rad]."""
+    solver: Literal["auto", "newton", "posture"] = "auto"
+    """Inverse kinematics: all states at once by Newton, from several seeds, or one after the other from the
+    demonstrated posture; "auto" takes Newton on a GPU (on a CPU its kernels take a minute to compile)."""
     joints: float = 0.05
     """Half width of the displacement of the arm's joints where nothing is held [rad or m]."""
     settle: float = 0.1

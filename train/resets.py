@@ -13,19 +13,20 @@ are discarded, and counted.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from concent_warp.train.cfg import ResetCfg, TrainError
 from concent_warp.train.inverse_kinematics import reach
+from concent_warp.train.inverse_kinematics_batch import reach_many
 from concent_warp.train.task import Task
 
 from concent_warp.simulate.inputs import compile_model
 
 ROUNDS = 20
-"""Draws for each state wanted after which the search is given up."""
+"""Rounds, of as many drafts as states are wanted, after which the search is given up."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ def draw_states(
     seed: int,
     *,
     count: int | None = None,
+    device: str = "cpu",
     progress: Callable[[float], None] | None = None,
 ) -> InitialStates:
     """Draw initial states of the task's stage.
@@ -65,20 +67,41 @@ def draw_states(
         cfg: How far states are displaced, and what is discarded.
         seed: Seed.
         count: States wanted; those of the settings by default.
+        device: Warp's name of the device for the inverse kinematics.
         progress: Called with the share done.
 
     Raises:
         TrainError: Too few of the states drawn can be used.
     """
-    return Drawing(task, cfg, seed).states(cfg.states if count is None else count, progress)
+    return Drawing(task, cfg, seed, device).states(cfg.states if count is None else count, progress)
+
+
+@dataclass
+class Draft:
+    """A state on its way."""
+
+    time: float
+    """Demonstrated moment [s]."""
+    case: int
+    kept: bool
+    """Whether it stays as demonstrated."""
+    qpos: np.ndarray
+    """Positions so far, objects already where they are to be, shape (nq,)."""
+    ctrl: np.ndarray
+    """Commands, shape (nu,)."""
+    position: np.ndarray | None = None
+    """Where the tool is to be [m], shape (3,); None where the joints are decided already."""
+    rotation: np.ndarray | None = None
+    """The tool's orientation there, shape (3, 3)."""
 
 
 class Drawing:
-    """Draws states one by one in C MuJoCo."""
+    """Draws states and tries them in C MuJoCo."""
 
-    def __init__(self, task: Task, cfg: ResetCfg, seed: int) -> None:
+    def __init__(self, task: Task, cfg: ResetCfg, seed: int, device: str) -> None:
         """Prepare to draw."""
-        self.task, self.cfg = task, cfg
+        self.task, self.cfg, self.device = task, cfg, device
+        self.newton = cfg.solver == "newton" or (cfg.solver == "auto" and device.startswith("cuda"))
         self.rng = np.random.default_rng([seed, 1])
         self.discarded: dict[str, int] = {"unreachable": 0, "overlapping": 0, "chain broken": 0}
         self.m = task.compiled
@@ -102,27 +125,36 @@ class Drawing:
 
     def states(self, count: int, progress: Callable[[float], None] | None) -> InitialStates:
         """Return `count` states."""
-        found: list[tuple[np.ndarray, np.ndarray, float, int]] = []
-        for _ in range(ROUNDS * count):
-            if (state := self.draw()) is not None:
-                found.append(state)
-                if progress is not None and len(found) % 32 == 0:
-                    progress(len(found) / count)
-            if len(found) == count:
-                break
-        else:
-            raise TrainError(
-                "too few initial states keep the contact chain",
-                expected=count,
-                found=f"{len(found)}, and discarded {self.discarded}",
-                fix="displace them less, with --environment.reset.position and .turn",
-            )
-        qpos, ctrl, time, case = zip(*found, strict=True)
-        rest = np.zeros((count, self.m.nv))
-        return InitialStates(np.array(qpos), rest, np.array(ctrl), np.array(time), np.array(case), self.discarded)
+        found: list[tuple[np.ndarray, Draft]] = []
+        for _ in range(ROUNDS):
+            for draft in self.solved([self.draft() for _ in range(count)]):
+                if (settled := self.tried(draft)) is not None:
+                    found.append((settled, draft))
+                    if progress is not None and len(found) % 32 == 0:
+                        progress(len(found) / count)
+                if len(found) == count:
+                    return self.collected(found)
+        raise TrainError(
+            "too few initial states keep the contact chain",
+            expected=count,
+            found=f"{len(found)}, and discarded {self.discarded}",
+            fix="displace them less, with --environment.reset.position and .turn",
+        )
 
-    def draw(self) -> tuple[np.ndarray, np.ndarray, float, int] | None:
-        """Return positions, commands, demonstrated time and case of one state, or None where it is discarded."""
+    def collected(self, found: list[tuple[np.ndarray, Draft]]) -> InitialStates:
+        """Return settled states in one."""
+        drafts = [draft for _, draft in found]
+        return InitialStates(
+            qpos=np.array([qpos for qpos, _ in found]),
+            qvel=np.zeros((len(found), self.m.nv)),
+            ctrl=np.array([draft.ctrl for draft in drafts]),
+            time=np.array([draft.time for draft in drafts]),
+            case=np.array([draft.case for draft in drafts]),
+            discarded=self.discarded,
+        )
+
+    def draft(self) -> Draft:
+        """Draw a moment and a displacement."""
         start, onset, end = self.window
         kept = self.rng.random() < self.cfg.demonstrated
         time = self.rng.uniform(start, end if kept else onset)
@@ -130,24 +162,53 @@ class Drawing:
             time = self.rng.uniform(start, end if kept else onset)
         row = self.task.replay.row(time)
         qpos, ctrl = self.task.replay.qpos[row].copy(), self.task.replay.ctrl[row].copy()
-        case = self.case(time)
+        draft = Draft(time, self.case(time), kept, qpos, ctrl)
+        if not kept and draft.case == 1:
+            self.scatter(draft)
+        elif not kept:
+            self.displace(draft)
+        return draft
+
+    def solved(self, drafts: list[Draft]) -> Iterator[Draft]:
+        """Give the drafts with their joints decided, those left out that the hand cannot reach."""
         robot = self.task.robot
-        if not kept:
-            move = self.displaced if case > 1 else self.scattered
-            if (moved := move(qpos, case)) is None:
-                self.discarded["unreachable"] += 1
-                return None
-            qpos = moved
-            if self.overlap(qpos) > self.cfg.overlap:
-                self.discarded["overlapping"] += 1
-                return None
+        asked = [i for i, draft in enumerate(drafts) if draft.position is not None]
+        if self.newton:
+            angles, fine = reach_many(
+                self.m,
+                robot,
+                np.array([drafts[i].qpos for i in asked]).reshape(-1, self.m.nq),
+                np.array([drafts[i].position for i in asked]).reshape(-1, 3),
+                np.array([drafts[i].rotation for i in asked]).reshape(-1, 3, 3),
+                device=self.device,
+            )
+            answers = {i: angles[k] if fine[k] else None for k, i in enumerate(asked)}
+        else:
+            answers = {}
+        for i, draft in enumerate(drafts):
+            if draft.position is not None and draft.rotation is not None:
+                if not self.newton:
+                    self.d.qpos[:] = draft.qpos
+                    answers[i] = reach(self.m, self.d, robot, draft.position, draft.rotation)
+                joints = answers[i]
+                if joints is None:
+                    self.discarded["unreachable"] += 1
+                    continue
+                draft.qpos[robot.qpos] = joints
+            yield draft
+
+    def tried(self, draft: Draft) -> np.ndarray | None:
+        """Return positions of a draft at rest, shape (nq,), None where it is discarded; sets its commands."""
+        if not draft.kept and self.overlap(draft.qpos) > self.cfg.overlap:
+            self.discarded["overlapping"] += 1
+            return None
         # What the demonstrated commands lead the joints by is lag and pressing; at rest, they are where the joints are.
-        ctrl[robot.actuator] = np.clip(qpos[robot.qpos], *self.range_of(robot.actuator))
-        settled = self.settle(qpos, ctrl, holding=case > 1)
+        robot = self.task.robot
+        draft.ctrl[robot.actuator] = np.clip(draft.qpos[robot.qpos], *self.range_of(robot.actuator))
+        settled = self.settle(draft.qpos, draft.ctrl, holding=draft.case > 1)
         if settled is None:
             self.discarded["chain broken"] += 1
-            return None
-        return settled, ctrl, time, case
+        return settled
 
     def range_of(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the limits of commands."""
@@ -165,11 +226,9 @@ class Drawing:
                 touching |= len(names) > 1 and {contact.a, contact.b} == set(names[:2])
         return 1 + holding + (holding and touching)
 
-    def scattered(self, qpos: np.ndarray, case: int) -> np.ndarray:
-        """Return positions with the robot's joints and every free object displaced by themselves (case 1)."""
-        del case
-        robot, cfg = self.task.robot, self.cfg
-        moved = qpos.copy()
+    def scatter(self, draft: Draft) -> None:
+        """Displace the robot's joints and every free object by themselves (case 1)."""
+        robot, cfg, moved = self.task.robot, self.cfg, draft.qpos
         moved[robot.qpos] += self.rng.uniform(-cfg.joints, cfg.joints, len(robot.qpos))
         limited = self.m.jnt_limited[robot.joint].astype(bool)
         low, high = self.m.jnt_range[robot.joint].T
@@ -177,27 +236,22 @@ class Drawing:
         for address in self.free:
             if address is not None:
                 place(moved, address, moved[address : address + 3], self.displacement(lift=False))
-        return moved
 
-    def displaced(self, qpos: np.ndarray, case: int) -> np.ndarray | None:
-        """Return positions with hand and objects moved as one, None where the hand cannot get there (cases 2 and 3)."""
-        together = case == 3 and self.free[1] is not None
-        moves = self.free[: 1 + together]
+    def displace(self, draft: Draft) -> None:
+        """Move hand and objects as one; where the hand is to be is left to inverse kinematics (cases 2 and 3)."""
+        if self.free[0] is None:  # what is held hangs on a joint of its own, and cannot be moved along
+            draft.kept = True
+            return
+        together = draft.case == 3 and self.free[1] is not None
         shift, turn = self.displacement(lift=not together)
-        d, robot = self.d, self.task.robot
-        d.qpos[:] = qpos
+        d, tool = self.d, self.task.robot.tool
+        d.qpos[:] = draft.qpos
         mujoco.mj_kinematics(self.m, d)
-        pivot = d.site_xpos[robot.tool].copy()
-        rotation = about_vertical(turn) @ d.site_xmat[robot.tool].reshape(3, 3)
-        joints = reach(self.m, d, robot, pivot + shift, rotation)
-        if joints is None:
-            return None
-        moved = qpos.copy()
-        moved[robot.qpos] = joints
-        for address in moves:
+        pivot = d.site_xpos[tool].copy()
+        draft.position, draft.rotation = pivot + shift, about_vertical(turn) @ d.site_xmat[tool].reshape(3, 3)
+        for address in self.free[: 1 + together]:
             assert address is not None
-            place(moved, address, pivot, (shift, turn))
-        return moved
+            place(draft.qpos, address, pivot, (shift, turn))
 
     def displacement(self, *, lift: bool) -> tuple[np.ndarray, float]:
         """Return a drawn shift [m], shape (3,), and a turn about the vertical [rad]."""

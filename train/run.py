@@ -106,8 +106,11 @@ def train(
         if resume:
             check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
         run.save(folder)
+    from concent_warp.simulate.warp_engine import preferred_device
+
     task = run.task()
-    states = draw_states(task, run.cfg.environment.reset, run.cfg.seed)
+    where = preferred_device() if device is None else device
+    states = draw_states(task, run.cfg.environment.reset, run.cfg.seed, device=where)
     environment = make_environment(task, run.cfg.environment, states, device=device, seed=run.cfg.seed)
     trainer = Trainer(environment, run.cfg, folder)
     environment.reset()
