@@ -36,7 +36,7 @@ FEW = 3
 PLACES = 12
 """Bumps over the places where a body was."""
 LEAST = 0.03
-"""Share of the held-out error from which on the force counts; on data that lack nothing it is a few thousandths."""
+"""Share of the held-out error from which on the force counts; on data that lack nothing it stays near a hundredth."""
 FORM = 0.01
 """Share of all that the first model lacked from which on it counts: the form of an effect that is there is right only
 to about a tenth, a hundredth in squares."""
