@@ -36,7 +36,6 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return torch.load(folder / CHECKPOINT, weights_only=False)["actor_state_dict"]
 
 
-@pytest.mark.slow
 def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
     cfg = TrainCfg(environment=SETTINGS, ppo=LEARNING)
     trainer, last = train(replace(made, cfg=cfg), None, device="cpu")
