@@ -36,8 +36,7 @@ class ActionCfg:
     gripper: float = 0.003
     """Largest step of the gripper's command [m]: small enough that exploring does not drop what is held at once."""
     turn_lead: float = 0.03
-    """How far a hinge joint's command may run ahead of the joint [rad]: with the stiffness, the largest force. A policy
-    that may press harder turns the object in the hand where a real rim stops it."""
+    """How far a hinge joint's command may run ahead of the joint [rad]: with the stiffness, the largest force."""
     slide_lead: float = 0.015
     """The same for slide joints [m]."""
 
