@@ -14,10 +14,11 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import bootstrap_interval, covariance, cut_blocks, sign_flip_p
+from concent_warp.diagnose.blocks import bootstrap_interval, cut_blocks, sign_flip_p
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
-from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, FittedParameter, Verdict
+from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verdict
+from concent_warp.diagnose.evidence import alike, detectable_size, fitted_parameters, removed
 from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.flexible import unknown_force
 from concent_warp.diagnose.noise import UNDERESTIMATE
@@ -31,11 +32,12 @@ from concent_warp.diagnose.search import (
     node,
     piecewise_candidate,
     polish_candidate,
+    restarted_candidate,
     screen,
     strengthened,
     without,
 )
-from concent_warp.diagnose.settle import Look, law_errors, settled
+from concent_warp.diagnose.settle import Look, settled
 from concent_warp.diagnose.where import where
 from concent_warp.fit.effects import check_finite
 from concent_warp.fit.observe import channel_noises, observe
@@ -244,7 +246,20 @@ class Procedure:
             if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
                 break
             found[leader] = better
+        found = self.levelled(base, found, found[leader])
         return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
+
+    def levelled(self, base: Node, found: list[Candidate], leader: Candidate) -> list[Candidate]:
+        """Return fitted candidates, those close to the leader taken up again from where it has the initial states.
+
+        Where contacts make the cost rough, luck with the initial states would decide between them.
+        """
+        close = [k for k, c in enumerate(found) if c is not leader and c.share(base) > CLOSE * leader.share(base)]
+        tasks = [(base, found[k], leader.fit.offsets) for k in close]
+        again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
+        for k, c in zip(close, again, strict=True):
+            found[k] = c
+        return found
 
     def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
         """Return fitted candidates, those that explain most fitted anew by way of short windows, where there are."""
@@ -375,6 +390,8 @@ DISTANT = 0.3
 """Share of the best gain below which a promise is not worth a fit any more."""
 NEAR = 0.7
 """Share of the best gain from which on a candidate is worth a second fit."""
+CLOSE = 0.85
+"""Share of the best gain from which on a candidate may be its equal."""
 SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
 QUIET = 0.25
@@ -391,8 +408,6 @@ STRONGEST = 3
 """Rivals whose initial states are tried on the model that they beat."""
 MOST = 0.8
 """Share of the folds in which an effect must gain."""
-SAME = 0.02
-"""Errors that differ by less than this share are taken for the same."""
 
 
 def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
@@ -412,83 +427,3 @@ def quiet_ratios(base: Node) -> dict[str, float]:
             mine, of = piece.residual[r.rows] ** 2, rows[r.rows]
             blocks.setdefault(r.channel, []).extend(float(np.sqrt(mine[of == b].mean())) for b in np.unique(of))
     return {channel: float(np.quantile(values, QUIET)) for channel, values in blocks.items()}
-
-
-def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
-    """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
-
-    With the law's own error, see `law_errors`.
-    """
-    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.spread is None else c.spread
-    fresh = range(prediction.owned, len(prediction.parameters))
-    law = law_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
-    found = []
-    for k in fresh:
-        p, value = prediction.parameters[k], float(c.fit.values[k])
-        reach = 1.96 * np.hypot(spread[k] * p.scale, law[k - prediction.owned])
-        low, high = max(value - reach, p.low), min(value + reach, p.high)
-        bound = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
-        at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bound)
-        found.append(FittedParameter(p.name, value, float(low), float(high), p.unit, p.null, at_bound))
-    return tuple(found)
-
-
-def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
-    """Return by how much the squared residual of each channel falls, as a share, most first."""
-    before: dict[str, float] = {}
-    after: dict[str, float] = {}
-    for window, old, new in zip(base.windows, base.pieces, c.pieces, strict=True):
-        for r in window.readings:
-            before[r.channel] = before.get(r.channel, 0.0) + float(np.sum(old.residual[r.rows] ** 2))
-            after[r.channel] = after.get(r.channel, 0.0) + float(np.sum(new.residual[r.rows] ** 2))
-    shares = {name: 1.0 - after[name] / max(value, 1e-12) for name, value in before.items()}
-    return tuple(sorted(((n, s) for n, s in shares.items() if s > 0), key=lambda pair: -pair[1]))
-
-
-def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[Candidate, Finding]]:
-    """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
-
-    They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it. Among
-    them those come first that leave less, need fewer parameters and smaller values of them, see `plausibility`.
-    """
-    best = max(good, key=lambda pair: pair[1].gain)
-    group = []
-    for c, f in good:
-        difference = c.errors - best[0].errors
-        error = np.sqrt(len(difference)) * difference.std()
-        if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
-            group.append((c, f))
-    return sorted(group, key=lambda pair: -plausibility(base, *pair))
-
-
-def plausibility(base: Node, c: Candidate, f: Finding) -> float:
-    """Return twice the log posterior of a candidate, up to a constant.
-
-    Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
-    a Cauchy prior of sizes, and how rare the effect is.
-    """
-    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
-    away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    blocks = base.blocks.count
-    fit = -blocks * np.log(max(c.errors.sum(), 1e-12)) - len(scale) * np.log(blocks)
-    return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
-
-
-def detectable_size(base: Node, s: Screened, share: float) -> Detectable | None:
-    """Return the smallest size of a candidate that the search would have found in half of all cases.
-
-    A parameter off its null value by x adds H x^2 to the error, of which it must be more than a share.
-    """
-    prediction = Prediction(base.model, (s.effect,), base.windows, engine=base.engine)
-    normal = sum(piece.jacobian.T @ piece.jacobian for piece in s.pieces)
-    needed = max(share, 0.0) * base.errors.sum()
-    best = None
-    for k in range(prediction.owned, len(prediction.parameters)):
-        p, curvature = prediction.parameters[k], float(np.asarray(normal)[k, k])
-        if np.isfinite(p.null) and curvature > 1e-12:
-            size = p.scale * np.sqrt(needed / curvature)
-            if size < p.high - p.low and (best is None or size / p.scale < best[0]):
-                best = size / p.scale, Detectable(s.effect.name, p.name, float(size), p.unit)
-    return None if best is None else best[1]

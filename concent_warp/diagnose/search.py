@@ -224,6 +224,14 @@ def polish_candidate(
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 
+def restarted_candidate(base: Node, candidate: Candidate, offsets: Sequence[np.ndarray]) -> Candidate:
+    """Take up the fit of a candidate from others' initial states where they serve it better, window by window."""
+    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1))
+    fresh = solver.better_starts(candidate.fit, [offsets], noise=0.0)
+    found = judged(base, candidate.effect, solver, solver.fit(fresh.values, fresh.offsets, fresh.starts))
+    return found if found.fit.cost < candidate.fit.cost else candidate
+
+
 def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Window]) -> Candidate:
     """Take up the fit of a candidate from values that short windows lead to; the worse of the two is dropped.
 

@@ -38,7 +38,7 @@ WIDEST = 100.0
 """By how much a valley that never shows widens an interval."""
 ASTRAY = 0.5
 """Share of the distance over which a valley rises by the roughness, squared, that counts as variance."""
-LAW_ERROR = 0.01
+LAW_ERROR = 0.005
 """Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
 WIDTH_ONLY = float("inf")
 """The same where nothing is taken up any more."""

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.contact_laws import AnisotropicForce, Pull
+from concent_warp.effects.drives import GRIPS
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import (
@@ -273,7 +274,7 @@ class PadFriction(Effect):
         among = np.concatenate([self.geoms(m), *held])
         among = among[(m.geom_contype[among] != 0) | (m.geom_conaffinity[among] != 0)]
         null = float(m.geom_friction[among, SLIDING].max())
-        scan = tuple(null * x for x in (0.2, 0.4, 0.7, 1.5))
+        scan = tuple(null * x for x in GRIPS)
         return (Parameter("coefficient", "-", null, 0.0, 5.0, 0.3 * null, scan=scan),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002

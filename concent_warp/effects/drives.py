@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""
 
+GRIPS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
+"""Factors of a grip's force that are worth a trial: what is held slips in a narrow range only."""
+
 
 class DriveEffect(Effect):
     """An effect on the actuators of an arm."""
@@ -107,7 +110,7 @@ class GripForce(ActuatorGain):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One factor for all."""
-        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=(0.3, 0.6, 1.6, 3.0)),)
+        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIPS),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
         """Gain, bias and limit of the force."""
