@@ -182,6 +182,11 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
                 ", ".join(others) or "-",
             ]
         )
+    other = [
+        [f"`{r['name']}`", r.get("verdict", "error"), told(r), " -> ".join(f"{x:.2f}" for x in r.get("ratio", ()))]
+        for r in sorted(rows, key=lambda r: (r["kind"], r["name"]))
+        if r["kind"] in ("outside", "pair") or (r["kind"] == "null" and alarm(r))
+    ]
     failed = [r for r in rows if "error" in r]
     smallest = [
         [f"`{f['effect']}`", f["rig"], f"{f['parameter']} {f['size']:.2g} {f['unit'].replace('-', '')}".rstrip()]
@@ -211,6 +216,12 @@ the noise, the large one two to three times that.
 {table(["effect", "data sets", "first", "in the group", "named instead"], effects)}
 ![which effect was named for which](hidden_effects.png)
 
+## Outside the library, two at once, false alarms
+
+The hidden effects are in the name of the data. Groups are what the data could not tell apart, in the order of the
+additions; the ratio is that of the residual to the noise, of the model as drawn and after each addition.
+
+{table(["data", "verdict", "named", "ratio"], other)}
 ## What would have been seen
 
 The smallest size of each effect that the search would have named in half of all cases, on the rig that it is tried on:
@@ -224,6 +235,11 @@ Seconds on one core for a whole diagnosis, all candidates and the calibration in
 machine.
 
 {table(["rig", "data sets", "median [s]", "longest [s]"], by_rig)}"""
+
+
+def told(row: Row) -> str:
+    """Return the groups that were named, in words."""
+    return ", then ".join(" or ".join(sorted(group)) for group in groups(row)) or "-"
 
 
 def confusion(rows: Sequence[Row]) -> None:

@@ -235,8 +235,9 @@ class Procedure:
         if not found:
             return found
         best = max(c.share(base) for c in found)
+        near = CLOSE if min(c.ratio for c in found) < EXPLAINED else NEAR
         hoped = [max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)]
-        rough = [k for k, c in enumerate(found) if hoped[k] > NEAR * best and c.ratio > SETTLED]
+        rough = [k for k, c in enumerate(found) if hoped[k] > near * best and c.ratio > SETTLED]
         polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
@@ -389,7 +390,7 @@ EXPLAINED = 1.1
 DISTANT = 0.3
 """Share of the best gain below which a promise is not worth a fit any more."""
 NEAR = 0.7
-"""Share of the best gain from which on a candidate is worth a second fit."""
+"""Share of the best gain from which on a candidate is worth a second fit, where none has left but noise."""
 CLOSE = 0.85
 """Share of the best gain from which on a candidate may be its equal."""
 SETTLED = 1.03
