@@ -199,14 +199,11 @@ def ignore(this: Round) -> None:
 
 def make_ppo(environment: Trainee, cfg: PpoCfg) -> PPO:
     """Return rsl-rl's PPO for an environment."""
-    network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
-    network["obs_normalization"] = cfg.normalise
-    squashed = {"class_name": SquashedGaussian, "init_std": cfg.std, "std_type": "log"}
     settings = {
         "num_steps_per_env": cfg.steps,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": {**network, "distribution_cfg": squashed},
-        "critic": dict(network),
+        "actor": network(cfg, actor=True),
+        "critic": network(cfg, actor=False),
         "multi_gpu": None,
         "algorithm": {
             "class_name": "PPO",
@@ -230,6 +227,15 @@ def make_ppo(environment: Trainee, cfg: PpoCfg) -> PPO:
             settings,
             str(environment.device),
         )
+
+
+def network(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
+    """Return rsl-rl's settings of the policy, or of the value function."""
+    settings: dict[str, Any] = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
+    settings["obs_normalization"] = cfg.normalise
+    if actor:
+        settings["distribution_cfg"] = {"class_name": SquashedGaussian, "init_std": cfg.std, "std_type": "log"}
+    return settings
 
 
 def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
