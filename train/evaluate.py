@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +41,17 @@ class Evaluation:
     def counts(self) -> dict[str, int]:
         """Return how many episodes came to each outcome."""
         return {name: self.outcome.count(name) for name in sorted(set(self.outcome))}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {
+            "episodes": len(self.success),
+            "successes": int(self.success.sum()),
+            "rate": self.rate,
+            "interval": list(self.interval),
+            "outcomes": list(self.outcome),
+            "steps": self.length.tolist(),
+        }
 
     def sentence(self) -> str:
         """Return the result in words."""

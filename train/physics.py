@@ -79,7 +79,7 @@ class MujocoPhysics:
         worlds: int,
         decimation: int,
         laws: Sequence[tuple[Law, np.ndarray]] = (),
-        actors: Sequence[Actor] = (),
+        actors: Sequence[Sequence[Actor]] = (),
     ) -> None:
         """Make the worlds.
 
@@ -88,12 +88,14 @@ class MujocoPhysics:
             worlds: N.
             decimation: Steps of one action.
             laws: Force laws with their parameters, shape (P,) each.
-            actors: What else acts.
+            actors: What else acts, for each world its own, for they may have a state; none where empty.
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
-        self._decimation, self._actors = decimation, tuple(actors)
+        self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
         self._data = [mujoco.MjData(model) for _ in range(worlds)]
         self._laws = [[law.bound(model, d, values) for law, values in laws] for d in self._data]
+        edited = sorted({name for law, _ in laws for name in law.edits})
+        self._unedited = [(getattr(model, name), getattr(model, name).copy()) for name in edited]
         self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
         self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
         self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
@@ -123,17 +125,19 @@ class MujocoPhysics:
             self._write(i, d)
             for _ in range(self._decimation):
                 command = ctrl[i]
-                if self._laws[i] or self._actors:
+                for actor in self._actors[i]:
+                    command = command if actor.command is None else actor.command(d.time, command)
+                d.ctrl[:] = command
+                if self._laws[i] or self._actors[i]:
                     d.qfrc_applied[:] = 0
                     d.xfrc_applied[:] = 0
+                    for target, values in self._unedited:
+                        target[:] = values
                     for law in self._laws[i]:
                         law()
-                    for actor in self._actors:
-                        command = command if actor.command is None else actor.command(d.time, command)
-                    for actor in self._actors:
+                    for actor in self._actors[i]:
                         if actor.force is not None:
                             actor.force(self.model, d)
-                d.ctrl[:] = command
                 mujoco.mj_step(self.model, d)
             mujoco.mj_kinematics(self.model, d)
             self._read(i, d)

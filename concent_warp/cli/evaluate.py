@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say
+from concent_warp.reality.hidden_in_task import TaskWorld, wanted
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from concent_warp.train.cfg import EnvironmentCfg, TrainError
@@ -35,6 +37,11 @@ class Arguments:
     """Initial states, of which each is run once in each world."""
     seed: int = 0
     """Seed of the initial states."""
+    hide: tuple[str, ...] = ()
+    """Effects to hide in the stand-in world, each as name=value in the unit of its main parameter, as in
+    joint_friction=1.2; an unknown name lists those that there are."""
+    json: bool = False
+    """Print one JSON object with the outcome of every episode instead of sentences."""
     device: str | None = None
     """Warp's name of the device for the simulation."""
     shapes: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
@@ -53,6 +60,9 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
 
     if arguments.episodes < 1:
         raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
+    hidden = wanted(arguments.hide)
+    if hidden and arguments.world == "simulation":
+        raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
     path = arguments.checkpoint / CHECKPOINT if arguments.checkpoint.is_dir() else arguments.checkpoint
     made = Run.load(path.parent)
     task = made.task()
@@ -70,16 +80,23 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         trainer.algorithm.load(weights, {"actor": True}, True)
         with progress_bar(world) as progress:
             found[world] = evaluate(environment, trainer.policy(), states, progress=progress)
-        say(f"{world}: {found[world].sentence()}")
+        if not arguments.json:
+            with_ = f" with {', '.join(arguments.hide)} hidden in it" if hidden and world == "reality" else ""
+            say(f"{world}{with_}: {found[world].sentence()}")
+    if arguments.json:
+        document: dict[str, Any] = {"checkpoint": str(path), "seed": arguments.seed, "hidden": dict(hidden)}
+        document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
+        print(json.dumps(document, indent=1, allow_nan=False))
     return found
 
 
 def real_environment(task: Task, cfg: EnvironmentCfg, states: InitialStates, arguments: Arguments) -> Environment:
     """Return the stand-in world with the policy's senses and commands, its block to come to rest in the hole."""
     from concent_warp.train.environment import Environment
-    from concent_warp.train.physics import MujocoPhysics
+    from concent_warp.train.physics import Actor, MujocoPhysics
 
-    model = arguments.reality.build(task.model.scene).compile()
+    world = task_world(task, cfg, arguments)
+    model = world.compile()
     bodies = [task.compiled.body(i).name for i in range(task.compiled.nbody)]
     if [model.body(i).name for i in range(model.nbody)] != bodies or model.nq != task.compiled.nq:
         raise TrainError("the stand-in world has other bodies than the model", where=task.model.scene.source)
@@ -87,5 +104,17 @@ def real_environment(task: Task, cfg: EnvironmentCfg, states: InitialStates, arg
     if task.place is not None:
         task = replace(task, place=np.array([0.0, 0.0, shapes.floor + shapes.block_size / 2]))
     steps = round(cfg.decimation * task.replay.timestep / arguments.reality.timestep)
-    physics = MujocoPhysics(model, cfg.worlds, steps)
+    actors = [[Actor(one.effect.force, one.effect.command) for one in world.hidden()] for _ in range(cfg.worlds)]
+    physics = MujocoPhysics(model, cfg.worlds, steps, actors=actors)
     return Environment(task, replace(cfg, collision="full"), physics, states)
+
+
+def task_world(task: Task, cfg: EnvironmentCfg, arguments: Arguments) -> TaskWorld:
+    """Return the stand-in world that was asked for."""
+    return TaskWorld(
+        task.model.scene,
+        arguments.reality,
+        task.compiled.body(task.objects[0]).name,
+        cfg.action.gripper_actuators,
+        wanted(arguments.hide),
+    )

@@ -60,9 +60,12 @@ def drives(rig: Rig) -> tuple[Drive, ...]:
             continue
         joint = m.joint(m.actuator_trnid[a, 0]).name
         kp, kv = m.actuator_gainprm[a, 0], -m.actuator_biasprm[a, 2]
-        found.append((m.actuator(a).name, joint, float(kp), float(kv), float(m.actuator_forcerange[a, 1])))
-    top = max((f[-1] for f in found), default=1.0)
-    return tuple(Drive(*f, weight=f[-1] / top) for f in found)
+        limit = float(m.actuator_forcerange[a, 1]) if m.actuator_forcelimited[a] else np.inf
+        found.append((m.actuator(a).name, joint, float(kp), float(kv), limit))
+    # Where a drive has no limit, stiffness tells how strong it is.
+    strength = np.array([f[4] for f in found])
+    strength = strength if np.isfinite(strength).all() else np.array([f[2] for f in found])
+    return tuple(Drive(*f, weight=float(s / strength.max())) for f, s in zip(found, strength, strict=True))
 
 
 class Fresh:

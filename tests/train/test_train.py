@@ -1,5 +1,6 @@
 """Training to success, going on exactly, and losing nothing."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,3 +125,9 @@ def test_commands_train_and_evaluate(made, tmp_path, capsys):
     assert "reality: " in said
     assert "of 4 succeed" in said
     assert main(["evaluate", "--checkpoint", f"{tmp_path}/nothing"]) == 2
+    capsys.readouterr()
+    hidden = ["--hide", "joint_friction=2", "mass=1.5", "--json"]
+    assert main(["evaluate", "--checkpoint", f"{tmp_path}/run", "--episodes", "4", "--world", "reality", *hidden]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["hidden"] == {"joint_friction": 2.0, "mass": 1.5}
+    assert document["worlds"]["reality"]["episodes"] == len(document["worlds"]["reality"]["outcomes"]) == 4
