@@ -234,33 +234,30 @@ class Procedure:
                 left = [s for s in left if s.promise > DISTANT * best]
         if not found:
             return found
-        best = max(c.share(base) for c in found)
-        near = CLOSE if min(c.ratio for c in found) < EXPLAINED else NEAR
-        hoped = [max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)]
-        rough = [k for k, c in enumerate(found) if hoped[k] > near * best and c.ratio > SETTLED]
-        polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
-        for k, c in zip(rough, polished, strict=True):
-            found[k] = c
-        leader = int(np.argmax([c.share(base) for c in found]))
-        for _ in range(ROUNDS):
-            better = polish_candidate(base, found[leader]) if found[leader].ratio > SETTLED else found[leader]
-            if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
-                break
-            found[leader] = better
-        found = self.levelled(base, found, found[leader])
+        hoped = np.array([max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)])
+        if min(c.ratio for c in found) > EXPLAINED:
+            rough = np.flatnonzero(hoped > NEAR * max(c.share(base) for c in found)).tolist()
+            polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
+            for k, c in zip(rough, polished, strict=True):
+                found[k] = c
+        leader = polished_leader(base, found, ROUNDS)
+        self.level(base, found, leader, hoped)
+        if np.argmax([c.share(base) for c in found]) != leader:
+            leader = polished_leader(base, found, 1)
         return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
 
-    def levelled(self, base: Node, found: list[Candidate], leader: Candidate) -> list[Candidate]:
-        """Return fitted candidates, those close to the leader taken up again from where it has the initial states.
+    def level(self, base: Node, found: list[Candidate], leader: int, hoped: np.ndarray) -> None:
+        """Take up the fits of candidates that may be the leader's equals from where it has the initial states.
 
-        Where contacts make the cost rough, luck with the initial states would decide between them.
+        Where contacts make the cost rough, luck with the initial states would decide between them. `hoped` is the
+        gain that there may be in each.
         """
-        close = [k for k, c in enumerate(found) if c is not leader and c.share(base) > CLOSE * leader.share(base)]
-        tasks = [(base, found[k], leader.fit.offsets) for k in close]
+        best = found[leader]
+        close = [k for k in range(len(found)) if k != leader and hoped[k] > CLOSE * best.share(base)]
+        tasks = [(base, found[k], best.fit.offsets) for k in close]
         again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
         for k, c in zip(close, again, strict=True):
             found[k] = c
-        return found
 
     def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
         """Return fitted candidates, those that explain most fitted anew by way of short windows, where there are."""
@@ -418,6 +415,17 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
     from joblib import Parallel, delayed
 
     return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks))
+
+
+def polished_leader(base: Node, found: list[Candidate], rounds: int) -> int:
+    """Take up the best fit again as long as that betters it, in place; return which one it is."""
+    leader = int(np.argmax([c.share(base) for c in found]))
+    for _ in range(rounds):
+        better = polish_candidate(base, found[leader]) if found[leader].ratio > SETTLED else found[leader]
+        if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
+            break
+        found[leader] = better
+    return leader
 
 
 def quiet_ratios(base: Node) -> dict[str, float]:
