@@ -194,6 +194,8 @@ class EnvironmentCfg:
     virtual: CollisionCfg = field(default_factory=CollisionCfg)
     reset: ResetCfg = field(default_factory=ResetCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
+    randomise_effects: bool = True
+    """Draw the parameters of the model's effects for each world from their fitted 95 % intervals."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 
 if TYPE_CHECKING:
@@ -80,6 +82,7 @@ class MujocoPhysics:
         decimation: int,
         laws: Sequence[tuple[Law, np.ndarray]] = (),
         actors: Sequence[Sequence[Actor]] = (),
+        fields: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Make the worlds.
 
@@ -87,15 +90,18 @@ class MujocoPhysics:
             model: Compiled model.
             worlds: N.
             decimation: Steps of one action.
-            laws: Force laws with their parameters, shape (P,) each.
+            laws: Force laws with their parameters, shape (N, P) each.
             actors: What else acts, for each world its own, for they may have a state; none where empty.
+            fields: Values of model fields that differ between worlds, shape (N, ...) each.
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
         self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
-        self._data = [mujoco.MjData(model) for _ in range(worlds)]
-        self._laws = [[law.bound(model, d, values) for law, values in laws] for d in self._data]
+        self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
+        self._data = [mujoco.MjData(m) for m in self._models]
+        rows = list(enumerate(zip(self._models, self._data, strict=True)))
+        self._laws = [[law.bound(m, d, values[i]) for law, values in laws] for i, (m, d) in rows]
         edited = sorted({name for law, _ in laws for name in law.edits})
-        self._unedited = [(getattr(model, name), getattr(model, name).copy()) for name in edited]
+        self._unedited = [[(getattr(m, name), getattr(m, name).copy()) for name in edited] for m in self._models]
         self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
         self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
         self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
@@ -109,6 +115,14 @@ class MujocoPhysics:
         arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
         self._arrays = [tensor.numpy() for tensor in arrays]
 
+    def _model_of(self, world: int, fields: Mapping[str, np.ndarray]) -> mujoco.MjModel:
+        """Return the model of a world, one for all where none differs."""
+        if not fields:
+            return self.model
+        m = copy.copy(self.model)
+        apply_fields(m, {name: values[world] for name, values in fields.items()}, mujoco.MjData(m))
+        return m
+
     def poses(self) -> tuple[wp.array, wp.array]:
         """Return positions and orientations as Warp arrays."""
         return self._xpos, self._xquat
@@ -121,8 +135,8 @@ class MujocoPhysics:
 
     def _advance(self, ctrl: np.ndarray) -> None:
         """Simulate the steps of one action, the commands of shape (N, nu) held."""
-        for i, d in enumerate(self._data):
-            self._write(i, d)
+        for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
+            self._write(i, m, d)
             for _ in range(self._decimation):
                 command = ctrl[i]
                 for actor in self._actors[i]:
@@ -131,31 +145,31 @@ class MujocoPhysics:
                 if self._laws[i] or self._actors[i]:
                     d.qfrc_applied[:] = 0
                     d.xfrc_applied[:] = 0
-                    for target, values in self._unedited:
+                    for target, values in self._unedited[i]:
                         target[:] = values
                     for law in self._laws[i]:
                         law()
                     for actor in self._actors[i]:
                         if actor.force is not None:
-                            actor.force(self.model, d)
-                mujoco.mj_step(self.model, d)
-            mujoco.mj_kinematics(self.model, d)
+                            actor.force(m, d)
+                mujoco.mj_step(m, d)
+            mujoco.mj_kinematics(m, d)
             self._read(i, d)
             if any(d.warning[kind].number for kind in UNSTABLE):
                 self._arrays[0][i] = np.nan
 
     def place(self) -> None:
         """Compute the poses that follow from the positions."""
-        for i, d in enumerate(self._data):
-            self._write(i, d)
-            mujoco.mj_kinematics(self.model, d)
+        for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
+            self._write(i, m, d)
+            mujoco.mj_kinematics(m, d)
             self._read(i, d)
 
-    def _write(self, i: int, d: mujoco.MjData) -> None:
+    def _write(self, i: int, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """Put the tensors of a world into its data, if they have been changed since they were read off it."""
         qpos, qvel, warmstart = (array[i] for array in self._arrays[:3])
         if not (np.array_equal(qpos, d.qpos) and np.array_equal(qvel, d.qvel)):
-            mujoco.mj_resetData(self.model, d)
+            mujoco.mj_resetData(m, d)
             d.qpos[:], d.qvel[:], d.qacc_warmstart[:] = qpos, qvel, warmstart
 
     def _read(self, i: int, d: mujoco.MjData) -> None:
@@ -178,7 +192,7 @@ class WarpPhysics:
         device: str,
         nconmax: int,
         njmax: int,
-        factors: dict[str, np.ndarray] | None = None,
+        fields: Mapping[str, np.ndarray] | None = None,
         capture: bool = True,
     ) -> None:
         """Make the worlds and capture their step.
@@ -187,37 +201,43 @@ class WarpPhysics:
             model: Compiled model.
             worlds: N.
             decimation: Steps of one action.
-            laws: Force laws with their parameters, shape (P,) each.
+            laws: Force laws with their parameters, shape (N, P) each.
             device: Warp's name of the device.
             nconmax: Contacts a world, of a pool for all.
             njmax: Constraint rows of each world.
-            factors: Values of model fields that differ between worlds, shape (N, ...) each.
+            fields: Values of model fields that differ between worlds, shape (N, ...) each.
             capture: Whether steps are captured in a graph.
         """
         import mujoco_warp as mjw
 
+        from concent_warp.simulate.warp_engine import largest
+        from concent_warp.simulate.warp_model import WorldModel, check_drag
+
         self.model, self.worlds = model, worlds
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
-        factors = factors or {}
         edited = sorted({name for law, _ in laws for name in law.edits})
+        varied = dict(fields or {})
+        for name in set(edited) - set(varied):
+            value = getattr(model, name)
+            varied[name] = np.tile(value, (worlds, *[1] * value.ndim))
+        check_drag(model, varied)
+        # What a law edits is zero now and then, and must not be taken for switched off.
+        typical = {name: largest(values) + (name in edited) for name, values in varied.items()}
         with wp.ScopedDevice(self._warp_device):
-            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(sorted({*factors, *edited}), worlds))
-            self._model.opt.warn_overflow = 0
-            for name, values in factors.items():
-                target = wp.to_torch(getattr(self._model, name))
-                target.copy_(torch.as_tensor(values, dtype=torch.float32).reshape(target.shape))
+            made = WorldModel(model, np.zeros(0, dtype=int), worlds, (), typical)
+            made.load({}, varied)
+            self._model = made.mjw
             wp.synchronize_device(self._warp_device)
             self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
-            self._laws: list[tuple[Law, Any]] = [
-                (law, wp.array(np.tile(values, (worlds, 1)), dtype=float)) for law, values in laws
-            ]
-            self._data = d = mjw.make_data(model, nworld=worlds, nconmax=nconmax, njmax=njmax)
+            self._laws: list[tuple[Law, Any]] = [(law, wp.array(values, dtype=float)) for law, values in laws]
+            self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
             self.overflow, bits = wp.to_torch(d.overflow), mjw.OverflowType
             self.dropping = int(bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD)
+            made.place(d)
             start = wp.clone(d.qpos)
             self._steps()  # loads the modules, which cannot be done while a graph is captured
             self._advance = Graph(self._steps, self._warp_device, capture)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
-from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg, Range
+from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
+from concent_warp.train.effects import effects_of_worlds
 from concent_warp.train.environment import Environment
 from concent_warp.train.physics import MujocoPhysics, Physics, WarpPhysics
 from concent_warp.train.resets import InitialStates
@@ -29,43 +32,64 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
 
     device = preferred_device() if device is None else device
     m = task.compiled
-    found = [(added.effect.law(m), added.array) for added in task.model.effects]
-    laws = [(law, values) for law, values in found if law is not None]
     on_cpu = not device.startswith("cuda")
-    if cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu):
-        return MujocoPhysics(m, cfg.worlds, cfg.decimation, laws)
+    plain = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
+    if plain:
+        variable = None
+    else:
+        from concent_warp.simulate.warp_model import batchable as variable
+    effects = effects_of_worlds(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
+    fields = drawn_fields(m, cfg.worlds, cfg.randomisation, seed, effects.fields)
+    if plain:
+        return MujocoPhysics(m, cfg.worlds, cfg.decimation, effects.laws, fields=fields)
     contacts = int(ROOM * task.replay.contacts) + SPARE if cfg.nconmax is None else cfg.nconmax
     constraints = int(ROOM * task.replay.constraints) + 4 * SPARE if cfg.njmax is None else cfg.njmax
     return WarpPhysics(
         m,
         cfg.worlds,
         cfg.decimation,
-        laws,
+        effects.laws,
         device=device,
         nconmax=contacts,
         njmax=constraints,
-        factors=drawn_fields(m, cfg.worlds, cfg.randomisation, seed),
+        fields=fields,
         capture=cfg.capture != "none",
     )
 
 
-def drawn_fields(m: mujoco.MjModel, worlds: int, cfg: RandomisationCfg, seed: int) -> dict[str, np.ndarray]:
-    """Return the values of the model fields that differ between worlds, shape (N, ...) each."""
-    rng = np.random.default_rng([seed, 2])
-    fields: dict[str, np.ndarray] = {}
+def drawn_fields(
+    m: mujoco.MjModel,
+    worlds: int,
+    cfg: RandomisationCfg,
+    seed: int,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
+    """Return the values of the model fields that differ between worlds, shape (N, ...) each.
 
-    def factors(range_: Range, *trailing: int) -> np.ndarray:
-        return rng.uniform(*range_, worlds).reshape(worlds, *[1] * len(trailing))
+    Args:
+        m: The model.
+        worlds: N.
+        cfg: Ranges of the factors.
+        seed: Seed of what is drawn.
+        fields: Values that differ already; the factors are on top of them.
+    """
+    rng = np.random.default_rng([seed, 2])
+    found = dict(fields or {})
+
+    def scaled(name: str, factor: np.ndarray, column: int | None = None) -> None:
+        given = found.get(name)
+        value = getattr(m, name)
+        values = np.tile(value, (worlds, *[1] * value.ndim)) if given is None else given.copy()
+        part = values if column is None else values[..., column]
+        part *= factor.reshape(worlds, *[1] * (part.ndim - 1))
+        found[name] = values
 
     if cfg.friction[0] != cfg.friction[1]:
-        fields["geom_friction"] = np.tile(m.geom_friction, (worlds, 1, 1))
-        fields["geom_friction"][..., 0] *= factors(cfg.friction, 1)
+        scaled("geom_friction", rng.uniform(*cfg.friction, worlds), 0)
     if cfg.stiffness[0] != cfg.stiffness[1]:
-        scale = factors(cfg.stiffness, 1)
-        gain, bias = np.tile(m.actuator_gainprm, (worlds, 1, 1)), np.tile(m.actuator_biasprm, (worlds, 1, 1))
-        gain[..., 0] *= scale
-        bias[..., 1] *= scale
-        fields |= {"actuator_gainprm": gain, "actuator_biasprm": bias}
+        factor = rng.uniform(*cfg.stiffness, worlds)
+        scaled("actuator_gainprm", factor, 0)
+        scaled("actuator_biasprm", factor, 1)
     if cfg.damping[0] != cfg.damping[1]:
-        fields["dof_damping"] = np.tile(m.dof_damping, (worlds, 1)) * factors(cfg.damping, 1)
-    return fields
+        scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
+    return found

@@ -1,0 +1,147 @@
+"""Effects of a model differ between worlds as their fitted intervals have it."""
+
+import warnings
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.cfg import RandomisationCfg
+from concent_warp.train.effects import drawn, effects_of_worlds
+from concent_warp.train.task import Task
+from concent_warp.train.worlds import drawn_fields, make_physics
+from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+
+from concent_warp.effects.effect import AddedEffect
+from concent_warp.effects.joints import JointDamping, Stribeck
+from concent_warp.effects.measurement import Latency
+from concent_warp.effects.objects import Mass, Size
+
+DAMPING = AddedEffect(JointDamping("x", "y"), (30.0, 20.0), ((20.0, 40.0), (20.0, 20.0)))
+STRIBECK = AddedEffect(
+    Stribeck("x", "y", "z"), (6.0, 5.0, 4.0, 0.05), ((2.0, 10.0), (5.0, 5.0), (4.0, 4.0), (0.05, 0.05))
+)
+MASS = AddedEffect(Mass("block"), (1.2,), ((1.0, 1.4),))
+WORLDS = 6
+
+
+def task_of(*effects: AddedEffect) -> Task:
+    plain = make_model()
+    demonstration = make_demonstration(plain)
+    events = make_events(plain, demonstration)
+    return Task.build(replace(plain, effects=effects), demonstration, SETTINGS, events)
+
+
+@pytest.fixture(scope="module")
+def varied() -> Task:
+    return task_of(DAMPING, STRIBECK, MASS)
+
+
+def test_parameters_have_the_interval_of_the_fit(varied):
+    rng = np.random.default_rng(0)
+    added = (DAMPING, STRIBECK, MASS)
+    damping, stribeck, mass = (drawn(a.effect.parameters(varied.compiled), a, 4000, rng) for a in added)
+    for values, (low, high) in ((damping[:, 0], (20, 40)), (stribeck[:, 0], (2, 10)), (mass[:, 0], (1.0, 1.4))):
+        assert ((values > low) & (values < high)).mean() == pytest.approx(0.95, abs=0.012)
+        assert values.mean() == pytest.approx((low + high) / 2, abs=0.02 * (low + high))
+    assert (damping[:, 1] == 20).all()
+    assert (stribeck[:, 1:] == STRIBECK.array[1:]).all()
+    assert abs(np.corrcoef(damping[:, 0], mass[:, 0])[0, 1]) < 0.05
+
+
+def test_values_follow_from_the_seed(varied):
+    first, again, other = (effects_of_worlds(varied, 5, seed, draw=True).values[0] for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1
+
+
+def test_parameters_stay_within_their_bounds():
+    wide = replace(DAMPING, intervals=((-40.0, 100.0), (0.0, 40.0)))
+    values = effects_of_worlds(task_of(wide), 500, 0, draw=True).values[0]
+    assert values.min() >= 0
+    assert values[:, 0].max() > 90
+    assert len(np.unique(values[:, 0])) == 500
+
+
+def test_nothing_is_drawn_where_it_is_not_wanted_or_not_known(varied):
+    found = effects_of_worlds(varied, 3, 0, draw=False)
+    assert not found.fields
+    for values, added in zip(found.values, varied.model.effects, strict=True):
+        np.testing.assert_array_equal(values, np.tile(added.array, (3, 1)))
+    unknown = effects_of_worlds(task_of(replace(DAMPING, intervals=())), 3, 0, draw=True)
+    assert not unknown.fields
+
+
+def test_fields_are_those_of_models_with_the_drawn_values(varied):
+    found = effects_of_worlds(varied, WORLDS, 0, draw=True)
+    assert set(found.fields) >= {"dof_damping", "body_mass"}
+    for world in range(WORLDS):
+        effects = [replace(a, values=tuple(v[world])) for a, v in zip(varied.model.effects, found.values, strict=True)]
+        m = replace(varied.model, effects=tuple(effects)).compile(varied.collidable)
+        for name, values in found.fields.items():
+            np.testing.assert_allclose(values[world], getattr(m, name), rtol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_each_world_moves_as_a_model_with_its_values(varied, engine):
+    settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=5)
+    physics = make_physics(varied, settings, device="cpu")
+    found = effects_of_worlds(varied, WORLDS, 0, draw=True)
+    start = torch.as_tensor(varied.replay.qpos[0])
+    physics.qpos[:] = start.to(physics.qpos.dtype)
+    ctrl = varied.replay.ctrl[0].copy()
+    ctrl[:2] += 0.03
+    physics.ctrl[:] = torch.as_tensor(ctrl, dtype=torch.float32)
+    for _ in range(6):
+        physics.advance()
+    expected = []
+    for world in range(WORLDS):
+        effects = [replace(a, values=tuple(v[world])) for a, v in zip(varied.model.effects, found.values, strict=True)]
+        model = replace(varied.model, effects=tuple(effects))
+        expected.append(one_by_one(model, varied, ctrl, 30))
+    expected = np.array(expected)
+    assert np.ptp(expected[:, varied.robot.qpos[0]]) > 1e-4
+    np.testing.assert_allclose(physics.qpos.numpy(), expected, rtol=0, atol=1e-9 if engine == "mujoco" else 2e-4)
+
+
+def one_by_one(model, task: Task, ctrl: np.ndarray, steps: int) -> np.ndarray:
+    """Return where C MuJoCo brings a single model, its laws written out here, shape (nq,)."""
+    m = model.compile(task.collidable)
+    d = mujoco.MjData(m)
+    d.qpos[:] = task.replay.qpos[0]
+    d.ctrl[:] = ctrl.astype(np.float32)
+    laws = [(law, added.array) for added in model.effects if (law := added.effect.law(m)) is not None]
+    loss = m.dof_frictionloss.copy()
+    for _ in range(steps):
+        m.dof_frictionloss[:] = loss
+        for law, values in laws:
+            law.apply(m, d, values)
+        mujoco.mj_step(m, d)
+    return d.qpos.copy()
+
+
+def test_what_is_compiled_in_is_kept_and_said_so():
+    size = AddedEffect(Size("block"), (1.01,), ((0.99, 1.03),))
+    late = AddedEffect(Latency(), (0.01,), ((0.005, 0.015),))
+    task = task_of(size, DAMPING, late)
+    with pytest.warns(UserWarning, match="cannot vary size between worlds") as said:
+        found = effects_of_worlds(task, 3, 0, draw=True)
+    assert len(said) == 1
+    assert found.kept == ("size",)
+    assert (found.values[0] == 1.01).all()
+    assert len(np.unique(found.values[1][:, 0])) == 3
+    with pytest.warns(UserWarning, match="joint_damping"):
+        found = effects_of_worlds(task, 3, 0, draw=True, variable=lambda name: name != "dof_damping")
+    assert found.kept == ("size", "joint_damping")
+    assert not found.fields
+
+
+def test_factors_are_on_top_of_effects(varied):
+    cfg = RandomisationCfg(damping=(2.0, 2.0000001))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fields = effects_of_worlds(varied, WORLDS, 0, draw=True).fields
+    both = drawn_fields(varied.compiled, WORLDS, cfg, 0, fields)
+    np.testing.assert_allclose(both["dof_damping"], 2 * fields["dof_damping"], rtol=1e-6)
+    np.testing.assert_array_equal(both["body_mass"], fields["body_mass"])
