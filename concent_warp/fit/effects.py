@@ -9,6 +9,7 @@ import numpy as np
 
 from concent_warp.diagnose.blocks import block_sums, covariance, cut_blocks
 from concent_warp.diagnose.diagnosis import FittedParameter
+from concent_warp.diagnose.settle import law_errors
 from concent_warp.errors import ModelError
 from concent_warp.fit.initial_states import start_cost, start_step
 from concent_warp.fit.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected
@@ -188,13 +189,21 @@ def best_start(
 def fitted_parameters(
     solver: Solver, fit: Fit, pieces: Sequence[Linear], windows: Sequence[Window]
 ) -> tuple[list[FittedParameter], np.ndarray]:
-    """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P)."""
+    """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
+
+    The intervals are those of the linear fit with the law's own error, see `law_errors`.
+    """
     blocks = cut_blocks(windows)
     limit = huber_limit([piece.residual for piece in pieces])
     covered = covariance(block_sums(pieces, blocks, limit), blocks)
     std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
+    law = np.zeros(len(std))
+    for part in solver.p.split:
+        if part.stop > part.start:
+            law[part] = law_errors(solver.p.parameters[part], fit.values[part])
+    reaches = NORMAL * np.hypot(std * solver.scale, law)
     found = []
-    for q, fitted, reach in zip(solver.p.parameters, fit.values, NORMAL * std * solver.scale, strict=True):
+    for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)
         low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
         untold = high - low > 2 * NORMAL * UNKNOWN * PRIOR * q.scale
