@@ -14,6 +14,8 @@ from concent_warp.train.resets import InitialStates
 from tensordict import TensorDict
 
 Policy = Callable[[TensorDict], torch.Tensor]
+Watch = Callable[[np.ndarray, np.ndarray], None]
+"""Takes the episodes that are running, ids (R,) int, and their positions (R, nq)."""
 FAILURES = ("dropped", "severe", "diverged")
 
 
@@ -62,7 +64,12 @@ class Evaluation:
 
 
 def evaluate(
-    environment: Environment, policy: Policy, states: InitialStates, *, progress: Callable[[float], None] | None = None
+    environment: Environment,
+    policy: Policy,
+    states: InitialStates,
+    *,
+    progress: Callable[[float], None] | None = None,
+    watch: Watch | None = None,
 ) -> Evaluation:
     """Run one episode from each of the states that an environment was made with.
 
@@ -71,6 +78,7 @@ def evaluate(
         policy: From observations to actions, without exploration.
         states: The environment's initial states.
         progress: Called with the share done.
+        watch: Called before each step with what is there.
     """
     count, worlds = len(states.qpos), environment.num_envs
     success, length = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
@@ -82,6 +90,9 @@ def evaluate(
         observation = environment.get_observations()
         open_ = np.ones(worlds, dtype=bool)
         for k in range(steps):
+            if watch is not None:
+                worlds_open = np.flatnonzero(open_ & (first + np.arange(worlds) < count))
+                watch(first + worlds_open, environment.physics.qpos.cpu().numpy()[worlds_open])
             with torch.inference_mode():
                 observation, _, done, _ = environment.step(policy(observation))
             ended = done.cpu().numpy() & open_

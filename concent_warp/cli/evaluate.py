@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from concent_warp.cli.terminal import progress_bar, quiet_warp, say
+from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.reality.hidden_in_task import TaskWorld, wanted
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
@@ -40,6 +41,12 @@ class Arguments:
     hide: tuple[str, ...] = ()
     """Effects to hide in the stand-in world, each as name=value in the unit of its main parameter, as in
     joint_friction=1.2; an unknown name lists those that there are."""
+    videos: int = 0
+    """How many of the first episodes in the stand-in world to film, as MP4."""
+    out: Path | None = None
+    """Folder for the videos; by default the folder videos in the run folder."""
+    overwrite: bool = False
+    """Replace videos that are there."""
     json: bool = False
     """Print one JSON object with the outcome of every episode instead of sentences."""
     device: str | None = None
@@ -63,7 +70,10 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     hidden = wanted(arguments.hide)
     if hidden and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
+    if arguments.videos and arguments.world == "simulation":
+        raise TrainError("videos are of the stand-in world", fix="add --world reality")
     path = arguments.checkpoint / CHECKPOINT if arguments.checkpoint.is_dir() else arguments.checkpoint
+    films = video_files(arguments, path.parent)
     made = Run.load(path.parent)
     task = made.task()
     states = made.evaluation_states(task, arguments.episodes, arguments.seed)
@@ -79,15 +89,59 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         weights = load_checkpoint(path, str(environment.device))
         trainer.algorithm.load(weights, {"actor": True}, True)
         with progress_bar(world) as progress:
-            found[world] = evaluate(environment, trainer.policy(), states, progress=progress)
+            reel = Reel(len(films)) if world == "reality" else None
+            found[world] = evaluate(environment, trainer.policy(), states, progress=progress, watch=reel)
         if not arguments.json:
             with_ = f" with {', '.join(arguments.hide)} hidden in it" if hidden and world == "reality" else ""
             say(f"{world}{with_}: {found[world].sentence()}")
+        if reel is not None and films:
+            film_all(films, reel, task_world(task, cfg, arguments), task, environment.control_step)
+            if not arguments.json:
+                say_written(*films)
     if arguments.json:
         document: dict[str, Any] = {"checkpoint": str(path), "seed": arguments.seed, "hidden": dict(hidden)}
         document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
         print(json.dumps(document, indent=1, allow_nan=False))
     return found
+
+
+class Reel:
+    """States of the first episodes of an evaluation."""
+
+    def __init__(self, count: int) -> None:
+        self.states: list[list[np.ndarray]] = [[] for _ in range(count)]
+
+    def __call__(self, episodes: np.ndarray, qpos: np.ndarray) -> None:
+        """Keep the states of those that are wanted; ids (R,) and positions (R, nq)."""
+        for episode, state in zip(episodes, qpos, strict=True):
+            if episode < len(self.states):
+                self.states[episode].append(state.copy())
+
+
+def video_files(arguments: Arguments, folder: Path) -> list[Path]:
+    """Return the files of the videos that were asked for, none of which is there yet."""
+    if not 0 <= arguments.videos <= arguments.episodes:
+        raise TrainError(
+            "the number of videos is not right", expected=f"0 to {arguments.episodes}", found=arguments.videos
+        )
+    place = arguments.out or folder / "videos"
+    hidden = "".join(f"_{one}" for one in arguments.hide)
+    films = [place / f"reality{hidden}_{k:03d}.mp4" for k in range(arguments.videos)]
+    for film in films:
+        claim_file(film, overwrite=arguments.overwrite)
+    return films
+
+
+def film_all(films: list[Path], reel: Reel, world: TaskWorld, task: Task, period: float) -> None:
+    """Film the episodes of a reel, their states being a period apart [s]."""
+    from concent_warp.reality.video import filmed, write_video
+
+    bodies = tuple(task.compiled.body(i).name for i in task.objects)
+    with progress_bar("videos") as progress:
+        for k, (path, states) in enumerate(zip(films, reel.states, strict=True)):
+            make_folder(path.parent)
+            write_video(path, filmed(world.spec(), bodies, np.array(states), period), 1 / period)
+            progress((k + 1) / len(films))
 
 
 def real_environment(task: Task, cfg: EnvironmentCfg, states: InitialStates, arguments: Arguments) -> Environment:

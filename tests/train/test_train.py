@@ -131,3 +131,28 @@ def test_commands_train_and_evaluate(made, tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["hidden"] == {"joint_friction": 2.0, "mass": 1.5}
     assert document["worlds"]["reality"]["episodes"] == len(document["worlds"]["reality"]["outcomes"]) == 4
+
+
+def test_first_episodes_in_the_stand_in_world_are_filmed(made, tmp_path, capsys):
+    import cv2
+
+    episode = replace(made, cfg=replace(made.cfg, environment=replace(made.cfg.environment, episode=0.4)))
+    train(episode, tmp_path / "run", device="cpu")
+    command = ["evaluate", "--checkpoint", f"{tmp_path}/run", "--episodes", "3", "--world", "reality", "--videos", "2"]
+    command += ["--hide", "mass=1.5"]
+    assert main(command) == 0
+    files = sorted((tmp_path / "run" / "videos").iterdir())
+    assert [file.name for file in files] == ["reality_mass=1.5_000.mp4", "reality_mass=1.5_001.mp4"]
+    assert files[1].name in capsys.readouterr().out
+    video = cv2.VideoCapture(str(files[0]))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20)
+    frames = []
+    while (read := video.read())[0]:
+        frames.append(read[1])
+    assert 1 <= len(frames) <= 8
+    assert frames[0].shape == (240, 320, 3)
+    assert frames[0].std() > 10
+    assert main(command) == 2
+    assert "overwrite" in capsys.readouterr().err
+    assert main([*command, "--videos", "9"]) == 2
+    assert "number of videos" in capsys.readouterr().err
