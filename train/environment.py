@@ -32,8 +32,8 @@ SPEED = 1e4
 """Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
 EXTENT = 1e4
 """Generalised position beyond which it does [rad or m]."""
-SUMS = (*TERMS, "steps", "episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
-SUMS = (*SUMS, "overflow")
+EPISODES = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
+SUMS = (*TERMS, "steps", *EPISODES, "overflow")
 """What is summed over steps and worlds between two calls of `Environment.read_log`."""
 
 

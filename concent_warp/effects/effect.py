@@ -78,9 +78,9 @@ class Effect:
     signature: ClassVar[str]
     """What it leaves in the residuals of a model that lacks it."""
     confusions: ClassVar[tuple[str, ...]] = ()
+    """Effects that leave something alike, by name."""
     rarity: ClassVar[float] = 0.0
     """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders what data cannot tell apart."""
-    """Effects that leave something alike, by name."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
     threshold: ClassVar[bool] = False
