@@ -185,14 +185,18 @@ class Environment(VecEnv):
         log = {f"/reward/{name}": value for name, value in zip(TERMS, means.unbind(), strict=True)}
         return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
 
-    def read_log(self) -> dict[str, float]:
+    def read_log(self, total: Callable[[torch.Tensor], torch.Tensor] | None = None) -> dict[str, float]:
         """Return means since the last call, and start anew; this waits for the device.
 
         Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
         episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
         were too small.
+
+        Args:
+            total: Adds the sums of other processes to those of this one; the worlds of this one alone by default.
         """
-        sums = dict(zip(SUMS, self._sums.tolist(), strict=True))
+        values = self._sums.clone() if total is None else total(self._sums.clone())
+        sums = dict(zip(SUMS, values.tolist(), strict=True))
         self._sums.zero_()
         steps, episodes = max(sums["steps"], 1.0), max(sums["episodes"], 1.0)
         per_step = {*TERMS, "overflow"}

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.distribution import SquashedGaussian
+from concent_warp.train.ranks import Ranks
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
@@ -22,6 +23,10 @@ CHECKPOINT = "checkpoint.pt"
 """File of the latest state of a training in its run folder."""
 OFFENCE = "diverged.npz"
 """File of the first state from which a world diverged."""
+
+
+Total = Callable[[torch.Tensor], torch.Tensor]
+"""Adds up what several processes have each for themselves."""
 
 
 class Trainee(Protocol):
@@ -33,7 +38,7 @@ class Trainee(Protocol):
 
     def get_observations(self) -> TensorDict: ...  # noqa: D102
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]: ...  # noqa: D102
-    def read_log(self) -> dict[str, float]: ...  # noqa: D102
+    def read_log(self, total: Total | None = None) -> dict[str, float]: ...  # noqa: D102
     def offending_state(self) -> dict[str, np.ndarray] | None: ...  # noqa: D102
     def state(self) -> dict[str, torch.Tensor]: ...  # noqa: D102
     def restore(self, state: dict[str, torch.Tensor]) -> None: ...  # noqa: D102
@@ -46,7 +51,7 @@ class Round:
     iteration: int
     """Rounds done, this one included."""
     steps: int
-    """Environment steps done in all."""
+    """Environment steps done in all, by all processes."""
     seconds: float
     """Time spent in all [s], over all sittings."""
     collecting: float
@@ -63,20 +68,27 @@ Report = Callable[[Round], None]
 class Trainer:
     """A policy in training."""
 
-    def __init__(self, environment: Trainee, cfg: TrainCfg, folder: Path | None = None) -> None:
+    def __init__(
+        self, environment: Trainee, cfg: TrainCfg, folder: Path | None = None, ranks: Ranks | None = None
+    ) -> None:
         """Make policy and value function.
 
         Args:
             environment: What to train in.
             cfg: Settings; of its environment part nothing is read.
             folder: Run folder for checkpoints and TensorBoard; None keeps everything in memory.
+            ranks: The processes that train together, joined already; this one alone by default.
         """
         self.environment, self.cfg, self.folder = environment, cfg, folder
+        self.ranks = Ranks() if ranks is None else ranks
         self.device = str(environment.device)
-        seed_everything(cfg.seed)
-        self.algorithm = make_ppo(environment, cfg.ppo)
+        seed_everything(cfg.seed)  # the same networks in all processes
+        self.algorithm = make_ppo(environment, cfg.ppo, self.ranks)
+        if not self.ranks.first:
+            seed_everything(self.ranks.seed(cfg.seed))
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
         self.history: list[Round] = []
+        self._offended = False
 
     def learn(self, report: Report | None = None, *, seconds: float | None = None) -> Round | None:
         """Train to the last round, to the target, or for some time, and return the last round.
@@ -86,26 +98,37 @@ class Trainer:
         Args:
             report: Called after every round.
             seconds: Time after which to stop [s].
+
+        Raises:
+            TrainError: The losses or the weights are not finite any more. The last checkpoint stays as it is.
         """
         begun = time.monotonic()
         self.algorithm.train_mode()
         observations = self.environment.get_observations()
         last: Round | None = None
-        with self._writer() as write:
+        with self._writer() as write, self.ranks.interruptions() as interrupted:
             try:
                 while self.iteration < self.cfg.ppo.iterations:
                     last, observations = self._round(observations)
                     write(last)
                     if report is not None:
                         report(last)
-                    done = self.cfg.target is not None and last.log["success"] >= self.cfg.target
-                    if done or (seconds is not None and time.monotonic() - begun > seconds):
+                    late = seconds is not None and time.monotonic() - begun > seconds
+                    if interrupted():
+                        raise KeyboardInterrupt
+                    if (self.cfg.target is not None and last.log["success"] >= self.cfg.target) or self._agreed(late):
                         break
                     if self.iteration % self.cfg.checkpoint == 0:
                         self.save()
-            finally:
+            except KeyboardInterrupt:
                 self.save()
+                raise
+            self.save()
         return last
+
+    def _agreed(self, late: bool) -> bool:
+        """Return what the first process thinks: clocks differ."""
+        return late if self.ranks.alone else self.ranks.gathered(late)[0]
 
     def _round(self, observations: TensorDict) -> tuple[Round, TensorDict]:
         """Collect and update once."""
@@ -117,31 +140,59 @@ class Trainer:
                 observations, rewards, dones, extras = environment.step(actions)
                 ppo.process_env_step(observations, rewards, dones, extras)
             ppo.compute_returns(observations)
-        log = environment.read_log()
+        log = environment.read_log(self.ranks.total)
         collected = time.monotonic()
         losses = ppo.update()
         end = time.monotonic()
+        means = self._mean_losses(losses)
         self.iteration += 1
-        self.steps += self.cfg.ppo.steps * environment.num_envs
+        self.steps += self.steps_of_round
         self.seconds += end - start
-        log |= {f"loss {name}": float(value) for name, value in losses.items()}
+        log |= {f"loss {name}": value for name, value in means.items()}
         log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
         this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, log)
         self.history.append(this)
-        self._keep_offence()
+        self._keep_offence(this)
         return this, observations
 
-    def _keep_offence(self) -> None:
+    @property
+    def steps_of_round(self) -> int:
+        """Environment steps of a round, of all processes."""
+        return self.cfg.ppo.steps * self.environment.num_envs * self.ranks.count
+
+    def _mean_losses(self, losses: dict[str, float]) -> dict[str, float]:
+        """Return the losses of an update, averaged over the processes.
+
+        Raises:
+            TrainError: They or the weights are not finite any more.
+        """
+        values = torch.tensor([float(value) for value in losses.values()], device=self.device)
+        means = (self.ranks.total(values) / self.ranks.count).tolist()
+        weights = [*self.algorithm.actor.parameters(), *self.algorithm.critic.parameters()]
+        fine = bool(torch.stack([weight.detach().isfinite().all() for weight in weights]).all())
+        if not (fine and np.isfinite(means).all()):
+            raise TrainError(
+                "the training has diverged: losses or weights are not finite any more",
+                where=self.folder,
+                found=", ".join(f"{name} {value:g}" for name, value in zip(losses, means, strict=True)),
+                fix="go on from the last checkpoint, which is from before, with a lower --ppo.learning-rate",
+            )
+        return dict(zip(losses, means, strict=True))
+
+    def _keep_offence(self, this: Round) -> None:
         """Save the first state from which a world diverged."""
-        if self.folder is None or (self.folder / OFFENCE).exists():
+        if self._offended or not this.log.get("diverged worlds"):
             return
-        if self.history[-1].log.get("diverged worlds") and (state := self.environment.offending_state()) is not None:
-            np.savez(self.folder / OFFENCE, **state)  # pyright: ignore[reportArgumentType]
+        states = [state for state in self.ranks.gathered(self.environment.offending_state()) if state is not None]
+        self._offended = bool(states)
+        if not states or self.folder is None or not self.ranks.first or (self.folder / OFFENCE).exists():
+            return
+        np.savez(self.folder / OFFENCE, **states[0])  # pyright: ignore[reportArgumentType]
 
     @contextlib.contextmanager
     def _writer(self) -> Iterator[Report]:
         """Give what writes a round to TensorBoard."""
-        if self.folder is None:
+        if self.folder is None or not self.ranks.first:
             yield ignore
             return
         from torch.utils.tensorboard.writer import SummaryWriter
@@ -151,14 +202,18 @@ class Trainer:
             def write(this: Round) -> None:
                 for name, value in this.log.items():
                     writer.add_scalar(name.replace(" ", "_"), value, this.steps, this.seconds)
-                rate = self.cfg.ppo.steps * self.environment.num_envs / (this.collecting + this.updating)
+                rate = self.steps_of_round / (this.collecting + this.updating)
                 writer.add_scalar("steps_per_second", rate, this.steps, this.seconds)
 
             yield write
 
     def save(self) -> None:
-        """Write a checkpoint, in one piece or not at all."""
+        """Write a checkpoint, in one piece or not at all, with the worlds and generators of all processes."""
         if self.folder is None:
+            return
+        worlds = {name: value.cpu() for name, value in self.environment.state().items()}
+        ranks = self.ranks.gathered({"environment": worlds, "random": random_state(self.device)})
+        if not self.ranks.first:
             return
         document = {
             **self.algorithm.save(),
@@ -166,8 +221,7 @@ class Trainer:
             "iteration": self.iteration,
             "steps": self.steps,
             "seconds": self.seconds,
-            "environment": self.environment.state(),
-            "random": random_state(),
+            "ranks": ranks,
         }
         path = self.folder / CHECKPOINT
         partial = path.with_name(f".{path.name}.partial")
@@ -175,16 +229,31 @@ class Trainer:
         partial.replace(path)
 
     def resume(self, path: Path) -> None:
-        """Go on from a checkpoint, as if training had not stopped."""
+        """Go on from a checkpoint, as if training had not stopped.
+
+        Raises:
+            TrainError: It cannot be gone on with: it is of another network, of more or fewer processes, or holds a
+                policy alone.
+        """
         document = load_checkpoint(path, self.device)
+        if "ranks" not in document:
+            raise TrainError("the checkpoint holds a policy, but no training to go on with", where=path)
+        if len(document["ranks"]) != self.ranks.count:
+            raise TrainError(
+                "the training was begun with another number of processes",
+                where=path,
+                expected=len(document["ranks"]),
+                found=self.ranks.count,
+            )
+        mine = document["ranks"][self.ranks.rank]
         try:
             self.algorithm.load(document, None, True)
         except RuntimeError as error:
             raise TrainError("the checkpoint is of another network", where=path, found=str(error)[:200]) from None
         self.algorithm.learning_rate = document["learning_rate"]
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
-        self.environment.restore(document["environment"])
-        restore_random_state(document["random"])
+        self.environment.restore(mine["environment"])
+        restore_random_state(mine["random"], self.device)
 
     def policy(self) -> Callable[[TensorDict], torch.Tensor]:
         """Return the policy without exploration: from observations to actions, shape (N, A)."""
@@ -197,14 +266,14 @@ def ignore(this: Round) -> None:
     del this
 
 
-def make_ppo(environment: Trainee, cfg: PpoCfg) -> PPO:
-    """Return rsl-rl's PPO for an environment."""
+def make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
+    """Return rsl-rl's PPO for an environment; its gradients are averaged over the processes."""
     settings = {
         "num_steps_per_env": cfg.steps,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": network(cfg, actor=True),
         "critic": network(cfg, actor=False),
-        "multi_gpu": None,
+        "multi_gpu": ranks.rsl_rl(),
         "algorithm": {
             "class_name": "PPO",
             "num_learning_epochs": cfg.epochs,
@@ -262,14 +331,14 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def random_state() -> dict[str, Any]:
-    """Return the state of torch's generators; nothing else draws while training."""
-    cuda = [state.cpu() for state in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else []
+def random_state(device: str) -> dict[str, Any]:
+    """Return the state of torch's generators on the CPU and on a device; nothing else draws while training."""
+    cuda = torch.cuda.get_rng_state(device).cpu() if device.startswith("cuda") else None
     return {"cpu": torch.get_rng_state(), "cuda": cuda}
 
 
-def restore_random_state(state: dict[str, Any]) -> None:
+def restore_random_state(state: dict[str, Any], device: str) -> None:
     """Bring back what `random_state` returned."""
     torch.set_rng_state(state["cpu"].cpu())
-    if state["cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all([one.cpu() for one in state["cuda"]])
+    if state["cuda"] is not None and device.startswith("cuda"):
+        torch.cuda.set_rng_state(state["cuda"].cpu(), device)

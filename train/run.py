@@ -7,6 +7,7 @@ from pathlib import Path
 
 from concent_warp.train.cfg import SETTINGS, TrainCfg, TrainError, plain
 from concent_warp.train.ppo import CHECKPOINT, Report, Round, Trainer
+from concent_warp.train.ranks import Ranks
 from concent_warp.train.resets import InitialStates, draw_states
 from concent_warp.train.task import Task
 from concent_warp.train.worlds import make_environment
@@ -88,6 +89,7 @@ def train(
     resume: bool = False,
     report: Report | None = None,
     seconds: float | None = None,
+    ranks: Ranks | None = None,
 ) -> tuple[Trainer, Round | None]:
     """Train, and return the trainer and its last round.
 
@@ -98,24 +100,25 @@ def train(
         resume: Go on from the folder's checkpoint.
         report: Called after every round.
         seconds: Time after which to stop [s].
+        ranks: The processes that train together, joined already; this one alone by default. Each has
+            `run.cfg.environment.worlds` worlds of its own.
 
     Raises:
         TrainError: The folder's training was begun with other settings.
     """
-    if folder is not None:
-        if resume:
-            check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
-        run.save(folder)
-    from concent_warp.simulate.warp_engine import preferred_device
-
-    task = run.task()
-    where = preferred_device() if device is None else device
-    states = draw_states(task, run.cfg.environment.reset, run.cfg.seed, device=where)
-    environment = make_environment(task, run.cfg.environment, states, device=device, seed=run.cfg.seed)
-    trainer = Trainer(environment, run.cfg, folder)
-    environment.reset()
-    if resume and folder is not None:
-        trainer.resume(folder / CHECKPOINT)
+    ranks = Ranks() if ranks is None else ranks
+    with ranks.agreeing():
+        if folder is not None and ranks.first:
+            if resume:
+                check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
+            run.save(folder)
+        task, where, seed = run.task(), ranks.device(device), ranks.seed(run.cfg.seed)
+        states = draw_states(task, run.cfg.environment.reset, seed, device=where)
+        environment = make_environment(task, run.cfg.environment, states, device=where, seed=seed)
+        trainer = Trainer(environment, run.cfg, folder, ranks)
+        environment.reset()
+        if resume and folder is not None:
+            trainer.resume(folder / CHECKPOINT)
     return trainer, trainer.learn(report, seconds=seconds)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Sequence
 from importlib import import_module
 
 import concent_warp
+from concent_warp.cli.terminal import processes
 from concent_warp.errors import ConcentError
 
 COMMANDS = {
@@ -27,6 +29,8 @@ COMMANDS = {
 }
 """Names of the commands, each a module of this package, with what they do."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141
+PATIENCE = 10.0
+"""How long another process waits for the first one to say what is wrong [s]."""
 
 
 def usage() -> str:
@@ -92,20 +96,36 @@ def run(command: str, arguments: Sequence[str]) -> int:
             args=arguments,
             prog=f"concent {command}",
             config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
+            console_outputs=processes()[0] == 0,
         )
         module.run(settings)
     except ConcentError as error:
-        print(f"concent {command}: {error}", file=sys.stderr)
+        complain(f"concent {command}: {error}")
         return ERROR
     except BrokenPipeError:
         return leave_pipe()
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
-        print(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.", file=sys.stderr)
+        complain(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.")
         return ERROR
     except KeyboardInterrupt as interrupt:
-        print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
+        if processes()[0] == 0:
+            print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
         return INTERRUPTED
     except SystemExit as end:  # tyro ends the process after a wrong option or --help
+        let_the_first_speak()
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0
+
+
+def complain(sentence: str) -> None:
+    """Write to standard error, once where there are several processes: what stops one stops all."""
+    if processes()[0] == 0:
+        print(sentence, file=sys.stderr)
+    let_the_first_speak()
+
+
+def let_the_first_speak() -> None:
+    """Wait to be ended in several processes: the first that leaves ends the others, maybe before they have spoken."""
+    if processes()[0] > 0:
+        time.sleep(PATIENCE)

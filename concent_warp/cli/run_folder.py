@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import concent_warp
+from concent_warp.cli.terminal import processes
 from concent_warp.errors import ConcentError
 from concent_warp.model import write_text
 
@@ -22,6 +23,8 @@ SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""
 CHECKPOINT = "checkpoint.npz"
 """File of the state of a fit."""
+CHECKPOINTS = "checkpoint.*"
+"""Files of the state of a fit or a training."""
 FREE = ("out", "resume", "overwrite", "engine", "recording", "model", "scene")
 """Settings that an interrupted run need not repeat to the letter: paths, and what does not decide the result."""
 INVOCATION: ContextVar[tuple[str, ...]] = ContextVar("INVOCATION", default=())
@@ -55,7 +58,7 @@ def run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> Iterat
     try:
         yield
     except ConcentError:
-        if new and not (folder / CHECKPOINT).exists():
+        if new and not any(folder.glob(CHECKPOINTS)):
             shutil.rmtree(folder)
         raise
 
@@ -132,12 +135,19 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def command_line() -> str:
     """Return the command that is running, as one would type it."""
-    return shlex.join(["concent", *INVOCATION.get()])
+    return shlex.join([*program(), *INVOCATION.get()])
 
 
 def resuming_command() -> str:
     """Return the command that goes on with the run that is running."""
-    return resuming(["concent", *INVOCATION.get()])
+    return resuming([*program(), *INVOCATION.get()])
+
+
+def program() -> list[str]:
+    """Return what comes before a command's name: "concent", or what starts it in several processes."""
+    if (count := processes()[1]) == 1:
+        return ["concent"]
+    return ["torchrun", "--nproc-per-node", str(count), "-m", "concent_warp"]
 
 
 def resuming(command: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,6 +17,7 @@ from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
     from concent_warp.train.ppo import Round
+    from concent_warp.train.ranks import Ranks
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Arguments:
     """Train a policy by reinforcement learning to bring about the contact events of a demonstration.
 
     Writes the policy with all it was made from to a run folder, and curves for TensorBoard. Ctrl-C loses nothing.
+    On N GPUs: torchrun --nproc-per-node N -m concent_warp train ..., each with --worlds of its own.
     """
 
     recording: tyro.conf.Positional[Path]
@@ -65,34 +68,47 @@ class Arguments:
 
 
 def run(arguments: Arguments) -> Round | None:
-    """Train and write the run folder."""
+    """Train and write the run folder, one of several processes where torchrun started them."""
     quiet_warp()
-    from concent_warp.events.sequence import ContactEventSequence
-    from concent_warp.train.run import CHECKPOINT, Run, train
+    from concent_warp.train.ppo import CHECKPOINT
+    from concent_warp.train.ranks import Ranks
 
-    recording = load_recording(arguments.recording)
-    model = given_model(arguments.model, recording)
+    ranks = Ranks.here()
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
-    cfg = arguments.cfg()
-    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
-        write_settings(folder, arguments)
-        made = Run.new(model, recording, cfg, demonstration=arguments.demonstration, events=events)
+    claimed = run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
+    with ranks.joined(ranks.device(arguments.device)), claimed if ranks.first else nullcontext():
         try:
-            with status_bar("training") as update:
-
-                def show(this: Round) -> None:
-                    rate = cfg.ppo.steps * cfg.environment.worlds / (this.collecting + this.updating)
-                    text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {rate:,.0f} steps/s"
-                    left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
-                    update(this.iteration / cfg.ppo.iterations, text, left)
-
-                _, last = train(made, folder, device=arguments.device, resume=arguments.resume, report=show)
+            last = train_in(folder, arguments, ranks)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"The state is saved; go on with: {resuming_command()}") from None
+            saved = (folder / CHECKPOINT).exists()
+            ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was trained yet."
+            raise KeyboardInterrupt(ending) from None
     if last is None:
-        say(f"nothing is left to train: {cfg.ppo.iterations} rounds are done")
+        say(f"nothing is left to train: {arguments.cfg().ppo.iterations} rounds are done")
     else:
         say(f"{last.steps:,} steps in {last.seconds:.0f} s, success while exploring {last.log['success']:.1%}")
     say_written(folder / CHECKPOINT)
     return last
+
+
+def train_in(folder: Path, arguments: Arguments, ranks: Ranks) -> Round | None:
+    """Train with a folder that was made."""
+    from concent_warp.events.sequence import ContactEventSequence
+    from concent_warp.train.run import Run, train
+
+    recording = load_recording(arguments.recording)
+    model = given_model(arguments.model, recording)
+    cfg = arguments.cfg()
+    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
+    if ranks.first:
+        write_settings(folder, arguments)
+    made = Run.new(model, recording, cfg, demonstration=arguments.demonstration, events=events)
+    with status_bar("training") as update:
+
+        def show(this: Round) -> None:
+            rate = ranks.count * cfg.ppo.steps * cfg.environment.worlds / (this.collecting + this.updating)
+            text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {rate:,.0f} steps/s"
+            left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
+            update(this.iteration / cfg.ppo.iterations, text, left)
+
+        return train(made, folder, device=arguments.device, resume=arguments.resume, report=show, ranks=ranks)[1]
