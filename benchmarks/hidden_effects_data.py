@@ -96,6 +96,9 @@ OUTSIDE: tuple[tuple[str, str], ...] = (
     ("slide", "patch"),
     ("tumble", "slosh"),
     ("push", "cable"),
+    ("push", "cogging"),
+    ("arm", "cogging"),
+    ("spin", "magnet"),
 )
 """Rig and what no library has, at both sizes."""
 PAIRS: tuple[tuple[str, str, str], ...] = (

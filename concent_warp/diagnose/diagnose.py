@@ -235,11 +235,14 @@ class Procedure:
         if not found:
             return found
         hoped = np.array([max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)])
-        if min(c.ratio for c in found) > EXPLAINED:
-            rough = np.flatnonzero(hoped > NEAR * max(c.share(base) for c in found)).tolist()
-            polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
-            for k, c in zip(rough, polished, strict=True):
-                found[k] = c
+        # A fit that is stuck gains too little: where another is done, rivals far behind are worth a second one.
+        near = HALF if min(c.ratio for c in found) < EXPLAINED else NEAR
+        best = max(c.share(base) for c in found)
+        rough = [k for k, c in enumerate(found) if hoped[k] > near * best and c.ratio > SETTLED]
+        polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
+        for k, c in zip(rough, polished, strict=True):
+            found[k] = c
+        hoped = np.maximum(hoped, [c.share(base) for c in found])
         leader = polished_leader(base, found, ROUNDS)
         self.level(base, found, leader, hoped)
         if np.argmax([c.share(base) for c in found]) != leader:
@@ -254,7 +257,7 @@ class Procedure:
         """
         best = found[leader]
         close = [k for k in range(len(found)) if k != leader and hoped[k] > CLOSE * best.share(base)]
-        tasks = [(base, found[k], best.fit.offsets) for k in close]
+        tasks = [(base, found[k], best.fit) for k in close]
         again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
         for k, c in zip(close, again, strict=True):
             found[k] = c
@@ -397,7 +400,8 @@ QUIET = 0.25
 PIECE = 0.4
 """Length of the short windows by way of which fits are led out of a local minimum [s]."""
 HALF = 0.5
-"""Share of the best gain from which on that is worth a try, where no candidate explains the data."""
+"""Share of the best gain from which on that is worth a try, where no candidate explains the data; and a second fit,
+where one does."""
 ROUNDS, FINE = 3, 0.01
 """How often the best fit is taken up again, as long as its cost falls by the second number."""
 DOUBTFUL = 0.4

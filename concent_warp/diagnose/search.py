@@ -224,10 +224,15 @@ def polish_candidate(
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 
-def restarted_candidate(base: Node, candidate: Candidate, offsets: Sequence[np.ndarray]) -> Candidate:
-    """Take up the fit of a candidate from others' initial states where they serve it better, window by window."""
+def restarted_candidate(base: Node, candidate: Candidate, leader: Fit) -> Candidate:
+    """Take up the fit of a candidate from the leader's initial states; the worse of the two is dropped.
+
+    Either window by window, where they serve its parameters better, or all of them, with the parameters that go with
+    them: those of a fit that is stuck do not.
+    """
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1))
-    fresh = solver.better_starts(candidate.fit, [offsets], noise=0.0)
+    some = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
+    fresh = min(some, solver.led(candidate.fit, leader), key=lambda f: f.cost)
     found = judged(base, candidate.effect, solver, solver.fit(fresh.values, fresh.offsets, fresh.starts))
     return found if found.fit.cost < candidate.fit.cost else candidate
 

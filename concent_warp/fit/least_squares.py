@@ -169,6 +169,27 @@ class Solver:
             fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in everywhere), linear=linear, cost=cost
         )
 
+    def led(self, fit: Fit, by: Fit, rounds: int = REFIT_ROUNDS) -> Fit:
+        """Return a fit at another's initial states, with the parameters that go with those.
+
+        Args:
+            fit: The fit whose parameters are led on.
+            by: The fit of the same windows whose initial states are taken; its parameters may be others.
+            rounds: Steps of the parameters.
+        """
+        held = [np.zeros_like(a) for a in by.starts]
+
+        def at(values: np.ndarray) -> Fit:
+            linear = self.linearise(values, by.offsets)
+            cost = self.cost([piece.residual for piece in linear], by.offsets, values)
+            return replace(fit, values=values, offsets=by.offsets, starts=by.starts, linear=linear, cost=cost)
+
+        best = at(fit.values)
+        for _ in range(rounds):
+            move, _ = self.solve(best.linear, held, best.offsets, best.values, self.cfg.damping)
+            best = min(best, at(self.inside(best.values + move * self.scale)), key=lambda f: f.cost)
+        return best
+
     def follow(self, fit: Fit, move: np.ndarray) -> list[np.ndarray]:
         """Return the errors of the initial states that go with a step of the parameters, to first order.
 

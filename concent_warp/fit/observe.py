@@ -155,7 +155,9 @@ def keeps_close(source: Source, d: Demonstration, start: float, last: float, eng
             value = np.where((value * value[:1]).sum(axis=2, keepdims=True) < 0, -value, value)
         second = np.linalg.norm(value[1::2] + value[2::2] - 2 * value[:1], axis=2) / 2
         size = (2.0 if dim == 4 else 1.0) / (std * np.sqrt(dim))
-        curved = np.maximum(curved, np.nan_to_num(np.quantile(size * second, 0.8, axis=0), nan=np.inf))
+        with np.errstate(invalid="ignore"):  # between two draws that diverge: inf - inf
+            bend = np.quantile(size * second, 0.8, axis=0)
+        curved = np.maximum(curved, np.nan_to_num(bend, nan=np.inf))
     wild = np.flatnonzero(curved > CURVED)
     reach = span if not len(wild) else float(record[wild[0]] * m.opt.timestep)
     return float(np.clip(reach, SHORTEST, span))

@@ -15,6 +15,8 @@ POLES = 14
 """Ripples of cogging a turn."""
 PITCH = 0.04
 """Ripples of a linear motor, one in this length [m]."""
+ANCHOR = np.array([-0.3, 0.4, 0.5])
+"""Where the cable is fixed [m]."""
 SPOT = np.array([0.03, 0.02])
 """Place of the magnet and of the rough patch on the table [m]."""
 
@@ -33,13 +35,14 @@ def cogging(rig: Rig, magnitude: float) -> Hidden:
 
 
 def cable(rig: Rig, magnitude: float) -> Hidden:
-    """A slack cable [N/m] that tugs at the body beyond its length."""
-    anchor, slack = np.array([-0.3, 0.4, 0.5]), 0.45
+    """A cable [N/m] that is as long as the way to where the body rests: slack on one side, and tugging on the other."""
+    rest = data_at_rest(rig)
+    slack = np.linalg.norm(ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(rig.body).id
-        end = data.xipos[b] if rig.body_tracked else data.site_xpos[-1]
-        way = anchor - end
+        end = cable_end(rig, data, b)
+        way = ANCHOR - end
         length = np.linalg.norm(way)
         if length > slack:
             pull = magnitude * (length - slack) * way / length
@@ -47,6 +50,19 @@ def cable(rig: Rig, magnitude: float) -> Hidden:
             data.xfrc_applied[b, 3:] += np.cross(end - data.xipos[b], pull)
 
     return Hidden("cable", HiddenEffect("cable", force=force))
+
+
+def data_at_rest(rig: Rig) -> mujoco.MjData:
+    """Return the drawing in its initial state."""
+    model = rig.scene.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
+    """Return where a cable is tied [m], shape (3,): to a body that is tracked, or to the last site."""
+    return data.xipos[body] if rig.body_tracked else data.site_xpos[-1]
 
 
 def magnet(rig: Rig, magnitude: float) -> Hidden:

@@ -72,6 +72,18 @@ def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_eithe
     assert solver.polish(fit).cost <= fit.cost * (1 + 1e-9)
 
 
+def test_the_initial_state_of_another_fit_leads_a_stuck_one_to_the_parameters_that_go_with_it():
+    solver = solver_for(swung(told=0.006), "joint_damping")
+    good = solver.fit()
+    values, zero = np.array([3 * DAMPING]), (np.zeros(2),)
+    linear = solver.linearise(values, zero)
+    stuck = Fit(values, zero, np.inf, linear, good.starts, True, 0.0)
+    led = solver.led(stuck, good)
+    assert led.values[0] == pytest.approx(DAMPING, rel=0.1)
+    assert led.offsets[0] == pytest.approx(good.offsets[0])
+    assert led.cost == pytest.approx(good.cost, rel=0.05)
+
+
 def test_values_stay_within_their_bounds_and_infinite_ones_stay_infinite():
     solver = solver_for(swung(), "joint_damping", "joint_friction")
     assert solver.inside(np.array([-1.0, np.inf])).tolist() == [solver.low[0], np.inf]
