@@ -1,38 +1,46 @@
-"""Environment steps per second of the training, beside bare MuJoCo-Warp on the same model, step and decimation.
+"""Environment steps per second of the training, beside bare MuJoCo-Warp on the same states of the same model.
 
-    python benchmarks/train_throughput.py                       # 256 to 32,768 worlds on CUDA, 8 on a CPU
-    python benchmarks/train_throughput.py --collisions vcp full # both sets of collidable spheres
-    python benchmarks/train_throughput.py --table               # the page from the stored results
+    python benchmarks/train_throughput.py --out F                            # 256 to 32,768 worlds on CUDA, 8 on a CPU
+    python benchmarks/train_throughput.py --out F --collisions full --worlds 256 512 1024 2048 4096 8192
+    python benchmarks/train_throughput.py --out F --what ppo alternatives --worlds 8192
+    python benchmarks/train_throughput_report.py F                           # the page
 
-The task is the insertion stage of the shape sorter with the arm. A step of an environment is one action, so
-`decimation` steps of the simulator. *bare* is `mujoco_warp.step`, as many of them captured in one graph, launched again
-and again on states of the same kind, and nothing else. *environment* is the whole of `Environment.step` with random
-actions and no learning: commands, physics, contact pairs, virtual collisions, reward, resets, observation. *PPO* is a
-round of rsl-rl's PPO, collecting and updating. Compilation and capture are in none of them.
-
-The profile times the parts of a step one after the other, each waited for, so that they add up to more than a step.
+Every measurement is a line of the file: what is in it is not measured again, so that a run can be cut short anywhere.
+What the measurements are, the page says.
 """
 
 from __future__ import annotations
 
-import time
+import copy
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
-import mujoco_warp as mjw
 import torch
 import tyro
-import warp as wp
 from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment import Environment
-from concent_warp.train.physics import Graph, WarpPhysics
 from concent_warp.train.ppo import Trainer
 from concent_warp.train.resets import InitialStates, draw_states
 from concent_warp.train.run import Run
 from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_environment
-from pages import machine, machine_line, read_data, table, write_data, write_page
+from concent_warp.train.worlds import buffers, make_environment
+from measurements import Measurements, Row
+from pages import machine
+from train_throughput_parts import (
+    bare_on_states,
+    bare_rounds,
+    environment_rounds,
+    memory_used,
+    named_kernels,
+    profile,
+    record_states,
+    release,
+    warp_physics,
+)
 
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.model import Model
@@ -41,35 +49,78 @@ from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.warp_engine import preferred_device
 
-NAME = "train_throughput"
 Collision = Literal["vcp", "full"]
-PARTS = ("command", "physics", "distances", "judge", "poses and pairs", "observe")
+What = Literal["rate", "kernels", "ppo", "alternatives"]
+COUNTS = (256, 1024, 4096, 8192, 16384, 32768)
+STEPS = 16
+"""Environment steps that a profile of kernels covers."""
 
 
 @dataclass(frozen=True)
 class Args:
     """Command line."""
 
+    out: Path
+    """File of the measurements (.jsonl)."""
     device: str = field(default_factory=preferred_device)
     """Warp's device; the first CUDA device where there is one."""
+    what: tuple[What, ...] = ("rate",)
+    """Rates beside bare MuJoCo-Warp, kernels by time, rounds of PPO, or all with other settings."""
     worlds: tuple[int, ...] = ()
     """Numbers of worlds; by default 256 to 32,768 on CUDA and 8 on a CPU."""
     collisions: tuple[Collision, ...] = ("vcp",)
     """Collidable spheres: those of the contact events, or all."""
-    steps: int = 50
-    """Environment steps of a measurement."""
-    repeats: int = 3
-    """Measurements, of which the fastest counts."""
-    ppo: bool = True
-    """Also measure rounds of PPO."""
+    steps: int = 40
+    """Environment steps of a round."""
+    repeats: int = 5
+    """Rounds, of which the median counts."""
+    seconds: float | None = None
+    """Time after which no measurement is begun [s]."""
     spheres: int = 512
     """Spheres of both objects together."""
     states: int = 512
     """Initial states."""
     cfg: EnvironmentCfg = field(default_factory=lambda: EnvironmentCfg(engine="warp"))
     """Settings of the environment; its worlds and collision are replaced."""
-    table: bool = False
-    """Write the page from the stored results, without runs."""
+
+    @property
+    def cuda(self) -> bool:
+        """Whether the device is one of CUDA."""
+        return self.device.startswith("cuda")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of worlds."""
+        return self.worlds or (COUNTS if self.cuda else (8,))
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Settings that may be quicker, or show what a setting costs."""
+
+    environment: dict[str, Any] = field(default_factory=dict)
+    """Changed settings of the environment."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Changed options of the simulator."""
+
+
+ALTERNATIVES = {
+    "as it is": Alternative(),
+    "10 iterations": Alternative({"iterations": 10}),
+    "10 iterations, 20 of the line search": Alternative({"iterations": 10, "ls_iterations": 20}),
+    "5 iterations, 10 of the line search": Alternative({"iterations": 5, "ls_iterations": 10}),
+    "64 contacts, 256 rows": Alternative({"nconmax": 64, "njmax": 256}),
+    "64 contacts, 256 rows, 10 iterations": Alternative({"nconmax": 64, "njmax": 256, "iterations": 10}),
+    "pyramidal cones": Alternative(options={"cone": 0, "impratio": 1.0}),
+    "5 steps of 10 ms": Alternative({"decimation": 5}, {"timestep": 0.01}),
+    "torch outside of graphs": Alternative({"capture": "physics"}),
+}
+PPO_ALTERNATIVES: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "products in float32": {"tf32": False},
+    "2 batches": {"batches": 2},
+    "16 steps": {"steps": 16},
+}
 
 
 def make_run(spheres: int) -> Run:
@@ -79,139 +130,188 @@ def make_run(spheres: int) -> Run:
     return Run.new(Model(scene, ContactGeometryCfg(count=spheres).build(scene)), recording, TrainCfg())
 
 
-def seconds(part: Callable[[], object], steps: int, repeats: int, device: str) -> float:
-    """Return the shortest time of one call [s], of `repeats` loops of `steps` calls."""
-    part()
-    times = []
-    for _ in range(repeats):
-        wp.synchronize_device(device)
-        start = time.perf_counter()
-        for _ in range(steps):
-            part()
-        if device.startswith("cuda"):
-            torch.cuda.synchronize()
-        wp.synchronize_device(device)
-        times.append((time.perf_counter() - start) / steps)
-    return min(times)
+@dataclass
+class Bench:
+    """What the measurements share."""
 
+    args: Args
+    run: Run
+    tasks: dict[str, tuple[Task, InitialStates]] = field(default_factory=dict)
+    room: tuple[int, int] | None = None
+    """Contacts and rows a world that were found to fit all spheres so far."""
 
-def bare(environment: Environment, decimation: int, device: str) -> Callable[[], None]:
-    """Return the steps of one action in bare MuJoCo-Warp, on the environment's own worlds."""
-    physics = environment.physics
-    assert isinstance(physics, WarpPhysics)
-    m, d = physics.simulator
+    def task(self, collision: str) -> tuple[Task, InitialStates]:
+        """Return the task with a set of spheres, and its initial states."""
+        if collision not in self.tasks:
+            cfg = replace(self.args.cfg, collision=collision)
+            task = Task.build(self.run.model, self.run.recording[0], cfg, self.run.events)
+            states = draw_states(task, cfg.reset, 0, count=self.args.states)
+            self.tasks[collision] = task, states
+        return self.tasks[collision]
 
-    def steps() -> None:
-        for _ in range(decimation):
-            mjw.step(m, d)
+    def rate(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+        """Return rates, profile, contacts dropped and memory of an environment."""
+        args = self.args
+        before = memory_used(args.device)
+        environment = make_environment(task, cfg, states, device=args.device)
+        actions = random_actions(environment)
+        with torch.inference_mode():
+            environment.reset()
+            environment_rounds(environment, actions, args.steps, 1)
+            environment.read_log()
+            rounds = environment_rounds(environment, actions, args.steps, args.repeats)
+            log = environment.read_log()
+            parts = profile(environment, actions, args.steps)
+            used = memory_used(args.device) - before
+            tape = record_states(environment, actions, args.steps)
+            bare, solver = bare_on_states(environment, tape, cfg.decimation)
+            held = bare_rounds(environment, cfg.decimation, args.steps, 2)
+        return {
+            **facts(task, cfg),
+            "nconmax": warp_physics(environment).nconmax,
+            "njmax": warp_physics(environment).njmax,
+            "environment_ms": rounds,
+            "bare_ms": bare,
+            "bare_held_ms": held,
+            "profile_ms": parts,
+            "solver_iterations": solver,
+            "contacts": tape.contacts,
+            "rows": tape.rows,
+            "dropping": tape.dropping,
+            "overflow": log["overflow"],
+            "diverged": log["diverged worlds"],
+            "episodes": log["episodes"],
+            "memory_gib": used / 2**30,
+        }
 
-    return Graph(steps, wp.get_device(device), True).launch
+    def fitting(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+        """Return the rate with buffers that nothing overflows, found by doubling those that did."""
+        tried = []
+        while True:
+            contacts, rows = self.room or buffers(task, cfg)
+            cfg = replace(cfg, nconmax=contacts, njmax=rows)
+            dropping = self.dropping(cfg, task, states)
+            tried.append([contacts, rows, dropping])
+            if not dropping:
+                break
+            self.room = contacts * (1 + ("nconmax" in dropping)), rows * (1 + ("njmax" in dropping))
+            print(f"  {contacts} contacts, {rows} rows a world: {' and '.join(dropping)} too small", flush=True)
+        return {**self.rate(cfg, task, states), "tried": tried}
 
+    def dropping(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> list[str]:
+        """Return the buffers that are too small in some step."""
+        environment = make_environment(task, cfg, states, device=self.args.device)
+        with torch.inference_mode():
+            environment.reset()
+            found = record_states(environment, random_actions(environment), 2 * self.args.steps, states=False).dropping
+        del environment
+        release()
+        return found
 
-def measure(task: Task, states: InitialStates, cfg: EnvironmentCfg, args: Args) -> dict[str, Any]:
-    """Return the figures of one number of worlds."""
-    device = args.device
-    begun = time.perf_counter()
-    environment = make_environment(task, cfg, states, device=device)
-    made = time.perf_counter() - begun
-    actions = 0.5 * torch.randn(16, cfg.worlds, environment.num_actions, device=environment.device)
-    count = 0
-
-    def step() -> None:
-        nonlocal count
-        environment.step(actions[count % len(actions)])
-        count += 1
-
-    with torch.inference_mode():
+    def ppo(self, cfg: EnvironmentCfg, task: Task, states: InitialStates, ppo: PpoCfg) -> Row:
+        """Return times of rounds of PPO."""
+        environment = make_environment(task, cfg, states, device=self.args.device)
+        settings = TrainCfg(environment=cfg, ppo=replace(ppo, iterations=2 + self.args.repeats))
+        trainer = Trainer(environment, settings)
         environment.reset()
-        one = seconds(step, args.steps, args.repeats, device)
-        log = environment.read_log()
-        parts = dict(zip(PARTS, environment.parts(), strict=True))
-        profile = {name: seconds(part, args.steps, 1, device) for name, part in parts.items()}
-        environment.reset()
-        physics = seconds(bare(environment, cfg.decimation, device), args.steps, args.repeats, device)
-    result = {
+        trainer.learn()
+        rounds = trainer.history[2:]
+        return {
+            **facts(task, cfg),
+            "steps": settings.ppo.steps,
+            "collecting_ms": [1e3 * this.collecting for this in rounds],
+            "updating_ms": [1e3 * this.updating for this in rounds],
+            "overflow": rounds[-1].log["overflow"],
+            "diverged": sum(this.log["diverged worlds"] for this in rounds),
+        }
+
+    def kernels(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+        """Return the kernels that take most time."""
+        environment = make_environment(task, cfg, states, device=self.args.device)
+        with torch.inference_mode():
+            environment.reset()
+            rows = named_kernels(environment, random_actions(environment), STEPS)
+        return {**facts(task, cfg), "steps": STEPS, "kernels": rows}
+
+
+def facts(task: Task, cfg: EnvironmentCfg) -> Row:
+    """Return what a measurement is of."""
+    return {
         "collision": cfg.collision,
         "spheres": int(task.collidable.sum()),
         "worlds": cfg.worlds,
         "decimation": cfg.decimation,
-        "bare_per_second": cfg.worlds / physics,
-        "environment_per_second": cfg.worlds / one,
-        "share": physics / one,
-        "overflow": log["overflow"],
-        "diverged": log["diverged worlds"],
-        "made_seconds": made,
-        "profile_ms": {name: 1e3 * value for name, value in profile.items()},
     }
-    if args.ppo:
-        environment.reset()
-        trainer = Trainer(environment, TrainCfg(environment=cfg, ppo=PpoCfg(iterations=2 + args.repeats)))
-        trainer.learn()
-        rounds = trainer.history[2:]
-        best = min(rounds, key=lambda this: this.collecting + this.updating)
-        result |= {
-            "ppo_per_second": cfg.worlds * trainer.cfg.ppo.steps / (best.collecting + best.updating),
-            "updating_share": best.updating / (best.collecting + best.updating),
-        }
-    if device.startswith("cuda"):
-        free, total = torch.cuda.mem_get_info()
-        result["memory_gib"] = (total - free) / 2**30
-    return result
 
 
-def page(data: dict[str, Any]) -> str:
-    """Return the page of the stored results."""
-    about = (__doc__ or "").split("\n\n", 2)[2].strip()
-    parts = ["# Throughput of training", f"Written by `benchmarks/{NAME}.py`; do not edit.", about]
-    for result in data.values():
-        head = [
-            "spheres, worlds",
-            "bare",
-            "environment",
-            "share",
-            "with PPO",
-            "of it updating",
-            "contacts dropped",
-            "GiB",
-        ]
-        rows, profile = [], []
-        for r in result["rows"]:
-            name = f"{r['spheres']} ({r['collision']}), {r['worlds']:,}"
-            ppo = [f"{r['ppo_per_second']:,.0f}", f"{r['updating_share']:.0%}"] if "ppo_per_second" in r else ["", ""]
-            memory = f"{r['memory_gib']:.1f}" if "memory_gib" in r else ""
-            rate = [f"{r['bare_per_second']:,.0f}", f"{r['environment_per_second']:,.0f}", f"{r['share']:.1%}"]
-            rows.append([name, *rate, *ppo, f"{r['overflow']:.2%} of steps", memory])
-            profile.append([name, *(f"{r['profile_ms'][part]:.2f}" for part in PARTS)])
-        steps = result["rows"][0]["decimation"]
-        parts += [
-            f"## {result['machine'].get('device', 'CPU')}",
-            machine_line(result["machine"]),
-            f"Environment steps per second, of {steps} simulation steps each:",
-            table(head, rows),
-            "Where a step's time goes [ms]:",
-            table(["spheres, worlds", *PARTS], profile),
-        ]
-    return "\n\n".join(parts)
+def random_actions(environment: Environment) -> torch.Tensor:
+    """Return actions of 16 steps, shape (16, N, A)."""
+    return 0.5 * torch.randn(16, environment.num_envs, environment.num_actions, device=environment.device)
+
+
+def altered(task: Task, options: dict[str, Any]) -> Task:
+    """Return a task with other options of the simulator."""
+    if not options:
+        return task
+    compiled = copy.copy(task.compiled)
+    for name, value in options.items():
+        setattr(compiled.opt, name, value)
+    return replace(task, compiled=compiled)
+
+
+def attempt(kept: Measurements, key: str, expected: float, measure: Callable[[], Row], device: str) -> None:
+    """Measure, unless it is measured or there is no time; keep an error in place of a result."""
+    if not kept.wanted(key, expected):
+        return
+    try:
+        row = measure()
+    except Exception as error:  # one that fails, for want of memory say, must not end the others
+        traceback.print_exc()
+        row = {"error": f"{type(error).__name__}: {error}"[:300]}
+    kept.add(key, {"machine": machine(device), **row})
+    del row
+    release()
 
 
 def main() -> None:
-    """Measure and report."""
+    """Measure."""
     args = tyro.cli(Args, description=__doc__)
-    if not args.table:
-        quiet_warp()
-        made = make_run(args.spheres)
-        counts = args.worlds or ((256, 1024, 4096, 8192, 16384, 32768) if args.device.startswith("cuda") else (8,))
-        rows = []
+    quiet_warp()
+    kept = Measurements(args.out, seconds=args.seconds)
+    bench = Bench(args, make_run(args.spheres))
+    for what in args.what:
         for collision in args.collisions:
-            cfg = replace(args.cfg, collision=collision)
-            task = Task.build(made.model, made.recording[0], cfg, made.events)
-            states = draw_states(task, cfg.reset, 0, count=args.states)
-            for worlds in counts:
-                rows.append(measure(task, states, replace(cfg, worlds=worlds), args))
-                print(rows[-1], flush=True)
-                kind = "cuda" if args.device.startswith("cuda") else "cpu"
-                write_data(NAME, read_data(NAME) | {kind: {"machine": machine(args.device), "rows": rows}})
-    write_page(NAME, page(read_data(NAME)))
+            for worlds in args.counts:
+                cfg = replace(args.cfg, collision=collision, worlds=worlds)
+                measure_one(bench, kept, what, cfg)
+    kept.close()
+
+
+def measure_one(bench: Bench, kept: Measurements, what: What, cfg: EnvironmentCfg) -> None:
+    """Take one kind of measurements with one environment."""
+    name = f"{what} {cfg.collision} {cfg.worlds}"
+
+    def one(key: str, expected: float, measure: Callable[[], Row]) -> None:
+        attempt(kept, key, expected, measure, bench.args.device)
+
+    task, states = bench.task(cfg.collision)
+    if what == "rate" and cfg.collision == "vcp":
+        one(name, 30, lambda: bench.rate(cfg, task, states))
+    elif what == "rate":
+        contacts, rows = buffers(bench.task("vcp")[0], cfg)
+        fixed = replace(cfg, nconmax=contacts, njmax=rows)
+        one(f"{name} fixed", 30, lambda: bench.rate(fixed, task, states))
+        one(f"{name} fitting", 60, lambda: bench.fitting(cfg, task, states))
+    elif what == "kernels":
+        one(name, 30, lambda: bench.kernels(cfg, task, states))
+    elif what == "ppo":
+        one(name, 30, lambda: bench.ppo(cfg, task, states, PpoCfg()))
+    else:
+        for title, other in ALTERNATIVES.items():
+            rate = partial(bench.rate, replace(cfg, **other.environment), altered(task, other.options), states)
+            one(f"{name}: {title}", 30, rate)
+        for title, changed in PPO_ALTERNATIVES.items():
+            one(f"{name}, PPO: {title}", 30, partial(bench.ppo, cfg, task, states, replace(PpoCfg(), **changed)))
 
 
 if __name__ == "__main__":

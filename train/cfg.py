@@ -188,6 +188,10 @@ class EnvironmentCfg:
     """Contacts a world to make room for; by default measured on the demonstration."""
     njmax: int | None = None
     """Constraint rows a world to make room for; by default measured on the demonstration."""
+    iterations: int | None = None
+    """Most iterations of the solver in a simulation step; by default the model's."""
+    ls_iterations: int | None = None
+    """Most iterations of its line search; by default the model's."""
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
@@ -236,6 +240,8 @@ class PpoCfg:
     """Divergence that the adaptive rate aims at."""
     gradient: float = 1.0
     """Largest norm of the gradient."""
+    tf32: bool = True
+    """Multiply matrices with 10 bits of mantissa on a GPU, which is quicker."""
 
 
 @dataclass(frozen=True)

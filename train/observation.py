@@ -78,7 +78,10 @@ class BaseObservation:
         turned = qpos[:, self._hinges]
         parts = [turned.sin(), turned.cos(), qpos[:, self._slides], p.qvel[:, self._dofs].float()]
         if len(self._gripper):
-            parts += [(qpos @ self._opening)[:, None], p.ctrl[:, self._gripper].mean(dim=1, keepdim=True)]
+            parts += [
+                (qpos * self._opening).sum(dim=1, keepdim=True),
+                p.ctrl[:, self._gripper].mean(dim=1, keepdim=True),
+            ]
         place = p.position[:, self._objects]
         if self._noise:
             place = place + self._noise * torch.randn_like(place)

@@ -213,7 +213,7 @@ class WarpPhysics:
         from concent_warp.simulate.warp_engine import largest
         from concent_warp.simulate.warp_model import WorldModel, check_drag
 
-        self.model, self.worlds = model, worlds
+        self.model, self.worlds, self.nconmax, self.njmax = model, worlds, nconmax, njmax
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
         edited = sorted({name for law, _ in laws for name in law.edits})

@@ -82,6 +82,7 @@ class Trainer:
         self.environment, self.cfg, self.folder = environment, cfg, folder
         self.ranks = Ranks() if ranks is None else ranks
         self.device = str(environment.device)
+        torch.set_float32_matmul_precision("high" if cfg.ppo.tf32 else "highest")
         seed_everything(cfg.seed)  # the same networks in all processes
         self.algorithm = make_ppo(environment, cfg.ppo, self.ranks)
         if not self.ranks.first:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 
 import mujoco
@@ -31,7 +32,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = preferred_device() if device is None else device
-    m = task.compiled
+    m = solver_limited(task.compiled, cfg)
     on_cpu = not device.startswith("cuda")
     plain = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
     if plain:
@@ -42,8 +43,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     fields = drawn_fields(m, cfg.worlds, cfg.randomisation, seed, effects.fields)
     if plain:
         return MujocoPhysics(m, cfg.worlds, cfg.decimation, effects.laws, fields=fields)
-    contacts = int(ROOM * task.replay.contacts) + SPARE if cfg.nconmax is None else cfg.nconmax
-    constraints = int(ROOM * task.replay.constraints) + 4 * SPARE if cfg.njmax is None else cfg.njmax
+    contacts, constraints = buffers(task, cfg)
     return WarpPhysics(
         m,
         cfg.worlds,
@@ -55,6 +55,21 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
         fields=fields,
         capture=cfg.capture != "none",
     )
+
+
+def solver_limited(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
+    """Return a model with the iterations that the settings allow its solver."""
+    limited = copy.copy(m)
+    limited.opt.iterations = m.opt.iterations if cfg.iterations is None else cfg.iterations
+    limited.opt.ls_iterations = m.opt.ls_iterations if cfg.ls_iterations is None else cfg.ls_iterations
+    return limited
+
+
+def buffers(task: Task, cfg: EnvironmentCfg) -> tuple[int, int]:
+    """Return for how many contacts and constraint rows a world is to have room."""
+    contacts = int(ROOM * task.replay.contacts) + SPARE if cfg.nconmax is None else cfg.nconmax
+    constraints = int(ROOM * task.replay.constraints) + 4 * SPARE if cfg.njmax is None else cfg.njmax
+    return contacts, constraints
 
 
 def drawn_fields(

@@ -171,3 +171,11 @@ def test_collidable_spheres_are_those_of_the_events(task):
     touched = {e.name for e in task.events.entities if e.sphere is not None}
     assert {task.compiled.geom(g).name for g in spheres} == touched
     assert 0 < len(touched) < len(task.collidable)
+
+
+def test_solver_stops_at_the_iterations_that_are_asked_for(task):
+    limited = make_physics(task, replace(SETTINGS, worlds=1, iterations=3, ls_iterations=7), device="cpu")
+    assert (limited.model.opt.iterations, limited.model.opt.ls_iterations) == (3, 7)
+    assert task.compiled.opt.iterations != 3
+    plain = make_physics(task, replace(SETTINGS, worlds=1), device="cpu")
+    assert plain.model.opt.iterations == task.compiled.opt.iterations
