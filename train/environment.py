@@ -282,6 +282,9 @@ class Environment(VecEnv):
         """Reward the step, end episodes, and start new ones in their worlds."""
         p, cfg = self.physics, self._settings.reward
         sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
+        sane &= p.ctrl.isfinite().all(
+            dim=1
+        )  # the simulators put a command of their own in the place of one that is not
         diverged = ~sane
         dropped = ((self._distance > self._dropped) & self._watched).any(dim=1) & sane
         severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane

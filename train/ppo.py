@@ -143,9 +143,9 @@ class Trainer:
             ppo.compute_returns(observations)
         log = environment.read_log(self.ranks.total)
         collected = time.monotonic()
-        losses = ppo.update()
+        losses = self._update()
         end = time.monotonic()
-        means = self._mean_losses(losses)
+        means = self._averaged(losses)
         self.iteration += 1
         self.steps += self.steps_of_round
         self.seconds += end - start
@@ -161,24 +161,35 @@ class Trainer:
         """Environment steps of a round, of all processes."""
         return self.cfg.ppo.steps * self.environment.num_envs * self.ranks.count
 
-    def _mean_losses(self, losses: dict[str, float]) -> dict[str, float]:
-        """Return the losses of an update, averaged over the processes.
+    def _update(self) -> dict[str, float]:
+        """Update policy and value function, and return the losses.
 
         Raises:
-            TrainError: They or the weights are not finite any more.
+            TrainError: Losses or weights are not finite any more.
         """
-        values = torch.tensor([float(value) for value in losses.values()], device=self.device)
-        means = (self.ranks.total(values) / self.ranks.count).tolist()
-        weights = [*self.algorithm.actor.parameters(), *self.algorithm.critic.parameters()]
-        fine = bool(torch.stack([weight.detach().isfinite().all() for weight in weights]).all())
-        if not (fine and np.isfinite(means).all()):
+        found: dict[str, float] = {}
+        try:
+            found = self.algorithm.update()
+        except RuntimeError:  # torch does not draw from a distribution that is not finite
+            if self._finite_weights():
+                raise
+        if not (found and np.isfinite(list(found.values())).all() and self._finite_weights()):
             raise TrainError(
                 "the training has diverged: losses or weights are not finite any more",
                 where=self.folder,
-                found=", ".join(f"{name} {value:g}" for name, value in zip(losses, means, strict=True)),
-                fix="go on from the last checkpoint, which is from before, with a lower --ppo.learning-rate",
+                fix="the last checkpoint is from before; start anew with a lower --ppo.learning-rate",
             )
-        return dict(zip(losses, means, strict=True))
+        return found
+
+    def _finite_weights(self) -> bool:
+        """Return whether policy and value function can be worked with."""
+        weights = [*self.algorithm.actor.parameters(), *self.algorithm.critic.parameters()]
+        return bool(torch.stack([weight.detach().isfinite().all() for weight in weights]).all())
+
+    def _averaged(self, losses: dict[str, float]) -> dict[str, float]:
+        """Return the mean of losses over the processes."""
+        values = torch.tensor([float(value) for value in losses.values()], device=self.device)
+        return dict(zip(losses, (self.ranks.total(values) / self.ranks.count).tolist(), strict=True))
 
     def _keep_offence(self, this: Round) -> None:
         """Save the first state from which a world diverged."""

@@ -30,7 +30,7 @@ COMMANDS = {
 """Names of the commands, each a module of this package, with what they do."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 PATIENCE = 10.0
-"""How long another process waits for the first one to say what is wrong [s]."""
+"""How long other processes wait for the first one to say what is wrong [s]."""
 
 
 def usage() -> str:
@@ -119,13 +119,12 @@ def run(command: str, arguments: Sequence[str]) -> int:
 
 
 def complain(sentence: str) -> None:
-    """Write to standard error, once where there are several processes: what stops one stops all."""
-    if processes()[0] == 0:
-        print(sentence, file=sys.stderr)
+    """Write to standard error; of several processes, which one error stops all, the first that comes to it."""
     let_the_first_speak()
+    print(sentence, file=sys.stderr)
 
 
 def let_the_first_speak() -> None:
-    """Wait to be ended in several processes: the first that leaves ends the others, maybe before they have spoken."""
+    """Wait for the first of several processes, which says what is wrong with all and ends them by leaving."""
     if processes()[0] > 0:
         time.sleep(PATIENCE)
