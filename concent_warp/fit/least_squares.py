@@ -169,13 +169,13 @@ class Solver:
             fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in everywhere), linear=linear, cost=cost
         )
 
-    def led(self, fit: Fit, by: Fit, rounds: int = REFIT_ROUNDS) -> Fit:
+    def led(self, fit: Fit, by: Fit, rounds: int = LEAPS) -> Fit:
         """Return a fit at another's initial states, with the parameters that go with those.
 
         Args:
             fit: The fit whose parameters are led on.
             by: The fit of the same windows whose initial states are taken; its parameters may be others.
-            rounds: Steps of the parameters.
+            rounds: Most steps of the parameters.
         """
         held = [np.zeros_like(a) for a in by.starts]
 
@@ -184,10 +184,17 @@ class Solver:
             cost = self.cost([piece.residual for piece in linear], by.offsets, values)
             return replace(fit, values=values, offsets=by.offsets, starts=by.starts, linear=linear, cost=cost)
 
-        best = at(fit.values)
+        best, size = at(fit.values), 1.0
         for _ in range(rounds):
             move, _ = self.solve(best.linear, held, best.offsets, best.values, self.cfg.damping)
-            best = min(best, at(self.inside(best.values + move * self.scale)), key=lambda f: f.cost)
+            found = at(self.inside(best.values + size * move * self.scale))
+            if found.cost > best.cost:
+                size /= 3
+                continue
+            settled = found.cost > (1 - WORTH) * best.cost
+            best, size = found, 1.0
+            if settled:
+                break
         return best
 
     def follow(self, fit: Fit, move: np.ndarray) -> list[np.ndarray]:

@@ -54,7 +54,7 @@ def cable(rig: Rig, magnitude: float) -> Hidden:
 
 def data_at_rest(rig: Rig) -> mujoco.MjData:
     """Return the drawing in its initial state."""
-    model = rig.scene.compile()
+    model = rig.scene.model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return data

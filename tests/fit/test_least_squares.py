@@ -75,7 +75,7 @@ def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_eithe
 def test_the_initial_state_of_another_fit_leads_a_stuck_one_to_the_parameters_that_go_with_it():
     solver = solver_for(swung(told=0.006), "joint_damping")
     good = solver.fit()
-    values, zero = np.array([3 * DAMPING]), (np.zeros(2),)
+    values, zero = np.array([1.5 * DAMPING]), (np.zeros(2),)
     linear = solver.linearise(values, zero)
     stuck = Fit(values, zero, np.inf, linear, good.starts, True, 0.0)
     led = solver.led(stuck, good)
