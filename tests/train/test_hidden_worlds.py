@@ -36,7 +36,7 @@ MAGNITUDES = {
     "pad_friction": 0.1,
     "gravity_tilt": 0.1,
     "cogging": 2.0,
-    "cable": 3.0,
+    "cable": 60.0,
     "warming": 5.0,
     "dropout": 0.5,
 }
