@@ -15,7 +15,7 @@ POLES = 14
 """Ripples of cogging a turn."""
 PITCH = 0.04
 """Ripples of a linear motor, one in this length [m]."""
-ANCHOR = np.array([-0.3, 0.4, 0.5])
+ANCHOR = np.array([-0.3, 0.4, 0.0])
 """Where the cable is fixed [m]."""
 SPOT = np.array([0.03, 0.02])
 """Place of the magnet and of the rough patch on the table [m]."""

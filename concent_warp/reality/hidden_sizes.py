@@ -37,7 +37,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "cogging": (0.01, 0.02, 0.05),
         "warming": (0.025, 0.05, 0.12),
         "dropout": (0.2, 0.3, 0.45),
-        "cable": (40.0, 90.0, 220.0),
+        "cable": (9.0, 18.0, 45.0),
     },
     "arm": {
         "joint_friction": (0.6, 1.2, 3.0),
@@ -86,7 +86,7 @@ MAGNITUDES: dict[str, dict[str, Values]] = {
         "time_base": (0.0022, 0.0048, 0.012),
         "latency": (0.011, 0.025, 0.06),
         "sensor_gain": (6e-4, 1.3e-3, 3.2e-3),
-        "cable": (0.8, 1.7, 4.0),
+        "cable": (0.6, 1.2, 3.0),
         "cogging": (0.2, 0.5, 1.2),
     },
     "drop": {
