@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from concent_warp.cli.given_policy import Pretrained, given_checkpoint
 from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.reality.hidden_in_task import TaskWorld, wanted
@@ -30,8 +31,10 @@ class Arguments:
     In the stand-in world shapes are exact, friction cones elliptic and steps fine; the policy has seen none of it.
     """
 
-    checkpoint: Path
+    checkpoint: Path | None = None
     """Run folder of a training, or its checkpoint file."""
+    pretrained: Pretrained = None
+    """Run a policy that comes with the package, shape_sorter where no name is given."""
     world: Literal["simulation", "reality", "both"] = "both"
     """Where to run the policy."""
     episodes: int = 200
@@ -44,7 +47,7 @@ class Arguments:
     videos: int = 0
     """How many of the first episodes in the stand-in world to film, as MP4."""
     out: Path | None = None
-    """Folder for the videos; by default the folder videos in the run folder."""
+    """Folder for the videos; by default the folder videos in the run folder, of a pretrained policy here."""
     overwrite: bool = False
     """Replace videos that are there."""
     json: bool = False
@@ -61,7 +64,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     import torch
 
     from concent_warp.train.evaluate import evaluate
-    from concent_warp.train.ppo import CHECKPOINT, Trainer, load_checkpoint
+    from concent_warp.train.ppo import Trainer, load_checkpoint
     from concent_warp.train.run import Run
     from concent_warp.train.worlds import make_environment
 
@@ -72,8 +75,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
     if arguments.videos and arguments.world == "simulation":
         raise TrainError("videos are of the stand-in world", fix="add --world reality")
-    path = arguments.checkpoint / CHECKPOINT if arguments.checkpoint.is_dir() else arguments.checkpoint
-    films = video_files(arguments, path.parent)
+    path = given_checkpoint(arguments.checkpoint, arguments.pretrained)
+    films = video_files(arguments, Path() if arguments.checkpoint is None else path.parent)
     made = Run.load(path.parent)
     task = made.task()
     states = made.evaluation_states(task, arguments.episodes, arguments.seed)
@@ -99,7 +102,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
             if not arguments.json:
                 say_written(*films)
     if arguments.json:
-        document: dict[str, Any] = {"checkpoint": str(path), "seed": arguments.seed, "hidden": dict(hidden)}
+        named = str(path) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
+        document: dict[str, Any] = {"checkpoint": named, "seed": arguments.seed, "hidden": dict(hidden)}
         document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
         print(json.dumps(document, indent=1, allow_nan=False))
     return found

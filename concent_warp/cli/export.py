@@ -1,4 +1,4 @@
-"""``concent export``: a trained policy as ONNX or TorchScript."""
+"""``concent export``: a trained policy as ONNX or TorchScript, or as one that comes with the package."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ class Arguments:
     """Write the policy of a training, without exploration, as ONNX or TorchScript.
 
     Names, order and units of observation and action, scales, limits and the control period are in its metadata.
+    With --as-pretrained, write a run folder reduced to what running the policy takes.
     """
 
     run: tyro.conf.Positional[Path]
     """Run folder of a training, or its checkpoint file."""
-    out: Path = Path("policy.onnx")
-    """File to write: .onnx for ONNX, .pt for TorchScript."""
+    out: Path | None = None
+    """File to write: .onnx for ONNX, which is the default, .pt for TorchScript; with --as-pretrained a folder."""
+    as_pretrained: bool = False
+    """Write a folder as they are for --pretrained."""
     overwrite: bool = False
-    """Replace the file if it is there."""
+    """Replace what is there."""
 
 
 def run(arguments: Arguments) -> dict[str, Any]:
@@ -32,12 +35,22 @@ def run(arguments: Arguments) -> dict[str, Any]:
     quiet_warp()
     from concent_warp.train.export import export
     from concent_warp.train.ppo import CHECKPOINT
+    from concent_warp.train.shipped import ship
 
-    claim_file(arguments.out, overwrite=arguments.overwrite)
     path = arguments.run / CHECKPOINT if arguments.run.is_dir() else arguments.run
-    make_folder(arguments.out.parent)
-    described = export(path, arguments.out)
+    if arguments.as_pretrained:
+        folder = Path("pretrained") if arguments.out is None else arguments.out
+        make_folder(folder.parent)
+        origin = ship(path, folder, overwrite=arguments.overwrite)
+        size = sum(file.stat().st_size for file in folder.iterdir())
+        say(f"policy of {origin['steps']:,} steps with all it takes to run it, {size / 1e3:,.0f} kB")
+        say_written(folder)
+        return origin
+    out = Path("policy.onnx") if arguments.out is None else arguments.out
+    claim_file(out, overwrite=arguments.overwrite)
+    make_folder(out.parent)
+    described = export(path, out)
     observations, actions = described["observation"]["size"], described["action"]["size"]
     say(f"{observations} observations to {actions} actions every {1e3 * described['control period']:g} ms")
-    say_written(arguments.out)
+    say_written(out)
     return described

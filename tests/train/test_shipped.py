@@ -1,0 +1,96 @@
+"""A policy that comes with the package runs at once, and any run can be made into one."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.cfg import TrainError
+from concent_warp.train.observation import Layout
+from concent_warp.train.ppo import CHECKPOINT
+from concent_warp.train.run import Run, train
+from concent_warp.train.shipped import FOLDER, ORIGIN, names, ship, shipped
+from several_processes import make_run
+
+from concent_warp.cli import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a short training."""
+    out = tmp_path_factory.mktemp("shipped") / "run"
+    train(make_run(), out, device="cpu")
+    (out / "settings.toml").write_text('command = "concent train some/where/demo.h5 --seed 0"\n')
+    return out
+
+
+def test_policy_that_comes_with_the_package_succeeds_on_a_cpu(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = ["--episodes", "6", "--world", "simulation", "--device", "cpu"]
+    assert main(["evaluate", "--pretrained", *options]) == 0
+    first = capsys.readouterr().out
+    assert "6 of 6 succeed" in first
+    assert main(["evaluate", "--pretrained", "shape_sorter", *options]) == 0
+    assert capsys.readouterr().out == first
+    assert not list(tmp_path.iterdir())
+
+
+def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
+    assert "shape_sorter" in names()
+    for name in names():
+        origin = tomllib.loads((FOLDER / name / ORIGIN).read_text())
+        assert origin["command"].startswith(("concent train ", "torchrun "))
+        assert "/" not in origin["command"]
+        assert origin["steps"] > 0
+        assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
+        run = Run.load(FOLDER / name)
+        weights = torch.load(shipped(name), weights_only=False)["actor_state_dict"]
+        assert weights["obs_normalizer._mean"].shape[1] == Layout.of(run.task()).size
+
+
+def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_path):
+    assert main(["export", str(folder), "--as-pretrained", "--out", f"{tmp_path}/small"]) == 0
+    small = tmp_path / "small"
+    whole = [torch.load(path / CHECKPOINT, weights_only=False) for path in (folder, small)]
+    for name, value in whole[0]["actor_state_dict"].items():
+        assert torch.equal(value, whole[1]["actor_state_dict"][name])
+    assert (small / CHECKPOINT).stat().st_size < 0.6 * (folder / CHECKPOINT).stat().st_size
+    tasks = [Run.load(path).task() for path in (folder, small)]
+    np.testing.assert_array_equal(tasks[0].replay.qpos, tasks[1].replay.qpos)
+    for name in ("body_a", "point_a", "body_b", "point_b", "used"):
+        np.testing.assert_array_equal(getattr(tasks[0].table, name), getattr(tasks[1].table, name))
+    origin = tomllib.loads((small / ORIGIN).read_text())
+    assert origin["command"] == "concent train demo.h5 --seed 0"
+    assert origin["rounds"] == 4
+
+
+def test_training_cannot_go_on_from_a_policy_alone(folder, tmp_path):
+    ship(folder / CHECKPOINT, tmp_path / "small")
+    with pytest.raises(TrainError, match="no training to go on with"):
+        train(make_run(), tmp_path / "small", device="cpu", resume=True)
+
+
+def test_folders_are_replaced_only_on_demand_and_only_such(folder, tmp_path, capsys):
+    command = ["export", str(folder), "--as-pretrained", "--out", str(tmp_path / "small")]
+    assert main(command) == 0
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("mine")
+    assert main([*command[:-1], str(tmp_path / "mine"), "--overwrite"]) == 2
+    assert (tmp_path / "mine" / "thesis.tex").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ([], "either --checkpoint with a run folder or --pretrained, found neither"),
+        (["--pretrained", "--checkpoint", "runs"], "found both"),
+        (["--pretrained", "dishwasher"], "no such policy comes with the package; expected one of ['shape_sorter'"),
+    ],
+)
+def test_policy_that_is_not_told_apart_is_refused(options, sentence, capsys):
+    assert main(["evaluate", *options]) == 2
+    assert sentence in capsys.readouterr().err
