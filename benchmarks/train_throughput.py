@@ -106,13 +106,14 @@ class Alternative:
 
 ALTERNATIVES = {
     "as it is": Alternative(),
-    "10 iterations": Alternative({"iterations": 10}),
-    "10 iterations, 20 of the line search": Alternative({"iterations": 10, "ls_iterations": 20}),
-    "5 iterations, 10 of the line search": Alternative({"iterations": 5, "ls_iterations": 10}),
+    "10 iterations": Alternative({"solver_iterations": 10}),
+    "10 iterations, 20 of the line search": Alternative({"solver_iterations": 10, "ls_iterations": 20}),
+    "5 iterations, 10 of the line search": Alternative({"solver_iterations": 5, "ls_iterations": 10}),
     "64 contacts, 256 rows": Alternative({"nconmax": 64, "njmax": 256}),
-    "64 contacts, 256 rows, 10 iterations": Alternative({"nconmax": 64, "njmax": 256, "iterations": 10}),
+    "64 contacts, 256 rows, 10 iterations": Alternative({"nconmax": 64, "njmax": 256, "solver_iterations": 10}),
     "pyramidal cones": Alternative(options={"cone": 0, "impratio": 1.0}),
     "5 steps of 10 ms": Alternative({"decimation": 5}, {"timestep": 0.01}),
+    "fused": Alternative({"fuse": True}),
     "torch outside of graphs": Alternative({"capture": "physics"}),
 }
 PPO_ALTERNATIVES: dict[str, dict[str, Any]] = {
@@ -289,7 +290,7 @@ def main() -> None:
 
 def measure_one(bench: Bench, kept: Measurements, what: What, cfg: EnvironmentCfg) -> None:
     """Take one kind of measurements with one environment."""
-    name = f"{what} {cfg.collision} {cfg.worlds}"
+    name = f"{what} {cfg.collision} {cfg.worlds}" + " fused" * cfg.fuse
 
     def one(key: str, expected: float, measure: Callable[[], Row]) -> None:
         attempt(kept, key, expected, measure, bench.args.device)

@@ -214,6 +214,7 @@ def memory_used(device: str) -> int:
 
 def release() -> None:
     """Give back the memory of what is no longer referred to."""
+    torch.compiler.reset()  # what was compiled refers to its environment
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.synchronize()

@@ -184,11 +184,13 @@ class EnvironmentCfg:
     """Largest deviation, per axis, of object 1 from its demonstrated place in object 2 that counts as success [m]."""
     capture: Literal["none", "physics", "step"] = "step"
     """What is captured in CUDA graphs: nothing, the physics, or all of a step."""
+    fuse: bool = False
+    """Compile what torch does in a captured step into few kernels: quicker steps for some time at the start."""
     nconmax: int | None = None
     """Contacts a world to make room for; by default measured on the demonstration."""
     njmax: int | None = None
     """Constraint rows a world to make room for; by default measured on the demonstration."""
-    iterations: int | None = None
+    solver_iterations: int | None = None
     """Most iterations of the solver in a simulation step; by default the model's."""
     ls_iterations: int | None = None
     """Most iterations of its line search; by default the model's."""

@@ -85,9 +85,8 @@ class Environment(VecEnv):
         self.observation = wp.to_torch(self._observation)
         """The observation, shape (N, layout.size); overwritten by the next step."""
         whole = cfg.capture == "step" and self.device.startswith("cuda")
-        self._command = captured(self._apply_action, whole)
-        self._judge = captured(self._judge_step, whole)
-        self._observe = captured(self._read_base, whole)
+        parts = (self._apply_action, self._judge_step, self._read_base)
+        self._command, self._judge, self._observe = (captured(part, whole, fuse=cfg.fuse) for part in parts)
         self.reset()
 
     def _make_tables(self) -> None:
@@ -342,10 +341,12 @@ class Environment(VecEnv):
         self.observation[:, : self.layout.base] = self._base.read()
 
 
-def captured(part: Callable[[], None], capture: bool) -> Callable[[], None]:
-    """Return torch operations on fixed buffers as a CUDA graph, or as they are."""
+def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
+    """Return torch operations on fixed buffers as a CUDA graph, of few fused kernels if wanted, or as they are."""
     if not capture:
         return part
+    if fuse:
+        part = torch.compile(part, fullgraph=True, dynamic=False)
     with torch.no_grad():
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
@@ -356,4 +357,5 @@ def captured(part: Callable[[], None], capture: bool) -> Callable[[], None]:
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             part()
-    return graph.replay
+    recorded = part, graph  # what was compiled has to live as long as its kernels are launched
+    return lambda: recorded[1].replay()

@@ -21,7 +21,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
-FREE = ("iterations", "checkpoint", "target")
+FREE = ("iterations", "checkpoint", "target", "capture", "fuse")
 """Settings that may change when a training is gone on with."""
 
 

@@ -60,7 +60,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
 def solver_limited(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
     """Return a model with the iterations that the settings allow its solver."""
     limited = copy.copy(m)
-    limited.opt.iterations = m.opt.iterations if cfg.iterations is None else cfg.iterations
+    limited.opt.iterations = m.opt.iterations if cfg.solver_iterations is None else cfg.solver_iterations
     limited.opt.ls_iterations = m.opt.ls_iterations if cfg.ls_iterations is None else cfg.ls_iterations
     return limited
 

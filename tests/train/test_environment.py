@@ -174,8 +174,25 @@ def test_collidable_spheres_are_those_of_the_events(task):
 
 
 def test_solver_stops_at_the_iterations_that_are_asked_for(task):
-    limited = make_physics(task, replace(SETTINGS, worlds=1, iterations=3, ls_iterations=7), device="cpu")
+    limited = make_physics(task, replace(SETTINGS, worlds=1, solver_iterations=3, ls_iterations=7), device="cpu")
     assert (limited.model.opt.iterations, limited.model.opt.ls_iterations) == (3, 7)
     assert task.compiled.opt.iterations != 3
     plain = make_physics(task, replace(SETTINGS, worlds=1), device="cpu")
     assert plain.model.opt.iterations == task.compiled.opt.iterations
+
+
+@pytest.mark.gpu
+def test_fused_step_is_that_of_single_operations(task, states):
+    settings = replace(SETTINGS, engine="warp", worlds=40)
+    pair = [make_environment(task, replace(settings, fuse=fuse), states, device="cuda:0") for fuse in (False, True)]
+    for one in pair:
+        start(one)
+    generator = torch.Generator("cuda").manual_seed(0)
+    for _ in range(5):
+        actions = torch.empty(40, pair[0].num_actions, device="cuda").uniform_(-0.3, 0.3, generator=generator)
+        (seen, reward, done, _), (fused, fused_reward, fused_done, _) = (one.step(actions) for one in pair)
+        if done.any():  # new states are drawn, and not the same
+            break
+        torch.testing.assert_close(fused["policy"], seen["policy"], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(fused_reward, reward, atol=1e-4, rtol=1e-4)
+        assert (fused_done == done).all()
