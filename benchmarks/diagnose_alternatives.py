@@ -28,6 +28,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ from diagnose_real_report import NAME as REAL
 from everything import Blame, fit_everything
 from held_out import noise_errors, spans_of
 from hidden_effects_data import DataSet, cases, make, true_model
+from joblib import Parallel, delayed
 from pages import ROOT, machine, read_data, write_data
 from sysid_toolbox import fit_toolbox
 
@@ -78,6 +80,8 @@ class Args:
     """Folder with the folders contactnets_cube and bam_xl330."""
     real: bool = True
     """Whether to try the measured data too."""
+    jobs: int = 1
+    """Data sets at a time."""
     again: bool = False
     """Do again what is done."""
     table: bool = False
@@ -126,27 +130,32 @@ def toolbox(model: Model, recording: Recording) -> Fitted:
 def main(args: Args) -> None:
     """Measure what is not done, and write data and page."""
     if not args.table:
+        done = set() if args.again else set(read_data(NAME).get("rows", {}))
         known = {c.name: c for c in cases()}
-        for name in args.names:
-            keep(name, args, lambda name=name: synthetic(known[name]))
-        if args.real:
-            missing = [str(args.data / f) for f in FOLDERS.values() if not (args.data / f).is_dir()]
-            if missing:
-                print(f"no measured data in {' and '.join(missing)}: --data or --no-real", file=sys.stderr)
-                raise SystemExit(2)
-            settings = RealArgs(data=args.data)
-            for kp in GAINS:
-                keep(f"servo, kp {kp:g}", args, lambda kp=kp: measured(servo(settings, kp)))
-            keep("tosses", args, lambda: measured(tosses(settings)))
+        todo = [name for name in args.names if name not in done]
+        work = Parallel(n_jobs=args.jobs, return_as="generator")(delayed(synthetic)(known[name]) for name in todo)
+        for name, row in zip(todo, work, strict=True):
+            assert row is not None
+            keep(name, row)
+        for name, case in real_cases(args).items() if args.real else ():
+            if name not in done:
+                keep(name, measured(case()))
     write_report(read_data(NAME))
 
 
-def keep(name: str, args: Args, work: Callable[[], dict[str, Any]]) -> None:
-    """Do a data set unless it is done, and keep what came out."""
-    rows = read_data(NAME).get("rows", {})
-    if name in rows and not args.again:
-        return
-    row = work()
+def real_cases(args: Args) -> dict[str, Callable[[], Case]]:
+    """Return how to get each of the measured cases, by the name of its row."""
+    missing = [str(args.data / f) for f in FOLDERS.values() if not (args.data / f).is_dir()]
+    if missing:
+        print(f"no measured data in {' and '.join(missing)}: --data or --no-real", file=sys.stderr)
+        raise SystemExit(2)
+    settings = RealArgs(data=args.data)
+    found: dict[str, Callable[[], Case]] = {f"servo, kp {kp:g}": partial(servo, settings, kp) for kp in GAINS}
+    return {**found, "tosses": partial(tosses, settings)}
+
+
+def keep(name: str, row: dict[str, Any]) -> None:
+    """Keep what came out of a data set."""
     rows = {**read_data(NAME).get("rows", {}), name: row}
     write_data(NAME, {"machine": machine(), "rows": rows})
     errors = ", ".join(f"{way} {r['error']:.2f} {r['blamed']} {r['seconds']:.0f} s" for way, r in row["ways"].items())
