@@ -13,6 +13,10 @@ from concent_warp.events.decode import decode
 from concent_warp.model import write_text
 
 Range = tuple[float, float]
+ALL = "all"
+"""Name of the chain of all stages."""
+SINGLE, CHAINED = 3.0, 12.0
+"""Lengths of episodes of one stage and of a chain of them, where none is given [s]."""
 SETTINGS = "train.toml"
 """File of the resolved configuration in a run folder."""
 
@@ -89,6 +93,10 @@ class RewardCfg:
     """Amplitude and length scale [m] of the far reaching term."""
     near: Range = (2.0, 0.008)
     """Amplitude and length scale [m] of the near reaching term."""
+    wide: Range = (1.0, 0.3)
+    """The same of a third term, for the way to an object; given where stages are chained."""
+    stage: float = 5.0
+    """Reward of a step for each stage that is done: more than reaching can give, so that moving on is always better."""
     action: float = 0.01
     """Penalty of the squared action."""
     velocity: float = 0.001
@@ -100,7 +108,8 @@ class RewardCfg:
     failure: float = 5.0
     """Fixed penalty of an episode that ends in failure."""
     scale: float = 0.05
-    """Factor on all of it, so that values are of order 1, which the value function learns sooner."""
+    """Factor on all of it, so that values are of order 1, which the value function learns sooner; divided by the number
+    of stages that are chained."""
     engineered: EngineeredCfg = field(default_factory=EngineeredCfg)
 
 
@@ -148,6 +157,25 @@ class ResetCfg:
     """How far an object may move in the hand while settling [m]."""
     overlap: float = 0.0015
     """Penetration of spheres of different objects at which a displaced state is discarded [m]."""
+    free: float = 0.3
+    """Share of states at the very beginning, where stages are chained: the robot as at the start of the demonstration,
+    the objects anywhere. The others are shared equally among the stages."""
+    place: tuple[float, float] = (0.05, 0.03)
+    """Half widths of the squares about the demonstrated places in which objects 1 and 2 are put in a chain [m]."""
+    heading: tuple[float, float] = (0.5, 0.3)
+    """Half widths of their rotations about the vertical in a chain [rad]."""
+
+
+@dataclass(frozen=True)
+class ChainCfg:
+    """When a world moves on to the next stage, and when its episode is over."""
+
+    tolerance: float = 0.004
+    """Distance within which all contact pairs of a target event are to be [m]."""
+    hold: int = 2
+    """Control steps for which they are to be there."""
+    rest: float = 0.5
+    """Time for which object 1 has been in place when an episode of a chain ends [s]."""
 
 
 @dataclass(frozen=True)
@@ -171,13 +199,13 @@ class EnvironmentCfg:
     engine: Literal["auto", "warp", "mujoco"] = "auto"
     """MuJoCo-Warp or C MuJoCo; "auto" takes MuJoCo-Warp on a GPU and C MuJoCo on a CPU."""
     stage: str = "insert"
-    """Stage of the contact event sequence whose target event is trained."""
+    """Stage of the contact event sequence whose target event is trained; "all" chains all stages."""
     collision: Literal["vcp", "full"] = "vcp"
     """Spheres in the physics: those of the contact event sequence alone, or all."""
     decimation: int = 10
     """Simulation steps of one action."""
-    episode: float = 3.0
-    """Length of an episode [s]."""
+    episode: float | None = None
+    """Length of an episode [s]; by default 3 s, where stages are chained 12 s."""
     dropped: float = 0.02
     """Distance of a contact pair with the robot at which a held object counts as lost [m]."""
     success: float = 0.003
@@ -199,9 +227,17 @@ class EnvironmentCfg:
     reward: RewardCfg = field(default_factory=RewardCfg)
     virtual: CollisionCfg = field(default_factory=CollisionCfg)
     reset: ResetCfg = field(default_factory=ResetCfg)
+    chain: ChainCfg = field(default_factory=ChainCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
     randomise_effects: bool = True
     """Draw the parameters of the model's effects for each world from their fitted 95 % intervals."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of an episode [s]."""
+        if self.episode is not None:
+            return self.episode
+        return CHAINED if self.stage == ALL else SINGLE
 
 
 @dataclass(frozen=True)

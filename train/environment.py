@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 from concent_warp.kernels.contact_pairs import ContactPairs
-from concent_warp.train.cfg import EnvironmentCfg
+from concent_warp.train.cfg import EnvironmentCfg, TrainError
 from concent_warp.train.observation import BaseObservation, Layout
 from concent_warp.train.physics import Graph, Physics
 from concent_warp.train.resets import InitialStates
@@ -26,19 +26,23 @@ from concent_warp.train.virtual import virtual_collision
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-TERMS = ("reach", "action", "velocity", "disturb", "vcp", "failure")
+TERMS = ("reach", "stages", "action", "velocity", "disturb", "vcp", "failure")
 """Terms of the reward, in the order of `Environment.terms`."""
 SPEED = 1e4
 """Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
 EXTENT = 1e4
 """Generalised position beyond which it does [rad or m]."""
 EPISODES = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
-SUMS = (*TERMS, "steps", *EPISODES, "overflow")
-"""What is summed over steps and worlds between two calls of `Environment.read_log`."""
+CHAINS = ("chains", "chain success")
+"""Sums over episodes that started with all stages to come; how many met each stage's target follows."""
 
 
 class Environment(VecEnv):
-    """N worlds of a task."""
+    """N worlds of a task.
+
+    Where stages are chained, each world has a stage, whose target event observation and reward follow. It moves on when
+    the target's pairs have been together for some steps, and its episode ends when object 1 has come to rest in place.
+    """
 
     def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: InitialStates) -> None:
         """Make the environment and start all worlds.
@@ -53,7 +57,7 @@ class Environment(VecEnv):
         self.num_envs, self.num_actions, self.device = physics.worlds, task.robot.actions, physics.device
         self.control_step = cfg.decimation * task.replay.timestep
         """Time between actions [s]."""
-        self.max_episode_length = max(1, round(cfg.episode / self.control_step))
+        self.max_episode_length = max(1, round(cfg.seconds / self.control_step))
         self.cfg = asdict(cfg)
         self._settings, self._states = cfg, states
         self._make_tables()
@@ -61,7 +65,7 @@ class Environment(VecEnv):
         self._base = BaseObservation(task, physics, cfg.observation.noise)
         warp_device = wp.device_from_torch(self.device)
         with wp.ScopedDevice(warp_device):
-            stage = wp.full(self.num_envs, task.stage, dtype=wp.int32)
+            stage = wp.from_torch(self.stage)
             self._observation = wp.zeros((self.num_envs, self.layout.size), dtype=float)
             self._pairs = ContactPairs(
                 task.table,
@@ -79,6 +83,7 @@ class Environment(VecEnv):
             pairs, virtual = self._pairs, self._virtual
             self._distance, self._worst = wp.to_torch(pairs.distance), wp.to_torch(pairs.worst_distance)
             self._reach, self._finite = wp.to_torch(pairs.reach), wp.to_torch(pairs.finite)
+            self._worst_pair = wp.to_torch(pairs.worst)
             self._severe = None if virtual is None else wp.to_torch(virtual.severe)
             self._penalty = self._none if virtual is None else wp.to_torch(virtual.reward)
         wp.synchronize_device(warp_device)
@@ -106,14 +111,17 @@ class Environment(VecEnv):
         ranges = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-np.inf, np.inf])
         self._range = real(ranges)
         self._objects = index(list(task.objects))
-        tool = int(m.site_bodyid[robot.tool])
-        self._held = torch.as_tensor(task.holds, device=self.device)
-        self._frame = index([tool if holds else 0 for holds in task.holds])
-        self._watched = torch.as_tensor(task.held[task.stage] & task.keeps, device=self.device)
+        tool, stages = int(m.site_bodyid[robot.tool]), range(len(task.held))
+        self._frames = index([[tool if holds else 0 for holds in task.holds(s)] for s in stages])
+        keeps = np.array([task.keeps(s) for s in stages])
+        self._watched = torch.as_tensor(task.held & keeps[:, None], device=self.device)
         self._place = None if task.place is None else real(task.place)
-        pool = self._states
-        self._pool = [real(values) for values in (pool.qpos, pool.qvel, pool.ctrl)]
         self._success, self._dropped = cfg.success, cfg.dropped
+        self._rest = max(1, round(cfg.chain.rest / self.control_step))
+        self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
+        pool = self._states
+        self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
+        self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
 
     def _make_buffers(self) -> None:
         """Allocate what lives as long as the environment; graphs refer to it."""
@@ -126,11 +134,21 @@ class Environment(VecEnv):
         """Whether the last step ended in a drop, a severe virtual collision or divergence, shape (N, 3)."""
         self.success = torch.zeros(n, dtype=torch.bool, device=device)
         """Whether object 1 was in place at the end of the last step."""
+        self.reached = torch.zeros(n, dtype=torch.int32, device=device)
+        """How many stage targets had been met, in their order, by the end of the last step, earlier stages included."""
+        self.stage = torch.full((n,), self.task.first, dtype=torch.int32, device=device)
+        """Stage of each world."""
+        self._begun = torch.zeros(n, dtype=torch.bool, device=device)
+        self._most = torch.zeros_like(self.stage)
+        self._near = torch.zeros_like(self.stage)
+        self._resting = torch.zeros_like(self.stage)
         self.terms = torch.zeros(n, len(TERMS), device=device)
         """Weighted terms of the last reward before it is scaled, shape (N, len(TERMS))."""
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self._return = torch.zeros(n, device=device)
-        self._sums = torch.zeros(len(SUMS), dtype=torch.float64, device=device)
+        chained = [self.task.events.stages[s].name for s in self.task.chained]
+        self._names = (*TERMS, "steps", *EPISODES, *CHAINS, *(f"met {name}" for name in chained), "overflow")
+        self._sums = torch.zeros(len(self._names), dtype=torch.float64, device=device)
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
@@ -151,12 +169,8 @@ class Environment(VecEnv):
     def start_from(self, rows: Sequence[int]) -> None:
         """Start an episode in every world from the states of these rows, one each."""
         index = torch.as_tensor(np.asarray(rows), device=self.device)
-        p = self.physics
-        for state, pool in zip((p.qpos, p.qvel, p.ctrl), self._pool, strict=True):
-            state.copy_(pool[index].to(state.dtype))
-        p.warmstart.zero_()
-        self.episode_length_buf.zero_()
-        self._return.zero_()
+        with torch.no_grad():
+            self._start(torch.ones_like(self.done), index)
         self.refresh()
 
     def refresh(self) -> None:
@@ -189,17 +203,22 @@ class Environment(VecEnv):
 
         Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
         episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
-        were too small.
+        were too small. Where stages are chained, `chain success` and `met <stage>` are shares of the ended episodes that
+        started with all stages to come.
 
         Args:
             total: Adds the sums of other processes to those of this one; the worlds of this one alone by default.
         """
         values = self._sums.clone() if total is None else total(self._sums.clone())
-        sums = dict(zip(SUMS, values.tolist(), strict=True))
+        sums = dict(zip(self._names, values.tolist(), strict=True))
         self._sums.zero_()
-        steps, episodes = max(sums["steps"], 1.0), max(sums["episodes"], 1.0)
-        per_step = {*TERMS, "overflow"}
-        means = {name: value / (steps if name in per_step else episodes) for name, value in sums.items()}
+        per = {name: "steps" for name in (*TERMS, "overflow")}
+        per |= {name: "chains" for name in self._names if name in CHAINS or name.startswith("met ")}
+        means = {name: value / max(sums[per.get(name, "episodes")], 1.0) for name, value in sums.items()}
+        if self.task.demonstrated is None:
+            means = {name: value for name, value in means.items() if per.get(name) != "chains"}
+        else:
+            means["chains"] = sums["chains"]
         return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
 
     def offending_state(self) -> dict[str, np.ndarray] | None:
@@ -211,19 +230,28 @@ class Environment(VecEnv):
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return everything that the future depends on besides the random number generators."""
-        p = self.physics
-        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
-        parts |= {"length": self.episode_length_buf, "return": self._return}
-        return {name: value.clone() for name, value in parts.items()}
+        return {name: value.clone() for name, value in self._state().items()}
 
     def restore(self, state: dict[str, torch.Tensor]) -> None:
-        """Bring back what `state` returned."""
-        p = self.physics
-        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
-        parts |= {"length": self.episode_length_buf, "return": self._return}
+        """Bring back what `state` returned.
+
+        Raises:
+            TrainError: It is of an environment that had less of a state.
+        """
+        parts = self._state()
+        if missing := sorted(set(parts) - set(state)):
+            raise TrainError("the checkpoint lacks a part of the environment's state", expected=missing)
         for name, value in parts.items():
             value.copy_(state[name])
         self.refresh()
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that `state` returns copies of."""
+        p = self.physics
+        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
+        parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
+        parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
+        return parts | {"most": self._most, "near": self._near, "resting": self._resting}
 
     def parts(self) -> tuple[Callable[[], None], ...]:
         """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
@@ -264,11 +292,12 @@ class Environment(VecEnv):
     def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the objects' poses, in the hand for those that the stage holds: (N, O, 3) [m] and (N, O, 4)."""
         position, quaternion = self.physics.position, self.physics.quaternion
+        frame = self._frames[self.stage.long()]
         return relative_pose(
             position[:, self._objects],
             quaternion[:, self._objects],
-            position[:, self._frame],
-            quaternion[:, self._frame],
+            position[self._worlds, frame],
+            quaternion[self._worlds, frame],
         )
 
     def _measure(self) -> None:
@@ -278,14 +307,14 @@ class Environment(VecEnv):
             self._virtual.launch()
 
     def _judge_step(self) -> None:
-        """Reward the step, end episodes, and start new ones in their worlds."""
-        p, cfg = self.physics, self._settings.reward
+        """Reward the step, let worlds move on, end episodes, and start new ones in their worlds."""
+        p, cfg, stage = self.physics, self._settings.reward, self.stage.long()
         sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
         sane &= p.ctrl.isfinite().all(
             dim=1
         )  # the simulators put a command of their own in the place of one that is not
         diverged = ~sane
-        dropped = ((self._distance > self._dropped) & self._watched).any(dim=1) & sane
+        dropped = ((self._distance > self._dropped) & self._watched[stage]).any(dim=1) & sane
         severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
         failed = diverged | dropped | severe
         self.failure.copy_(torch.stack([dropped, severe & ~dropped, diverged], dim=1))
@@ -293,30 +322,68 @@ class Environment(VecEnv):
             self.success.copy_((self._worst < self._success) & sane)
         else:
             self.success.copy_(((self.place() - self._place).abs() < self._success).all(dim=1))
-        reach = engineered(cfg.engineered, self.place()) if cfg.kind == "engineered" else self._reach.sum(dim=1)
         action, velocity = effort(cfg, self.action, p.qvel[:, self._arm_dof].float())
         disturb = disturbance(cfg, self._pose_before, self._object_poses())
-        weighted = [cfg.reach * reach, *(cfg.regularisation * t for t in (action, velocity, disturb))]
+        weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
+        weighted += [cfg.regularisation * t for t in (action, velocity, disturb)]
         weighted += [cfg.vcp * self._penalty, self._none]
         terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
         terms[:, -1] = -cfg.failure * failed
         self.terms.copy_(terms)
-        self.reward.copy_(cfg.scale * terms.sum(dim=1))
+        self.reward.copy_(cfg.scale / len(self.task.chained) * terms.sum(dim=1))
 
+        self._move_on(sane & ~failed)
         self.episode_length_buf += 1
         self._return += self.reward
-        self.time_out.copy_((self.episode_length_buf >= self.max_episode_length) & ~failed)
+        finished = (self.episode_length_buf >= self.max_episode_length) | (self._resting >= self._rest)
+        self.time_out.copy_(finished & ~failed)
         self.done.copy_(failed | self.time_out)
         self._note_offence(diverged)
-        ended = self.done.double()
-        overflow = ((p.overflow & p.dropping) != 0).double().sum()
-        counts = [self.success & self.time_out, self.time_out, *self.failure.unbind(dim=1)]
+        self._count(terms)
+        self._start(self.done)
+
+    def _reaching(self) -> torch.Tensor:
+        """Return the reaching reward of the worlds' stages, shape (N,)."""
+        cfg, chained = self._settings.reward, self.task.demonstrated is not None
+        reach = self._reach.sum(dim=1)
+        if chained:
+            reach = reach + (self._worst_pair >= 0) * cfg.wide[0] * torch.exp(-self._worst / cfg.wide[1])
+        if cfg.kind != "engineered":
+            return reach
+        designed = engineered(cfg.engineered, self.place())
+        return torch.where(self.stage == self.task.stage, designed, reach) if chained else designed
+
+    def _move_on(self, fine: torch.Tensor) -> None:
+        """Bring worlds whose target is met to their next stage, and count for how long object 1 has been in place.
+
+        Args:
+            fine: Where nothing has failed, shape (N,) bool.
+        """
+        chain = self._settings.chain
+        near = (self._worst_pair >= 0) & (self._worst < chain.tolerance) & fine
+        self._near.copy_(torch.where(near, self._near + 1, 0))
+        met = self._near >= chain.hold
+        self._most.copy_(torch.maximum(self._most, self.stage - self.task.first + met))
+        self.reached.copy_(self._most)
+        onward = met & (self.stage < self.task.stage)
+        self.stage += onward
+        self._near.masked_fill_(onward, 0)
+        if self.task.demonstrated is not None:
+            self._resting.copy_(torch.where(self.success & fine, self._resting + 1, 0))
+
+    def _count(self, terms: torch.Tensor) -> None:
+        """Add a step to the sums of the log."""
+        p, ended = self.physics, self.done.double()
+        succeeded, chains = self.success & self.time_out, self.done & self._begun
+        counts = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
         sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
         sums += [count.double().sum() for count in counts]
-        sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum(), overflow]
+        sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum()]
+        sums += [chains.double().sum(), (chains & succeeded).double().sum()]
+        sums += [(chains & (self.reached > k)).double().sum() for k in range(len(self.task.chained))]
+        sums.append(((p.overflow & p.dropping) != 0).double().sum())
         self._sums += torch.stack(sums)
         p.overflow.zero_()
-        self._start(self.done)
 
     def _note_offence(self, diverged: torch.Tensor) -> None:
         """Keep the state before the step of the first world that diverged."""
@@ -326,15 +393,19 @@ class Environment(VecEnv):
         self._offence.copy_(torch.where(first, state, self._offence))
         self._offended.logical_or_(first)
 
-    def _start(self, where: torch.Tensor) -> None:
-        """Draw new initial states in the worlds of a mask, shape (N,) bool."""
+    def _start(self, where: torch.Tensor, rows: torch.Tensor | None = None) -> None:
+        """Start episodes in the worlds of a mask (N,) bool, from initial states drawn anew or of these rows (N,)."""
         p = self.physics
-        rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
-        for state, pool in zip((p.qpos, p.qvel, p.ctrl), self._pool, strict=True):
-            state.copy_(torch.where(where[:, None], pool[rows].to(state.dtype), state))
+        if rows is None:
+            rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
+        states = (p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage, self._begun)
+        for state, pool in zip(states, self._pool, strict=True):
+            mask = where.view(-1, *[1] * (state.ndim - 1))
+            state.copy_(torch.where(mask, pool[rows].to(state.dtype), state))
         p.warmstart.copy_(torch.where(where[:, None], 0.0, p.warmstart))
-        self.episode_length_buf.masked_fill_(where, 0)
-        self._return.masked_fill_(where, 0.0)
+        self._most.copy_(torch.where(where, self.stage - self.task.first, self._most))
+        for counter in (self._near, self._resting, self.episode_length_buf, self._return):
+            counter.masked_fill_(where, 0)
 
     def _read_base(self) -> None:
         """Write robot and objects to the observation; the slots are there already."""

@@ -113,7 +113,7 @@ def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "control period": cfg.environment.decimation * dt,
         "decimation": cfg.environment.decimation,
         "simulation step": dt,
-        "episode": cfg.environment.episode,
+        "episode": cfg.environment.seconds,
         "observation": described_observation(cfg, task),
         "action": described_action(task),
         "gripper": described_gripper(task),

@@ -36,6 +36,8 @@ class Physics(Protocol):
     """Shape (N, nv)."""
     ctrl: torch.Tensor
     """Shape (N, nu)."""
+    mocap: tuple[torch.Tensor, torch.Tensor]
+    """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of what is fixed where a world has it."""
     warmstart: torch.Tensor
     """Accelerations that the solver starts from, shape (N, nv)."""
     position: torch.Tensor
@@ -110,6 +112,10 @@ class MujocoPhysics:
         self.qvel = torch.zeros(worlds, model.nv, dtype=torch.float64)
         self.warmstart = torch.zeros_like(self.qvel)
         self.ctrl = torch.zeros(worlds, model.nu)
+        fixed = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
+        places = [np.tile(values[fixed], (worlds, 1, 1)) for values in (model.body_pos, model.body_quat)]
+        self.mocap = torch.from_numpy(places[0]), torch.from_numpy(places[1])
+        self._places = places
         self.site = torch.zeros(worlds, model.nsite, 3)
         self.overflow, self.dropping = torch.zeros(worlds, dtype=torch.int32), 0
         arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
@@ -167,10 +173,13 @@ class MujocoPhysics:
 
     def _write(self, i: int, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """Put the tensors of a world into its data, if they have been changed since they were read off it."""
-        qpos, qvel, warmstart = (array[i] for array in self._arrays[:3])
-        if not (np.array_equal(qpos, d.qpos) and np.array_equal(qvel, d.qvel)):
+        given = [array[i] for array in (*self._arrays[:2], *self._places)]
+        held = d.qpos, d.qvel, d.mocap_pos, d.mocap_quat
+        if not all(map(np.array_equal, given, held)):
             mujoco.mj_resetData(m, d)
-            d.qpos[:], d.qvel[:], d.qacc_warmstart[:] = qpos, qvel, warmstart
+            for target, value in zip(held, given, strict=True):
+                target[:] = value
+            d.qacc_warmstart[:] = self._arrays[2][i]
 
     def _read(self, i: int, d: mujoco.MjData) -> None:
         """Put the data of a world into its tensors."""
@@ -235,6 +244,11 @@ class WarpPhysics:
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
+            self.mocap = (
+                (wp.to_torch(d.mocap_pos), wp.to_torch(d.mocap_quat))
+                if model.nmocap
+                else (torch.zeros(worlds, 0, 3, device=self.device), torch.zeros(worlds, 0, 4, device=self.device))
+            )
             self.overflow, bits = wp.to_torch(d.overflow), mjw.OverflowType
             self.dropping = int(bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD)
             made.place(d)

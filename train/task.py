@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from concent_warp.kernels.contact_pairs import PairTable
-from concent_warp.train.cfg import EnvironmentCfg, TrainError
+from concent_warp.train.cfg import ALL, EnvironmentCfg, TrainError
+from concent_warp.train.chain import DemonstratedStages, demonstrated_stages
+from concent_warp.train.movable import movable
 from concent_warp.train.robot import Robot
 from concent_warp.train.slots import slot_table
 
@@ -45,12 +47,15 @@ class Replay:
 
 @dataclass(frozen=True)
 class Task:
-    """A stage to be trained, with everything about it that does not change."""
+    """What is to be trained, a stage or a chain of them, with everything about it that does not change."""
 
     model: Model
+    """Objects that are fixed in the scene are mocap bodies here, so that worlds can have them in different places."""
     events: ContactEventSequence
+    first: int
+    """The stage that a chain begins with; `stage` itself where it is trained alone."""
     stage: int
-    """Which stage's target event is trained."""
+    """The stage whose target event ends the task."""
     compiled: mujoco.MjModel
     """The model with the collidable spheres alone."""
     collidable: np.ndarray
@@ -65,6 +70,8 @@ class Task:
     """Whether a slot's pair is of the robot, shape (stages, slots) bool."""
     place: np.ndarray | None
     """Where object 1 is to be in the frame of object 2 [m], shape (3,); None in a stage of the robot alone."""
+    demonstrated: DemonstratedStages | None = None
+    """Which stage the demonstration is in, where several are trained."""
 
     @staticmethod
     def build(
@@ -89,22 +96,21 @@ class Task:
         if delayed := [a.effect.name for a in model.effects if a.effect.commands]:
             raise TrainError("effects on the commands cannot be trained with yet", found=delayed)
         events = extract(model, demonstration, MujocoEngine(model, threads=1)) if events is None else events
-        names = [stage.name for stage in events.stages]
-        if cfg.stage not in names:
-            raise TrainError("the demonstration has no such stage", expected=f"one of {names}", found=cfg.stage)
-        stage = names.index(cfg.stage)
+        first, stage = chain(events, cfg.stage)
         collidable = np.ones(len(model.geometry), dtype=bool)
         if cfg.collision == "vcp":
             touched = [e.sphere for e in events.entities if e.sphere is not None]
             collidable[:] = False
             collidable[touched] = True
+        replayer, model = model, replace(model, scene=movable(model.scene))
         compiled, _ = compile_model(model, collidable)
         table, held = slot_table(compiled, events, cfg.observation.slots)
         objects = tuple(int(compiled.body(name).id) for name in ranked(model, events))
-        replay = replayed(compiled, model, demonstration, collidable)
-        return Task(
+        replay = replayed(compiled, replayer, demonstration, collidable)
+        task = Task(
             model=model,
             events=events,
+            first=first,
             stage=stage,
             compiled=compiled,
             collidable=collidable,
@@ -115,17 +121,37 @@ class Task:
             held=held,
             place=place(compiled, replay, events, stage, objects),
         )
+        if first == stage:
+            return task
+        return replace(task, demonstrated=demonstrated_stages(task, cfg.chain, cfg.decimation))
 
     @property
-    def keeps(self) -> bool:
-        """Whether the stage begins with object 1 in the hand, which is to stay there."""
-        return self.events.stages[self.stage].bodies[0] != "robot" and bool(self.held[self.stage].any())
+    def chained(self) -> tuple[int, ...]:
+        """The stages that are trained, in their order."""
+        return tuple(range(self.first, self.stage + 1))
 
-    @property
-    def holds(self) -> tuple[bool, ...]:
-        """Whether the stage's target event has the robot touch each object."""
-        touched = self.table.body_b[self.stage][self.held[self.stage]]
-        return tuple(body in touched for body in self.objects)
+    def keeps(self, stage: int) -> bool:
+        """Return whether a stage begins with object 1 in the hand, which is to stay there."""
+        return self.events.stages[stage].bodies[0] != "robot" and bool(self.held[stage].any())
+
+    def holds(self, stage: int) -> tuple[bool, ...]:
+        """Return whether the target event of a stage that begins with something in the hand has it hold each object."""
+        touched = self.table.body_b[stage][self.held[stage]]
+        return tuple(self.keeps(stage) and body in touched for body in self.objects)
+
+
+def chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
+    """Return the first and the last of the stages that a name asks for.
+
+    Raises:
+        TrainError: There is no such stage, or none at all.
+    """
+    names = [stage.name for stage in events.stages]
+    if name == ALL and names:
+        return 0, len(names) - 1
+    if name not in names:
+        raise TrainError("the demonstration has no such stage", expected=f"one of {[*names, ALL]}", found=name)
+    return names.index(name), names.index(name)
 
 
 def ranked(model: Model, events: ContactEventSequence) -> list[str]:
