@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,10 @@ class Evaluation:
     """"success", "missed" where time was up, or what made it fail."""
     length: np.ndarray
     """Steps of each, shape (E,) int."""
+    stages: tuple[str, ...] = ()
+    """Stages whose targets were to be met, in their order; none where a single one was trained."""
+    reached: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
+    """How many of the targets each episode met, in their order, shape (E,) int."""
 
     @property
     def rate(self) -> float:
@@ -44,6 +48,11 @@ class Evaluation:
         """Return how many episodes came to each outcome."""
         return {name: self.outcome.count(name) for name in sorted(set(self.outcome))}
 
+    @property
+    def met(self) -> dict[str, int]:
+        """How many episodes met each stage's target, and those of all stages before it."""
+        return {name: int((self.reached > k).sum()) for k, name in enumerate(self.stages)}
+
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data."""
         return {
@@ -53,6 +62,7 @@ class Evaluation:
             "interval": list(self.interval),
             "outcomes": list(self.outcome),
             "steps": self.length.tolist(),
+            "stages met": [{"stage": name, "episodes": count} for name, count in self.met.items()],
         }
 
     def sentence(self) -> str:
@@ -60,7 +70,9 @@ class Evaluation:
         low, high = self.interval
         others = ", ".join(f"{count} {name}" for name, count in self.counts().items() if name != "success")
         text = f"{int(self.success.sum())} of {len(self.success)} succeed: {self.rate:.1%} ({low:.1%} to {high:.1%})"
-        return f"{text}; {others}" if others else text
+        text = f"{text}; {others}" if others else text
+        met = ", ".join(f"{name} {count / len(self.success):.1%}" for name, count in self.met.items())
+        return f"{text}; stage targets met in order: {met}" if met else text
 
 
 def evaluate(
@@ -82,7 +94,7 @@ def evaluate(
     """
     count, worlds = len(states.qpos), environment.num_envs
     success, length = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
-    outcome = ["missed"] * count
+    outcome, reached = ["missed"] * count, np.zeros(count, dtype=int)
     steps = int(environment.max_episode_length)
     for first in range(0, count, worlds):
         rows = np.arange(first, first + worlds) % count
@@ -104,13 +116,15 @@ def evaluate(
                 success[row] = bool(environment.success[world]) and not failed.any()
                 outcome[row] = FAILURES[int(failed.argmax())] if failed.any() else outcome[row]
                 outcome[row] = "success" if success[row] else outcome[row]
-                length[row] = k + 1
+                length[row], reached[row] = k + 1, int(environment.reached[world])
             open_ &= ~ended
             if progress is not None:
                 progress((first + worlds * (k + 1) / steps) / (math.ceil(count / worlds) * worlds))
             if not open_.any():
                 break
-    return Evaluation(success, tuple(outcome), length)
+    task = environment.task
+    stages = tuple(task.events.stages[s].name for s in task.chained) if len(task.chained) > 1 else ()
+    return Evaluation(success, tuple(outcome), length, stages, reached)
 
 
 def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:

@@ -109,7 +109,8 @@ def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "stage": task.events.stages[task.stage].name,
+        "stages": [task.events.stages[s].name for s in task.chained],
+        "moving on": described_chain(cfg, task),
         "control period": cfg.environment.decimation * dt,
         "decimation": cfg.environment.decimation,
         "simulation step": dt,
@@ -152,13 +153,27 @@ def described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     }
 
 
+def described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
+    """Return when the slots are to show the next stage, None where there is one alone."""
+    if len(task.chained) == 1:
+        return None
+    chain = cfg.environment.chain
+    return {
+        "tolerance": chain.tolerance,
+        "hold": chain.hold,
+        "meaning": "the slots show the first stage at the start, and the next one as soon as all displacements of the "
+        "stage have been shorter than tolerance [m] for hold control periods on end",
+    }
+
+
 def described_slots(task: Task) -> dict[str, Any]:
-    """Return what each contact slot is made from."""
-    table, s, m = task.table, task.stage, task.compiled
+    """Return what each contact slot is made from, in each stage."""
+    table, m = task.table, task.compiled
     pairs = []
-    for k in np.flatnonzero(table.used[s]):
+    for s, k in ((s, k) for s in task.chained for k in np.flatnonzero(table.used[s])):
         pairs.append(
             {
+                "stage": task.events.stages[s].name,
                 "slot": int(k),
                 "body": m.body(table.body_a[s, k]).name,
                 "point": table.point_a[s, k].tolist(),
@@ -172,7 +187,7 @@ def described_slots(task: Task) -> dict[str, Any]:
             "mask": MASK, "point": POINT, "displacement": DISPLACEMENT, "direction": DIRECTION, "normal": NORMAL,
         },
         "meaning": "mask 1; point of the body, displacement from it to the target point, its direction, target normal: "
-        "world frame [m]; slots that are not listed are all zero",
+        "world frame [m]; slots that are not listed for the stage are all zero",
         "frames": "points and normals as listed are in the frames of their bodies",
         "pairs": pairs,
     }  # fmt: skip

@@ -76,8 +76,11 @@ class Run:
         return Task.build(self.model, self.recording[0], self.cfg.environment, self.events)
 
     def evaluation_states(self, task: Task, count: int, seed: int) -> InitialStates:
-        """Return initial states to judge a policy by: displaced ones alone, none of which training has seen."""
-        cfg = replace(self.cfg.environment.reset, demonstrated=0.0)
+        """Return initial states to judge a policy by, none of which training has seen.
+
+        They are displaced ones alone; where stages are chained, starts of the whole alone.
+        """
+        cfg = replace(self.cfg.environment.reset, demonstrated=0.0, free=1.0)
         return draw_states(task, cfg, seed + 1_000_000, count=count)
 
 

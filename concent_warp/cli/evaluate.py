@@ -98,7 +98,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
             with_ = f" with {', '.join(arguments.hide)} hidden in it" if hidden and world == "reality" else ""
             say(f"{world}{with_}: {found[world].sentence()}")
         if reel is not None and films:
-            film_all(films, reel, task_world(task, cfg, arguments), task, environment.control_step)
+            film_all(films, reel, task_world(task, cfg, arguments), task, states, environment.control_step)
             if not arguments.json:
                 say_written(*films)
     if arguments.json:
@@ -136,15 +136,23 @@ def video_files(arguments: Arguments, folder: Path) -> list[Path]:
     return films
 
 
-def film_all(films: list[Path], reel: Reel, world: TaskWorld, task: Task, period: float) -> None:
-    """Film the episodes of a reel, their states being a period apart [s]."""
+def film_all(
+    films: list[Path], reel: Reel, world: TaskWorld, task: Task, starts: InitialStates, period: float
+) -> None:
+    """Film the episodes of a reel, which began with `starts`; their states are a period apart [s]."""
     from concent_warp.reality.video import filmed, write_video
 
     bodies = tuple(task.compiled.body(i).name for i in task.objects)
     with progress_bar("videos") as progress:
         for k, (path, states) in enumerate(zip(films, reel.states, strict=True)):
             make_folder(path.parent)
-            write_video(path, filmed(world.spec(), bodies, np.array(states), period), 1 / period)
+            spec = world.spec()
+            for body in task.objects:
+                mocap = int(task.compiled.body_mocapid[body])
+                if mocap >= 0:
+                    placed = spec.body(task.compiled.body(body).name)
+                    placed.pos, placed.quat = starts.mocap[k, mocap, :3], starts.mocap[k, mocap, 3:]
+            write_video(path, filmed(spec, bodies, np.array(states), period), 1 / period)
             progress((k + 1) / len(films))
 
 

@@ -45,7 +45,7 @@ class Arguments:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     stage: str | None = None
-    """Stage to train; short for --environment.stage."""
+    """Stage to train, or all for the chain of all stages; short for --environment.stage."""
     worlds: int | None = None
     """Environments side by side; short for --environment.worlds."""
     reward: Literal["contact", "engineered"] | None = None
