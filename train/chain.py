@@ -1,20 +1,20 @@
 """Stages one after the other: when a target event counts as met, and which stage a demonstrated moment belongs to.
 
-Paper, section 3.2.1 and appendix B: every state of a stage is rewarded for its one target event. A world moves on to the
-next stage when all contact pairs of its target have been within a tolerance for some steps.
+Paper, section 3.2.1 and appendix B: every state of a stage is rewarded for its one target event. A world moves on to
+the next stage when all contact pairs of its target have been within a tolerance for some steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from concent_warp.kernels.contact_pairs import PairTable
 from concent_warp.train.cfg import ChainCfg, TrainError
 
-if TYPE_CHECKING:
-    from concent_warp.train.task import Task
+from concent_warp.events.sequence import Stage
 
 
 @dataclass(frozen=True)
@@ -24,53 +24,63 @@ class DemonstratedStages:
     stage: np.ndarray
     """Stage at each step, shape (K,) int."""
     start: dict[int, float]
-    """Time at which each stage of the chain begins [s]."""
+    """Time at which each stage begins [s]."""
     end: dict[int, float]
-    """Time until which states are taken from it [s]: to its target's fulfilment, in the last one to the target event."""
+    """Time until which states are taken from it [s]: until its target is met; in the last one, to the target event."""
 
 
-def demonstrated_stages(task: Task, cfg: ChainCfg, period: int) -> DemonstratedStages:
-    """Return the stages of the demonstration by the rule by which worlds move on.
+def demonstrated_stages(
+    m: mujoco.MjModel,
+    table: PairTable,
+    stages: Sequence[Stage],
+    qpos: np.ndarray,
+    timestep: float,
+    cfg: ChainCfg,
+    period: int,
+) -> DemonstratedStages:
+    """Return the stages of a demonstration by the rule by which worlds move on.
 
     Args:
-        task: A task of several stages.
+        m: Compiled model.
+        table: Contact pairs of the stages.
+        stages: All of them, in their order.
+        qpos: Positions as the model replays the demonstration, shape (K + 1, nq).
+        timestep: Time between them [s].
         cfg: The rule.
         period: Simulation steps between two checks.
 
     Raises:
-        TrainError: The demonstration, as the model replays it, does not meet the target of a stage but the last.
+        TrainError: The replay does not meet the target of a stage but the last.
     """
-    m, replay = task.compiled, task.replay
     d = mujoco.MjData(m)
-    count = len(replay.ctrl)
+    count, last = len(qpos) - 1, len(stages) - 1
     stage = np.empty(count, dtype=int)
-    now, held, closest = task.first, 0, np.inf
+    now, held, closest = 0, 0, np.inf
     start = {now: 0.0}
     for row in range(0, count, period):
-        d.qpos[:] = replay.qpos[row]
+        d.qpos[:] = qpos[row]
         mujoco.mj_kinematics(m, d)
-        distance = worst_distance(task, d, now)
+        distance = worst_distance(table, d, now)
         closest = min(closest, distance)
         held = held + 1 if distance < cfg.tolerance else 0
         stage[row : row + period] = now
-        if held >= cfg.hold and now < task.stage:
+        if held >= cfg.hold and now < last:
             now, held, closest = now + 1, 0, np.inf
-            start[now] = min(row + period, count) * replay.timestep
-    if now < task.stage:
+            start[now] = min(row + period, count) * timestep
+    if now < last:
         raise TrainError(
-            f"the replayed demonstration does not meet the target of stage {task.events.stages[now].name!r}",
+            f"the replayed demonstration does not meet the target of stage {stages[now].name!r}",
             expected=f"all pairs within {cfg.tolerance * 1e3:g} mm for {cfg.hold} control steps",
             found=f"{closest * 1e3:.1f} mm at best",
             fix="allow more with --environment.chain.tolerance, or fit the model's contact geometry",
         )
-    end = {s: start[s + 1] for s in range(task.first, task.stage)}
-    end[task.stage] = max(task.events.stages[task.stage].event.time, start[task.stage])
+    end = {s: start[s + 1] for s in range(last)}
+    end[last] = max(stages[last].event.time, start[last])
     return DemonstratedStages(stage, start, end)
 
 
-def worst_distance(task: Task, d: mujoco.MjData, stage: int) -> float:
+def worst_distance(table: PairTable, d: mujoco.MjData, stage: int) -> float:
     """Return the distance of the pair of a stage's target that is farthest apart [m]; `d` holds the poses."""
-    table = task.table
     used = table.used[stage]
 
     def points(body: np.ndarray, local: np.ndarray) -> np.ndarray:

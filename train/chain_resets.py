@@ -1,10 +1,11 @@
-"""Initial states of a chain of stages: objects anywhere, and the demonstration bent so that it leads from one to the other.
+"""Initial states of a chain of stages: objects anywhere, and the demonstration bent to lead from one to the other.
 
-Object 1 is put elsewhere by a rigid motion A about the vertical, object 2 by another, B. A demonstrated moment becomes one
-of the task with these places: until object 1 is grasped, the hand's pose is moved by a part of A that grows from none at
-the start to all of it at the object; hand and object together are then moved by what leads from A to B on the way; and all
-by B from their first contact on. So are relative poses kept where there is contact, as the paper's appendix D wants it:
-cases 1, 2 and 3. On top come displacements of each state by itself, as in the training of one stage.
+Object 1 is put elsewhere by a rigid motion A about the vertical, object 2 by another, B. A demonstrated moment becomes
+one of the task with these places: until object 1 is grasped, the hand's pose is moved by a part of A that grows from
+none at the start to all of it at the object; hand and object together are then moved by what leads from A to B on the
+way; and all by B from their first contact on. So are relative poses kept where there is contact, as the paper's
+appendix D wants it in its cases 1, 2 and 3. On top come displacements of each state by itself, as in the training of
+one stage.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import numpy as np
 from concent_warp.train.cfg import ResetCfg
 from concent_warp.train.drawing import Draft, Drawing, about_vertical, place
 from concent_warp.train.task import Task
-
 
 FARTHER = 3.0
 """By how much more the hand is displaced at the start of its way to object 1 than at its end, as a factor."""

@@ -1,4 +1,4 @@
-"""How initial states are drawn: a demonstrated moment, a displacement that keeps the contact chain, and a trial of it."""
+"""How initial states are drawn: a demonstrated moment, a displacement that keeps the contact chain, and a trial."""
 
 from __future__ import annotations
 
@@ -286,7 +286,7 @@ class Drawing:
         return d.qpos.copy()
 
     def watched(self, draft: Draft) -> np.ndarray:
-        """Return what must not move while a draft settles: object 1 in the hand, or where the hand is clear of it [m]."""
+        """Return what must not move while a draft settles [m]: object 1 in the hand, or where the hand is clear."""
         if draft.case > 1:
             return self.in_hand()
         return self.d.xpos[self.task.objects[0]].copy() if draft.apart else np.zeros(3)

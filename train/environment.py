@@ -203,8 +203,8 @@ class Environment(VecEnv):
 
         Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
         episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
-        were too small. Where stages are chained, `chain success` and `met <stage>` are shares of the ended episodes that
-        started with all stages to come.
+        were too small. Where stages are chained, `success` and `met <stage>` are shares of the ended episodes that
+        started with all stages to come, and `success of all` is that of all.
 
         Args:
             total: Adds the sums of other processes to those of this one; the worlds of this one alone by default.
@@ -212,13 +212,13 @@ class Environment(VecEnv):
         values = self._sums.clone() if total is None else total(self._sums.clone())
         sums = dict(zip(self._names, values.tolist(), strict=True))
         self._sums.zero_()
-        per = {name: "steps" for name in (*TERMS, "overflow")}
-        per |= {name: "chains" for name in self._names if name in CHAINS or name.startswith("met ")}
+        per = dict.fromkeys((*TERMS, "overflow"), "steps")
+        per |= {name: "chains" for name in self._names if name.startswith(("met ", "chain "))}
         means = {name: value / max(sums[per.get(name, "episodes")], 1.0) for name, value in sums.items()}
-        if self.task.demonstrated is None:
-            means = {name: value for name, value in means.items() if per.get(name) != "chains"}
-        else:
-            means["chains"] = sums["chains"]
+        chained = {name: means.pop(name) for name in self._names if name == "chains" or per.get(name) == "chains"}
+        if self.task.demonstrated is not None:
+            success, means["success of all"] = chained.pop("chain success"), means["success"]
+            means |= {**chained, "success": success, "chains": sums["chains"]}
         return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
 
     def offending_state(self) -> dict[str, np.ndarray] | None:

@@ -170,7 +170,7 @@ def described_slots(task: Task) -> dict[str, Any]:
     """Return what each contact slot is made from, in each stage."""
     table, m = task.table, task.compiled
     pairs = []
-    for s, k in ((s, k) for s in task.chained for k in np.flatnonzero(table.used[s])):
+    for s, k in ((stage, slot) for stage in task.chained for slot in np.flatnonzero(table.used[stage])):
         pairs.append(
             {
                 "stage": task.events.stages[s].name,

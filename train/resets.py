@@ -6,9 +6,9 @@ At a demonstrated moment the robot holds object 1 or does not, and object 1 touc
 2. Object 1 in the hand: both are moved as one, and inverse kinematics finds the joints.
 3. Object 1 in the hand and on object 2: all three move as one.
 
-Where one stage is trained, object 2 stays where it is fixed, and states between cases 2 and 3 are drawn: as demonstrated
-on object 2, or displaced, and lifted off it. Where stages are chained, objects stand anywhere, and all moments of the
-demonstration are drawn from (`ChainDrawing`).
+Where one stage is trained, object 2 stays where it is fixed, and states between cases 2 and 3 are drawn: as
+demonstrated on object 2, or displaced, and lifted off it. Where stages are chained, objects stand anywhere, and all
+moments of the demonstration are drawn from (`ChainDrawing`).
 
 States whose inverse kinematics fails, whose displacement makes objects overlap, or whose chain breaks while they settle
 are discarded, and counted.

@@ -123,7 +123,10 @@ class Task:
         )
         if first == stage:
             return task
-        return replace(task, demonstrated=demonstrated_stages(task, cfg.chain, cfg.decimation))
+        shown = demonstrated_stages(
+            compiled, table, events.stages, replay.qpos, replay.timestep, cfg.chain, cfg.decimation
+        )
+        return replace(task, demonstrated=shown)
 
     @property
     def chained(self) -> tuple[int, ...]:

@@ -136,9 +136,7 @@ def video_files(arguments: Arguments, folder: Path) -> list[Path]:
     return films
 
 
-def film_all(
-    films: list[Path], reel: Reel, world: TaskWorld, task: Task, starts: InitialStates, period: float
-) -> None:
+def film_all(films: list[Path], reel: Reel, world: TaskWorld, task: Task, starts: InitialStates, period: float) -> None:
     """Film the episodes of a reel, which began with `starts`; their states are a period apart [s]."""
     from concent_warp.reality.video import filmed, write_video
 

@@ -1,7 +1,9 @@
 """The smallest insertion: a Cartesian gripper holds a block over a box with a hole, each of few spheres."""
 
+from dataclasses import replace
+
 import numpy as np
-from concent_warp.train.cfg import ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
+from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
 from concent_warp.train.task import Task
 
 from concent_warp.events.extract import extract
@@ -116,3 +118,14 @@ def make_task(cfg: EnvironmentCfg = SETTINGS) -> Task:
     """Return the task of inserting."""
     model = make_model()
     return Task.build(model, make_demonstration(model), cfg)
+
+
+CHAIN = replace(
+    SETTINGS,
+    stage=ALL,
+    episode=5.0,
+    # A Cartesian robot cannot turn.
+    reset=replace(SETTINGS.reset, place=(0.02, 0.015), heading=(0.0, 0.0)),
+    action=replace(SETTINGS.action, gripper=0.002),
+)
+"""The same with all stages chained."""

@@ -9,6 +9,7 @@ import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.environment import Environment
 from concent_warp.train.evaluate import evaluate, wilson
+from concent_warp.train.export import export
 from concent_warp.train.ppo import CHECKPOINT, OFFENCE, Round
 from concent_warp.train.run import Run, train
 from concent_warp.train.worlds import make_environment
@@ -131,6 +132,32 @@ def test_commands_train_and_evaluate(made, tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["hidden"] == {"joint_friction": 2.0, "mass": 1.5}
     assert document["worlds"]["reality"]["episodes"] == len(document["worlds"]["reality"]["outcomes"]) == 4
+
+
+def test_commands_train_and_evaluate_a_chain(made, tmp_path, capsys):
+    write_hdf5(made.recording, tmp_path / "demo.h5")
+    made.model.save(tmp_path / "model.toml")
+    made.events.save(tmp_path / "events.json")
+    options = f"--model {tmp_path}/model.toml --events {tmp_path}/events.json --out {tmp_path}/run --device cpu"
+    options += " --stage all --worlds 4 --iterations 2 --ppo.steps 4 --ppo.hidden 16 --environment.reset.states 8"
+    options += " --environment.reset.turn 0 --environment.reset.heading 0 0 --environment.reset.place 0.02 0.01"
+    options += " --environment.action.gripper-actuators grip --environment.episode 0.3"
+    assert main(["train", f"{tmp_path}/demo.h5", *options.split()]) == 0
+    assert main(["train", f"{tmp_path}/demo.h5", *options.split(), "--resume", "--iterations", "3"]) == 0
+    capsys.readouterr()
+    command = ["evaluate", "--checkpoint", f"{tmp_path}/run", "--episodes", "3", "--device", "cpu"]
+    assert main([*command, "--world", "simulation"]) == 0
+    assert "targets met in order: pick 0.0%, align 0.0%, insert 0.0%" in capsys.readouterr().out
+    assert main([*command, "--videos", "1", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    for world in ("simulation", "reality"):
+        met = document["worlds"][world]["stages met"]
+        assert met == [{"stage": name, "episodes": 0} for name in ("pick", "align", "insert")]
+    assert len(list((tmp_path / "run" / "videos").iterdir())) == 1
+    described = export(tmp_path / "run" / CHECKPOINT, tmp_path / "policy.pt")
+    assert described["stages"] == ["pick", "align", "insert"]
+    assert described["moving on"]["hold"] == 2
+    assert [p["stage"] for p in described["observation"]["slots"]["pairs"]].count("align") == 8
 
 
 def test_first_episodes_in_the_stand_in_world_are_filmed(made, tmp_path, capsys):

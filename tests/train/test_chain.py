@@ -1,0 +1,215 @@
+"""Stages one after the other, and objects that stand elsewhere in each world."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.cfg import TrainError
+from concent_warp.train.chain import worst_distance
+from concent_warp.train.environment import TERMS, Environment
+from concent_warp.train.evaluate import evaluate
+from concent_warp.train.movable import movable
+from concent_warp.train.resets import InitialStates, draw_states
+from concent_warp.train.task import Task
+from concent_warp.train.worlds import make_environment, make_physics
+from small_insertion import CHAIN, HOLE, SETTINGS, make_task
+
+WORLDS = 6
+
+
+@pytest.fixture(scope="module")
+def chain() -> Task:
+    return make_task(CHAIN)
+
+
+@pytest.fixture(scope="module")
+def drawn(chain) -> InitialStates:
+    return draw_states(chain, CHAIN.reset, 0, count=80)
+
+
+@pytest.fixture
+def as_shown(chain) -> Environment:
+    """Return worlds that all start where the demonstration does."""
+    cfg = replace(CHAIN, worlds=2, reset=replace(CHAIN.reset, free=1.0, place=(0.0, 0.0)))
+    return make_environment(chain, cfg, draw_states(chain, cfg.reset, 0, count=2), device="cpu")
+
+
+def as_demonstrated(environment: Environment, k: int) -> torch.Tensor:
+    """Command as in step k of the demonstration, and return the action that leaves it so."""
+    replay, period = environment.task.replay, CHAIN.decimation
+    environment.physics.ctrl[:] = torch.as_tensor(replay.ctrl[min(k * period, len(replay.ctrl) - 1)]).float()
+    return torch.zeros(environment.num_envs, environment.num_actions)
+
+
+def test_demonstration_meets_its_targets_in_order(chain):
+    shown = chain.demonstrated
+    assert shown is not None
+    assert chain.chained == (0, 1, 2)
+    assert (np.diff(shown.stage) >= 0).all()
+    assert list(shown.start) == [0, 1, 2]
+    for stage in (0, 1):
+        assert shown.end[stage] == shown.start[stage + 1]
+        # A target is met after its contact has begun, and before the next one's has.
+        assert chain.events.stages[stage].start < shown.end[stage] < chain.events.stages[stage + 1].end
+    with pytest.raises(TrainError, match=r"'pick'.*mm at best.*tolerance"):
+        make_task(replace(CHAIN, chain=replace(CHAIN.chain, tolerance=1e-6)))
+
+
+def test_world_moves_on_exactly_when_its_target_has_been_met_for_long_enough(as_shown, chain):
+    environment, d = as_shown, mujoco.MjData(chain.compiled)
+    environment.start_from([0, 1])
+    held, stage, moves = 0, 0, []
+    for k in range(environment.max_episode_length):
+        _, _, done, _ = environment.step(as_demonstrated(environment, k))
+        if done.any():
+            break
+        d.qpos[:] = environment.physics.qpos[1]
+        mujoco.mj_kinematics(chain.compiled, d)
+        held = held + 1 if worst_distance(chain.table, d, stage) < CHAIN.chain.tolerance else 0
+        if held == CHAIN.chain.hold and stage < 2:
+            stage, held = stage + 1, 0
+            moves.append(k)
+        assert environment.stage.tolist() == [stage, stage]
+    assert len(moves) == 2
+    assert environment.reached.tolist() == [3, 3]
+    assert environment.success.all()
+    # The episode was over as soon as the block had come to rest.
+    assert done.all()
+    assert k < environment.max_episode_length - 1
+
+
+def test_moving_on_is_never_worse_than_staying(as_shown):
+    environment, terms, stages = as_shown, [], []
+    environment.start_from([0, 1])
+    for k in range(60):
+        stages.append(environment.stage.tolist()[0])
+        environment.step(as_demonstrated(environment, k))
+        terms.append(environment.terms[0, [TERMS.index("reach"), TERMS.index("stages")]].clone())
+        if environment.done.any():
+            break
+    told = torch.stack(terms).sum(dim=1)
+    best = [max(float(t) for t, s in zip(told, stages, strict=True) if s == stage) for stage in (0, 1, 2)]
+    least = [min(float(t) for t, s in zip(told, stages, strict=True) if s == stage) for stage in (0, 1, 2)]
+    assert best[0] < least[1]
+    assert best[1] < least[2]
+
+
+def test_observation_shows_the_stage_that_the_world_is_in(chain, drawn):
+    environment = make_environment(chain, replace(CHAIN, worlds=len(drawn.qpos)), drawn, device="cpu")
+    environment.start_from(range(len(drawn.qpos)))
+    assert environment.stage.tolist() == drawn.stage.tolist()
+    shown = environment.observation[:, environment.layout.base :].numpy().reshape(len(drawn.qpos), -1, 13)
+    d, table = mujoco.MjData(chain.compiled), chain.table
+    for i in range(0, len(drawn.qpos), 7):
+        d.qpos[:] = drawn.qpos[i]
+        d.mocap_pos[:], d.mocap_quat[:] = drawn.mocap[i, :, :3], drawn.mocap[i, :, 3:]
+        mujoco.mj_kinematics(chain.compiled, d)
+        s = int(drawn.stage[i])
+        assert (shown[i, :, 0] > 0).tolist() == table.used[s].tolist()
+        assert np.linalg.norm(shown[i, :, 4:7], axis=1).max() == pytest.approx(
+            worst_distance(chain.table, d, s), abs=1e-6
+        )
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_block_falls_into_the_hole_wherever_a_world_has_it(chain, engine):
+    physics = make_physics(chain, replace(CHAIN, worlds=WORLDS, engine=engine), device="cpu")
+    rng = np.random.default_rng(0)
+    box = np.array([HOLE, 0]) + rng.uniform(-0.03, 0.03, (WORLDS, 2))
+    block = rng.uniform(-0.001, 0.001, (WORLDS, 2))
+    physics.qpos[:] = torch.as_tensor(chain.replay.qpos[0]).to(physics.qpos.dtype)
+    physics.qpos[:, :2] = torch.as_tensor(box + block).to(physics.qpos.dtype)
+    physics.qpos[:, 2] = 0.03
+    physics.mocap[0][:, 0, :2] = torch.as_tensor(box).to(physics.mocap[0].dtype)
+    physics.ctrl[:] = torch.as_tensor(chain.replay.ctrl[0]).float()
+    for _ in range(8):
+        physics.advance()
+    second = chain.objects[1]
+    np.testing.assert_allclose(physics.position[:, second, :2], box, atol=1e-6)
+    seated = physics.position[:, chain.objects[0]] - physics.position[:, second]
+    assert chain.place is not None
+    np.testing.assert_allclose(seated[:, 2], chain.place[2], atol=1e-3)
+    assert seated[:, :2].abs().max() < 2e-3
+
+
+def test_box_of_no_fixed_place_is_as_immovable(chain):
+    plain = chain.model.scene.model
+    assert plain.nmocap == 1
+    assert movable(chain.model.scene) == chain.model.scene
+    d = mujoco.MjData(chain.compiled)
+    d.qpos[:] = chain.replay.qpos[-1]
+    d.mocap_pos[0, 2] -= 0.001  # into the table: no contact of what cannot move with what does not
+    mujoco.mj_forward(chain.compiled, d)
+    table = {g for g in range(chain.compiled.ngeom) if chain.compiled.geom_bodyid[g] == 0}
+    box = {g for g in range(chain.compiled.ngeom) if chain.compiled.geom_bodyid[g] == chain.objects[1]}
+    assert not [c for c in d.contact if set(c.geom.tolist()) & table and set(c.geom.tolist()) & box]
+
+
+def test_states_of_all_stages_keep_the_contact_chain(chain, drawn):
+    d = mujoco.MjData(chain.compiled)
+
+    def poses(qpos: np.ndarray, mocap: np.ndarray) -> np.ndarray:
+        d.qpos[:] = qpos
+        d.mocap_pos[:], d.mocap_quat[:] = mocap[:, :3], mocap[:, 3:]
+        mujoco.mj_kinematics(chain.compiled, d)
+        return np.array([d.site_xpos[chain.robot.tool], *d.xpos[list(chain.objects)]])
+
+    home = poses(chain.replay.qpos[0], drawn.mocap[0])[0]
+    fixed = np.array([[HOLE, 0, 0, 1, 0, 0, 0]])
+    offsets = []
+    for i, time in enumerate(drawn.time):
+        tool, block, box = poses(drawn.qpos[i], drawn.mocap[i])
+        then_tool, then_block, _ = poses(chain.replay.qpos[chain.replay.row(time)], fixed)
+        if drawn.case[i] > 1:
+            assert np.abs((block - tool) - (then_block - then_tool)).max() < CHAIN.reset.slip
+        elif drawn.begins[i]:
+            assert np.abs(tool - home).max() < 1e-3
+        assert np.abs(box - fixed[0, :3]).max() <= CHAIN.reset.place[1]
+        offsets.append(box - fixed[0, :3])
+    assert np.ptp(offsets, axis=0)[:2].min() > CHAIN.reset.place[1]
+    assert set(drawn.stage) == {0, 1, 2}
+    assert set(drawn.case) == {1, 2, 3}
+    assert 0.1 < drawn.begins.mean() < 0.5
+    assert not drawn.stage[drawn.begins].any()
+
+
+def test_saved_chain_is_gone_on_with_exactly(chain, drawn):
+    torch.manual_seed(0)
+    environment = make_environment(chain, replace(CHAIN, worlds=16), drawn, device="cpu")
+    action = torch.rand(60, 16, environment.num_actions) * 2 - 1
+    for k in range(10):
+        environment.step(action[k])
+    state, random = environment.state(), torch.get_rng_state()
+    runs = []
+    for _ in range(2):
+        environment.restore(state)
+        torch.set_rng_state(random)
+        found = [(environment.step(action[k])[0]["policy"], environment.stage.clone()) for k in range(10, 60)]
+        runs.append([torch.stack(parts) for parts in zip(*found, strict=True)])
+    assert len(torch.unique(runs[0][1])) == 3
+    for first, again in zip(*runs, strict=True):
+        torch.testing.assert_close(first, again, rtol=0, atol=0)
+    del state["stage"]
+    with pytest.raises(TrainError, match="lacks"):
+        environment.restore(state)
+
+
+def test_evaluation_tells_how_many_targets_were_met_in_order(chain):
+    cfg = replace(CHAIN, worlds=4, reset=replace(CHAIN.reset, free=1.0, place=(0.0, 0.0)))
+    states = draw_states(chain, cfg.reset, 0, count=6)
+    environment = make_environment(chain, cfg, states, device="cpu")
+    step = iter(range(10_000))
+    found = evaluate(environment, lambda _: as_demonstrated(environment, next(step)), states)
+    # Of the second batch nothing is reached: its commands are those at the demonstration's end.
+    assert found.reached.tolist() == [3, 3, 3, 3, 0, 0]
+    assert found.met == {"pick": 4, "align": 4, "insert": 4}
+    assert found.success.tolist() == [True] * 4 + [False] * 2
+    assert "in order: pick 66.7%, align 66.7%, insert 66.7%" in found.sentence()
+
+
+def test_single_stage_knows_no_chain():
+    task = make_task(SETTINGS)
+    assert task.demonstrated is None
+    assert task.chained == (task.stage,)
