@@ -1,4 +1,4 @@
-"""Strict reading of dataclasses from parsed JSON: no field missing or unknown, no wrong type, no number not finite."""
+"""Strict reading of dataclasses from parsed JSON: no field unknown, none missing that has no default, no wrong type, no number not finite."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def decode_fields(kind: Any, value: Any, where: str) -> Any:
     known = {field.name: field for field in fields(kind)}
     if unknown := sorted(set(value) - set(known)):
         raise EventsError("unknown entries", where=where, expected=f"only {list(known)}", found=unknown[:5])
-    needed = [name for name, field in known.items() if field.default is MISSING]
+    needed = [name for name, field in known.items() if field.default is MISSING and field.default_factory is MISSING]
     if missing := [name for name in needed if name not in value]:
         raise EventsError("missing entries", where=where, expected=f"all of {needed}", found=f"no {missing}")
     hints = get_type_hints(kind)
