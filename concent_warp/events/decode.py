@@ -1,4 +1,4 @@
-"""Strict reading of dataclasses from parsed JSON: no field unknown, none missing that has no default, no wrong type, no number not finite."""
+"""Strict reading of dataclasses from parsed JSON: no wrong type, nothing unknown, nothing missing without a default."""
 
 from __future__ import annotations
 
