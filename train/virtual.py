@@ -11,6 +11,8 @@ from concent_warp.train.cfg import CollisionCfg
 from concent_warp.train.physics import Physics
 from concent_warp.train.task import Task
 
+from concent_warp.scene.surface import Surface
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -33,8 +35,9 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     for body in geometry.bodies:
         left = geometry.of(body)[~task.collidable[geometry.of(body)]]
         if len(left):
-            radius = np.maximum(geometry.radius[left] - cfg.slack, 0.0)
-            sets.append(SphereSet(m.body(body).id, geometry.position[left], radius))
+            surface = Surface.of_body(task.model.scene, body)
+            covered = within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
+            sets.append(SphereSet(m.body(body).id, *covered))
     links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
     tool = int(m.site_bodyid[task.robot.tool])
     links |= {i for i in range(m.nbody) if i == tool or int(m.body_parentid[i]) in links | {tool}}
@@ -64,6 +67,18 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
         band_weight=cfg.band,
         severe_penalty=0.0,
     )
+
+
+def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return spheres that stay `slack` [m] below an object's surface: centres [m], shape (n, 3), radii [m], shape (n,).
+
+    Spheres centred on the surface stand out of it by their radius, which a fit has corrected for those alone that took
+    part in contacts. The others would call collision what the demonstration did, where there is little room.
+    """
+    distance, outward = surface.distance(centre)
+    deep = np.clip(-distance, 0.0, radius)
+    inward = np.maximum(distance + np.maximum(deep, slack), 0.0)
+    return centre - inward[:, None] * outward, np.maximum(deep - slack, 0.0)
 
 
 def gate(task: Task, stage: int, a: int, b: int) -> float:
