@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from concent_warp.train.commands import Following
 from concent_warp.train.task import Task
 
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
@@ -34,6 +35,8 @@ class EffectsOfWorlds:
     """Values of the model fields that differ between worlds, shape (N, ...) each."""
     laws: Laws
     """Force laws with their parameters in each world, shape (N, P) each."""
+    late: tuple[Following, ...]
+    """Delays and lags of the commands, of each effect on them."""
     values: tuple[np.ndarray, ...]
     """Parameters of each effect, shape (N, P) each."""
     kept: tuple[str, ...]
@@ -71,8 +74,16 @@ def effects_of_worlds(
             f"the simulator cannot vary {', '.join(kept)} between worlds: all have the fitted value", stacklevel=2
         )
     laws = [(law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None]
+    late = tuple(following(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands)
     fields = written_fields(bare, [added.effect for added in effects], varied, values)
-    return EffectsOfWorlds(fields, laws, tuple(values), tuple(kept))
+    return EffectsOfWorlds(fields, laws, late, tuple(values), tuple(kept))
+
+
+def following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> Following:
+    """Return how commands are followed under an effect on them; its parameters in the worlds are of shape (N, P)."""
+    found = [effect.late(m, row) for row in values]
+    delay, lag = (np.array([late[k] for late in found if late is not None]) for k in range(2))
+    return Following(delay, (lag,))
 
 
 def any_open(added: AddedEffect) -> bool:
@@ -88,7 +99,7 @@ def acts(effect: Effect) -> bool:
 
 def can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:
     """Return whether the parameters of an effect can differ between worlds that share what is compiled."""
-    return acts(effect) and not effect.edits and not effect.commands and all(map(variable or bool, fields))
+    return acts(effect) and not effect.edits and all(map(variable or bool, fields))
 
 
 def drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rng: np.random.Generator) -> np.ndarray:

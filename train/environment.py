@@ -17,7 +17,7 @@ import warp as wp
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg, TrainError
 from concent_warp.train.observation import BaseObservation, Layout
-from concent_warp.train.physics import Graph, Physics
+from concent_warp.train.physics import Graph, Physics, captured
 from concent_warp.train.resets import InitialStates
 from concent_warp.train.reward import disturbance, effort, engineered, relative_pose
 from concent_warp.train.rotation import inverse, rotate
@@ -251,7 +251,7 @@ class Environment(VecEnv):
         parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
         parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
         parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
-        return parts | {"most": self._most, "near": self._near, "resting": self._resting}
+        return parts | {"most": self._most, "near": self._near, "resting": self._resting} | p.memory
 
     def parts(self) -> tuple[Callable[[], None], ...]:
         """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
@@ -406,27 +406,8 @@ class Environment(VecEnv):
         self._most.copy_(torch.where(where, self.stage - self.task.first, self._most))
         for counter in (self._near, self._resting, self.episode_length_buf, self._return):
             counter.masked_fill_(where, 0)
+        p.begin(where)
 
     def _read_base(self) -> None:
         """Write robot and objects to the observation; the slots are there already."""
         self.observation[:, : self.layout.base] = self._base.read()
-
-
-def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
-    """Return torch operations on fixed buffers as a CUDA graph, of few fused kernels if wanted, or as they are."""
-    if not capture:
-        return part
-    if fuse:
-        part = torch.compile(part, fullgraph=True, dynamic=False)
-    with torch.no_grad():
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(2):
-                part()
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            part()
-    recorded = part, graph  # what was compiled has to live as long as its kernels are launched
-    return lambda: recorded[1].replay()

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
+from concent_warp.train.commands import Follower, Following
 
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
@@ -50,6 +51,12 @@ class Physics(Protocol):
     """Bits of what went wrong in the simulator, shape (N,) int."""
     dropping: int
     """Those of the bits that say that contacts were dropped because a buffer was too small."""
+    memory: dict[str, torch.Tensor]
+    """What the future depends on besides positions, velocities, commands and warm start."""
+
+    def begin(self, where: torch.Tensor) -> None:
+        """Take the present commands as having been held for long in the worlds of a mask, shape (N,) bool."""
+        ...
 
     def poses(self) -> tuple[wp.array, wp.array]:
         """Return positions and orientations as Warp arrays, of `wp.vec3` and `wp.quat`, shape (N, nbody)."""
@@ -85,6 +92,7 @@ class MujocoPhysics:
         laws: Sequence[tuple[Law, np.ndarray]] = (),
         actors: Sequence[Sequence[Actor]] = (),
         fields: Mapping[str, np.ndarray] | None = None,
+        following: Following | None = None,
     ) -> None:
         """Make the worlds.
 
@@ -95,8 +103,11 @@ class MujocoPhysics:
             laws: Force laws with their parameters, shape (N, P) each.
             actors: What else acts, for each world its own, for they may have a state; none where empty.
             fields: Values of model fields that differ between worlds, shape (N, ...) each.
+            following: How what acts follows the commands; at once by default.
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
+        self._follower = following and Follower(following, model.opt.timestep, decimation, self.device)
+        self.memory = {} if self._follower is None else self._follower.memory
         self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
         self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
         self._data = [mujoco.MjData(m) for m in self._models]
@@ -133,18 +144,26 @@ class MujocoPhysics:
         """Return positions and orientations as Warp arrays."""
         return self._xpos, self._xquat
 
+    def begin(self, where: torch.Tensor) -> None:
+        """See `Physics.begin`."""
+        if self._follower is not None:
+            self._follower.begin(where, self.ctrl)
+
     def advance(self) -> None:
         """Simulate the steps of one action. A world that MuJoCo resets as unstable is left not finite instead."""
-        ctrl = self.ctrl.numpy().astype(float)
+        if self._follower is None:
+            acting = np.broadcast_to(self.ctrl.numpy(), (self._decimation, *self.ctrl.shape))
+        else:
+            self._follower.follow(self.ctrl)
+            acting = self._follower.acting.numpy()
         with quiet_warnings():
-            self._advance(ctrl)
+            self._advance(acting.astype(float))
 
     def _advance(self, ctrl: np.ndarray) -> None:
-        """Simulate the steps of one action, the commands of shape (N, nu) held."""
+        """Simulate the steps of one action under the commands of each, shape (D, N, nu)."""
         for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
             self._write(i, m, d)
-            for _ in range(self._decimation):
-                command = ctrl[i]
+            for command in ctrl[:, i]:
                 for actor in self._actors[i]:
                     command = command if actor.command is None else actor.command(d.time, command)
                 d.ctrl[:] = command
@@ -202,6 +221,7 @@ class WarpPhysics:
         nconmax: int,
         njmax: int,
         fields: Mapping[str, np.ndarray] | None = None,
+        following: Following | None = None,
         capture: bool = True,
     ) -> None:
         """Make the worlds and capture their step.
@@ -215,6 +235,7 @@ class WarpPhysics:
             nconmax: Contacts a world, of a pool for all.
             njmax: Constraint rows of each world.
             fields: Values of model fields that differ between worlds, shape (N, ...) each.
+            following: How what acts follows the commands; at once by default.
             capture: Whether steps are captured in a graph.
         """
         import mujoco_warp as mjw
@@ -242,6 +263,7 @@ class WarpPhysics:
             self._laws: list[tuple[Law, Any]] = [(law, wp.array(values, dtype=float)) for law, values in laws]
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
+            self._follow(following, capture)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
             self.mocap = (
@@ -262,6 +284,17 @@ class WarpPhysics:
             d.overflow.zero_()
         wp.synchronize_device(self._warp_device)
 
+    def _follow(self, following: Following | None, capture: bool) -> None:
+        """Keep the commands apart from what acts, where the one follows the other."""
+        self._follower, self.memory, self._acting = None, {}, None
+        if following is None:
+            return
+        self.ctrl = torch.zeros_like(self.ctrl)
+        follower = Follower(following, float(self.model.opt.timestep), self._decimation, self.device)
+        self._follower, self.memory = follower, follower.memory
+        self._acting = [wp.from_torch(acts) for acts in follower.acting]
+        self._filter = captured(lambda: follower.follow(self.ctrl), capture and self._warp_device.is_cuda)
+
     @property
     def simulator(self) -> tuple[Any, Any]:
         """MuJoCo-Warp's model and data, for measurements of its own."""
@@ -271,8 +304,15 @@ class WarpPhysics:
         """Return positions and orientations as Warp arrays."""
         return self._data.xpos, self._data.xquat
 
+    def begin(self, where: torch.Tensor) -> None:
+        """See `Physics.begin`."""
+        if self._follower is not None:
+            self._follower.begin(where, self.ctrl)
+
     def advance(self) -> None:
         """Simulate the steps of one action."""
+        if self._follower is not None:
+            self._filter()
         self._advance.launch()
 
     def place(self) -> None:
@@ -281,7 +321,9 @@ class WarpPhysics:
 
     def _steps(self) -> None:
         """Launch the steps of one action."""
-        for _ in range(self._decimation):
+        for k in range(self._decimation):
+            if self._acting is not None:
+                wp.copy(self._data.ctrl, self._acting[k])
             if self._laws:
                 for target, values in self._unedited:
                     wp.copy(target, values)
@@ -318,3 +360,23 @@ class Graph:
                 self._launches()
             else:
                 wp.capture_launch(self._graph, stream=stream)
+
+
+def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
+    """Return torch operations on fixed buffers as a CUDA graph, of few fused kernels if wanted, or as they are."""
+    if not capture:
+        return part
+    if fuse:
+        part = torch.compile(part, fullgraph=True, dynamic=False)
+    with torch.no_grad():
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(2):
+                part()
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            part()
+    recorded = part, graph  # what was compiled has to live as long as its kernels are launched
+    return lambda: recorded[1].replay()

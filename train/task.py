@@ -93,8 +93,6 @@ class Task:
         """
         if model.geometry is None:
             raise TrainError("the model has no contact geometry to train with", fix="make one with concent fit")
-        if delayed := [a.effect.name for a in model.effects if a.effect.commands]:
-            raise TrainError("effects on the commands cannot be trained with yet", found=delayed)
         events = extract(model, demonstration, MujocoEngine(model, threads=1)) if events is None else events
         first, stage = chain(events, cfg.stage)
         collidable = np.ones(len(model.geometry), dtype=bool)
@@ -104,6 +102,12 @@ class Task:
             collidable[touched] = True
         replayer, model = model, replace(model, scene=movable(model.scene))
         compiled, _ = compile_model(model, collidable)
+        odd = [a.effect for a in model.effects if a.effect.commands and a.effect.late(compiled, a.array) is None]
+        if odd:
+            raise TrainError(
+                "effects on the commands can be trained with where they are delays and lags",
+                found=[effect.name for effect in odd],
+            )
         table, held = slot_table(compiled, events, cfg.observation.slots)
         objects = tuple(int(compiled.body(name).id) for name in ranked(model, events))
         replay = replayed(compiled, replayer, demonstration, collidable)

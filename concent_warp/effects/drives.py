@@ -185,6 +185,12 @@ class ActuatorDelay(DriveEffect):
         late[:, ids] = (1 - weight) * ctrl[lower][:, ids] + weight * ctrl[upper][:, ids]
         return late
 
+    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the delay of the targets."""
+        delay = np.zeros(m.nu)
+        delay[self.ids(m)] = max(float(values[0]), 0.0)
+        return delay, np.zeros(m.nu)
+
 
 class ActuatorLag(DriveEffect):
     """A drive that follows its commands sluggishly."""
@@ -214,6 +220,12 @@ class ActuatorLag(DriveEffect):
         before = lfilter([0, 1 - keep], [1, -keep], u - u[0], axis=0) + u[0]
         slow[:, ids] = u + (np.asarray(before) - u) * mean
         return slow
+
+    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the time constant of the targets."""
+        lag = np.zeros(m.nu)
+        lag[self.ids(m)] = max(float(values[0]), 0.0)
+        return np.zeros(m.nu), lag
 
 
 class Backlash(ServoEffect):

@@ -129,6 +129,14 @@ class Effect:
         """Return what acts where `ctrl`, shape (K, nu), was commanded, one row a time step."""
         return ctrl
 
+    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # noqa: ARG002
+        """Return what `command` comes to where it is a delay and a first-order lag, None where it is something else.
+
+        Returns:
+            Delays and time constants of all actuators [s], shape (nu,) each.
+        """
+        return None
+
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Return what the instruments read where `read` is what there was to see."""
         return read
