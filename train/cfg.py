@@ -180,14 +180,22 @@ class ChainCfg:
 
 @dataclass(frozen=True)
 class RandomisationCfg:
-    """What differs between the worlds; factors are drawn once for each world."""
+    """What differs between the worlds; it is drawn once for each world."""
 
     friction: Range = (1.0, 1.0)
-    """Factor on the sliding friction of all geoms."""
+    """Factor on the sliding friction of all geoms but the robot's."""
+    grip: Range = (1.0, 1.0)
+    """Factor on the sliding friction of the robot's geoms. What is held has the larger friction of the two."""
     stiffness: Range = (1.0, 1.0)
     """Factor on the stiffness of the position control."""
     damping: Range = (1.0, 1.0)
     """Factor on the damping of the joints."""
+    mass: Range = (1.0, 1.0)
+    """Factor on mass and inertia of the objects."""
+    delay: Range = (0.0, 0.0)
+    """Delay of the arm's commands [s]."""
+    lag: Range = (0.0, 0.0)
+    """Time constant with which the arm's set points follow its commands [s]."""
 
 
 @dataclass(frozen=True)

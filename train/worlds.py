@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 
 import mujoco
-import numpy as np
-from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
+from concent_warp.train.cfg import EnvironmentCfg
+from concent_warp.train.commands import Following
 from concent_warp.train.effects import effects_of_worlds
 from concent_warp.train.environment import Environment
 from concent_warp.train.physics import MujocoPhysics, Physics, WarpPhysics
+from concent_warp.train.randomisation import drawn_fields, drawn_following
 from concent_warp.train.resets import InitialStates
 from concent_warp.train.task import Task
 
@@ -40,9 +40,10 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     else:
         from concent_warp.simulate.warp_model import batchable as variable
     effects = effects_of_worlds(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
-    fields = drawn_fields(m, cfg.worlds, cfg.randomisation, seed, effects.fields)
+    fields = drawn_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
+    following = Following.of([*effects.late, drawn_following(task, cfg.worlds, cfg.randomisation, seed)])
     if plain:
-        return MujocoPhysics(m, cfg.worlds, cfg.decimation, effects.laws, fields=fields)
+        return MujocoPhysics(m, cfg.worlds, cfg.decimation, effects.laws, fields=fields, following=following)
     contacts, constraints = buffers(task, cfg)
     return WarpPhysics(
         m,
@@ -53,6 +54,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
         nconmax=contacts,
         njmax=constraints,
         fields=fields,
+        following=following,
         capture=cfg.capture != "none",
     )
 
@@ -70,41 +72,3 @@ def buffers(task: Task, cfg: EnvironmentCfg) -> tuple[int, int]:
     contacts = int(ROOM * task.replay.contacts) + SPARE if cfg.nconmax is None else cfg.nconmax
     constraints = int(ROOM * task.replay.constraints) + 4 * SPARE if cfg.njmax is None else cfg.njmax
     return contacts, constraints
-
-
-def drawn_fields(
-    m: mujoco.MjModel,
-    worlds: int,
-    cfg: RandomisationCfg,
-    seed: int,
-    fields: Mapping[str, np.ndarray] | None = None,
-) -> dict[str, np.ndarray]:
-    """Return the values of the model fields that differ between worlds, shape (N, ...) each.
-
-    Args:
-        m: The model.
-        worlds: N.
-        cfg: Ranges of the factors.
-        seed: Seed of what is drawn.
-        fields: Values that differ already; the factors are on top of them.
-    """
-    rng = np.random.default_rng([seed, 2])
-    found = dict(fields or {})
-
-    def scaled(name: str, factor: np.ndarray, column: int | None = None) -> None:
-        given = found.get(name)
-        value = getattr(m, name)
-        values = np.tile(value, (worlds, *[1] * value.ndim)) if given is None else given.copy()
-        part = values if column is None else values[..., column]
-        part *= factor.reshape(worlds, *[1] * (part.ndim - 1))
-        found[name] = values
-
-    if cfg.friction[0] != cfg.friction[1]:
-        scaled("geom_friction", rng.uniform(*cfg.friction, worlds), 0)
-    if cfg.stiffness[0] != cfg.stiffness[1]:
-        factor = rng.uniform(*cfg.stiffness, worlds)
-        scaled("actuator_gainprm", factor, 0)
-        scaled("actuator_biasprm", factor, 1)
-    if cfg.damping[0] != cfg.damping[1]:
-        scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
-    return found

@@ -9,8 +9,9 @@ import pytest
 import torch
 from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.effects import drawn, effects_of_worlds
+from concent_warp.train.randomisation import drawn_fields
 from concent_warp.train.task import Task
-from concent_warp.train.worlds import drawn_fields, make_physics
+from concent_warp.train.worlds import make_physics
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect
@@ -142,6 +143,6 @@ def test_factors_are_on_top_of_effects(varied):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fields = effects_of_worlds(varied, WORLDS, 0, draw=True).fields
-    both = drawn_fields(varied.compiled, WORLDS, cfg, 0, fields)
+    both = drawn_fields(varied, WORLDS, cfg, 0, fields)
     np.testing.assert_allclose(both["dof_damping"], 2 * fields["dof_damping"], rtol=1e-6)
     np.testing.assert_array_equal(both["body_mass"], fields["body_mass"])

@@ -8,7 +8,8 @@ import pytest
 import torch
 from concent_warp.train.environment import TERMS, Environment
 from concent_warp.train.physics import WarpPhysics
-from concent_warp.train.worlds import drawn_fields, make_environment, make_physics
+from concent_warp.train.randomisation import drawn_fields
+from concent_warp.train.worlds import make_environment, make_physics
 from small_insertion import SETTINGS
 
 
@@ -149,12 +150,22 @@ def test_both_simulators_give_the_same_steps(task, states):
 
 
 def test_randomised_fields_differ_between_worlds_and_are_used(task):
-    cfg = replace(SETTINGS.randomisation, friction=(0.5, 1.5), stiffness=(0.8, 1.2))
-    fields = drawn_fields(task.compiled, 4, cfg, 0)
-    ratio = fields["geom_friction"][:, :, 0] / task.compiled.geom_friction[:, 0]
-    assert ((ratio > 0.5) & (ratio < 1.5)).all()
-    assert len(np.unique(ratio[:, 0].round(9))) == 4
-    np.testing.assert_allclose(ratio, ratio[:, :1] * np.ones_like(ratio))
+    cfg = replace(SETTINGS.randomisation, friction=(0.5, 1.5), grip=(2.0, 3.0), stiffness=(0.8, 1.2), mass=(0.5, 2.0))
+    fields = drawn_fields(task, 4, cfg, 0)
+    m = task.compiled
+    ratio = fields["geom_friction"][:, :, 0] / m.geom_friction[:, 0]
+    robot = [m.body(name).id for name in ("rail", "palm", "left_finger", "right_finger")]
+    held = np.isin(m.geom_bodyid, robot)
+    for part, (low, high) in ((ratio[:, ~held], (0.5, 1.5)), (ratio[:, held], (2.0, 3.0))):
+        assert ((part > low) & (part < high)).all()
+        assert len(np.unique(part[:, 0].round(9))) == 4
+        np.testing.assert_allclose(part, part[:, :1] * np.ones_like(part))
+    heavier = fields["body_mass"] / np.where(m.body_mass > 0, m.body_mass, 1.0)
+    assert len(np.unique(heavier[:, m.body("block").id])) == 4
+    np.testing.assert_array_equal(fields["body_mass"][:, robot], np.tile(m.body_mass[robot], (4, 1)))
+    np.testing.assert_allclose(
+        fields["body_inertia"][:, m.body("block").id, 0], m.body("block").inertia[0] * heavier[:, m.body("block").id]
+    )
     gain, bias = fields["actuator_gainprm"][..., 0], fields["actuator_biasprm"][..., 1]
     np.testing.assert_allclose(gain, -bias)
     physics = make_physics(task, replace(SETTINGS, worlds=4, engine="warp", randomisation=cfg), device="cpu")

@@ -1,0 +1,151 @@
+"""Late and sluggish commands act in training as the effects have them."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.cfg import RandomisationCfg, TrainError
+from concent_warp.train.commands import Follower, Following
+from concent_warp.train.effects import effects_of_worlds
+from concent_warp.train.task import Task
+from concent_warp.train.worlds import make_environment, make_physics
+from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+
+from concent_warp.effects.drives import ActuatorDelay, ActuatorLag, DriveEffect
+from concent_warp.effects.effect import AddedEffect, Parameter
+
+DELAY = AddedEffect(ActuatorDelay("x", "y"), (0.031,), ((0.0, 0.062),))
+LAG = AddedEffect(ActuatorLag("x", "z"), (0.04,), ((0.02, 0.06),))
+DECIMATION = 4
+WORLDS = 5
+
+
+def task_of(*effects: AddedEffect) -> Task:
+    plain = make_model()
+    demonstration = make_demonstration(plain)
+    return Task.build(replace(plain, effects=effects), demonstration, SETTINGS, make_events(plain, demonstration))
+
+
+@pytest.fixture(scope="module")
+def late() -> Task:
+    return task_of(DELAY, LAG)
+
+
+def offline(task: Task, values: tuple[np.ndarray, ...], world: int, ctrl: np.ndarray) -> np.ndarray:
+    """Return what acts in each step by the effects' own account, where commands of shape (actions, nu) were given."""
+    held = np.repeat(ctrl, DECIMATION, axis=0)
+    for added, rows in zip(task.model.effects, values, strict=True):
+        held = added.effect.command(task.compiled, held, rows[world])
+    return held
+
+
+def test_commands_are_followed_as_the_effects_have_it(late):
+    rng = np.random.default_rng(0)
+    values = effects_of_worlds(late, WORLDS, 0, draw=True)
+    rows = (np.array([[0.0], [0.005], [0.0123], [0.062], [0.29]]), np.array([[0.0], [0.03], [0.001], [0.2], [0.05]]))
+    parts = []
+    for added, row in zip(late.model.effects, rows, strict=True):
+        found = [added.effect.late(late.compiled, value) for value in row]
+        parts.append(Following(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
+    following = Following.of(parts)
+    assert following is not None
+    assert len(values.late) == 2
+    follower = Follower(following, late.compiled.opt.timestep, DECIMATION, "cpu")
+    ctrl = rng.normal(size=(30, WORLDS, late.compiled.nu)).astype(np.float32)
+    follower.begin(torch.ones(WORLDS, dtype=torch.bool), torch.from_numpy(ctrl[0]))
+    acted = []
+    for command in ctrl:
+        follower.follow(torch.from_numpy(command))
+        acted.append(follower.acting.clone())
+    for world in range(WORLDS):
+        expected = offline(late, rows, world, ctrl[:, world])
+        # The last step is interpolated with what is not yet commanded.
+        np.testing.assert_allclose(torch.cat(acted)[:-1, world], expected[:-1], atol=2e-6)
+
+
+def test_worlds_that_begin_anew_forget_what_was_commanded(late):
+    lag = np.full((2, late.compiled.nu), 0.1)
+    follower = Follower(Following(lag, (lag,)), 0.005, DECIMATION, "cpu")
+    old, new = torch.zeros(2, late.compiled.nu), torch.ones(2, late.compiled.nu)
+    follower.begin(torch.tensor([True, True]), old)
+    follower.follow(new)
+    assert not follower.acting.any()
+    follower.begin(torch.tensor([False, True]), new)
+    follower.follow(new)
+    assert (follower.acting[:, 1] == 1).all()
+    assert not follower.acting[:, 0].any()
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
+    settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=DECIMATION)
+    physics = make_physics(late, settings, device="cpu")
+    values = effects_of_worlds(late, WORLDS, 0, draw=True).values
+    assert len(np.unique(values[0])) == WORLDS
+    physics.qpos[:] = torch.as_tensor(late.replay.qpos[0]).to(physics.qpos.dtype)
+    ctrl = np.tile(late.replay.ctrl[0], (8, 1))
+    ctrl[1:4, :3] += 0.02
+    ctrl[4:, :3] -= 0.01
+    for k, command in enumerate(ctrl):
+        physics.ctrl[:] = torch.as_tensor(command, dtype=torch.float32)
+        if k == 0:
+            physics.begin(torch.ones(WORLDS, dtype=torch.bool))
+        physics.advance()
+    expected = np.empty((WORLDS, late.compiled.nq))
+    for world in range(WORLDS):
+        d = mujoco.MjData(late.compiled)
+        d.qpos[:] = late.replay.qpos[0]
+        for acting in offline(late, values, world, ctrl):
+            d.ctrl[:] = acting
+            mujoco.mj_step(late.compiled, d)
+        expected[world] = d.qpos
+    assert np.ptp(expected[:, late.robot.qpos[0]]) > 1e-4
+    np.testing.assert_allclose(physics.qpos.numpy(), expected, rtol=0, atol=2e-6 if engine == "mujoco" else 2e-4)
+
+
+def test_saved_state_holds_what_was_commanded(late, states):
+    cfg = replace(SETTINGS, worlds=3, randomisation=RandomisationCfg(delay=(0.05, 0.1), lag=(0.0, 0.05)))
+    environment = make_environment(late, cfg, states, device="cpu")
+    act = torch.ones(3, environment.num_actions)
+    environment.start_from([0, 1, 2])
+    environment.step(act)
+    environment.step(-act)
+    state = environment.state()
+    first = environment.step(act)[0]["policy"]
+    environment.step(-act)
+    environment.restore(state)
+    torch.testing.assert_close(environment.step(act)[0]["policy"], first, rtol=0, atol=0)
+    environment.start_from([0, 1, 2])
+    again = environment.step(0 * act)[0]["policy"]
+    environment.start_from([0, 1, 2])
+    torch.testing.assert_close(environment.step(0 * act)[0]["policy"], again, rtol=0, atol=0)
+
+
+def test_drawn_delay_is_of_the_arm_alone(task):
+    cfg = replace(SETTINGS, worlds=4, randomisation=RandomisationCfg(delay=(0.05, 0.05)), decimation=2)
+    physics = make_physics(task, cfg, device="cpu")
+    physics.qpos[:] = torch.as_tensor(task.replay.qpos[0])
+    physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)
+    physics.begin(torch.ones(4, dtype=torch.bool))
+    before = physics.qpos.clone()
+    physics.ctrl[:] -= 0.01
+    physics.advance()
+    moved = (physics.qpos - before).abs()[0]
+    assert moved[task.robot.qpos[[0, 2]]].max() < 1e-8  # the finger's reaction moves the other one
+    assert (physics.qpos - before)[0, task.compiled.joint("left").qposadr[0]] < -1e-5
+
+
+def test_other_effects_on_commands_are_refused():
+    class Rounded(DriveEffect):
+        name = "rounded"
+
+        def parameters(self, m):  # noqa: ARG002
+            return (Parameter("step", "m", 0.0, 0.0, 0.1, 0.01),)
+
+        def command(self, m, ctrl, values):  # noqa: ARG002
+            return np.round(ctrl / values[0]) * values[0]
+
+    with pytest.raises(TrainError, match="delays and lags"):
+        task_of(AddedEffect(Rounded("x"), (0.01,)))
