@@ -24,6 +24,7 @@ COMMANDS = {
     "diagnose": "find which physical effect a model lacks, with the evidence, or why none can be named",
     "train": "train a policy to bring about the contact events of a demonstration",
     "evaluate": "count how often a trained policy succeeds, in simulation and in the stand-in world",
+    "play": "show a trained policy at work, live in the browser",
     "export": "write a trained policy as ONNX or TorchScript",
     "add": "add a physical effect to a model, and fit it to a recording",
 }

@@ -80,7 +80,13 @@ def geom_data(compiled: mujoco.MjModel, g: int) -> dict[str, Any]:
 
 
 def mesh_data(compiled: mujoco.MjModel, mesh: int) -> dict[str, Any]:
-    """Return vertices [m] and faces of a mesh, or of its convex hull where it is large."""
+    """Return a mesh as the page has it."""
+    vertices, faces = mesh_arrays(compiled, mesh)
+    return {"vertices": packed(vertices), "faces": packed(faces.ravel())}
+
+
+def mesh_arrays(compiled: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [m] (V, 3) and triangles (F, 3) of a mesh, or of its convex hull where it is large."""
     first, count = compiled.mesh_vertadr[mesh], compiled.mesh_vertnum[mesh]
     vertices = np.array(compiled.mesh_vert[first : first + count])
     first, count = compiled.mesh_faceadr[mesh], compiled.mesh_facenum[mesh]
@@ -90,7 +96,7 @@ def mesh_data(compiled: mujoco.MjModel, mesh: int) -> dict[str, Any]:
 
         hull = trimesh.convex.convex_hull(vertices[:: max(1, len(vertices) // 3000)])
         vertices, faces = np.asarray(hull.vertices), np.asarray(hull.faces)
-    return {"vertices": packed(vertices), "faces": packed(faces.ravel())}
+    return vertices, faces
 
 
 def geometry_data(

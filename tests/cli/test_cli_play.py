@@ -1,0 +1,115 @@
+"""A policy is shown live in a browser."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from live_page import BROWSER, Page, opened
+
+from concent_warp.cli import main
+
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
+
+
+@pytest.fixture(scope="module")
+def served():
+    """Give the address of a policy that is being shown, and end it as a user does."""
+    command = [sys.executable, "-m", "concent_warp", "play", "--pretrained", "--states", "2", "--port", "8765"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        line = next(text for text in process.stdout if "http" in text)
+        yield line.split()[0]
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+        assert process.wait(30) == 0
+        assert re.search(r"\d+ episodes?", rest)
+
+
+@pytest.fixture(scope="module")
+def page(served, tmp_path_factory):
+    with opened(served, tmp_path_factory.mktemp("browser")) as found:
+        found.wait_for("spheres touch")
+        yield found
+
+
+def clock(page: Page) -> float:
+    return float(page.wait_for(r"Stage insert, ([\d.]+) s")[1])
+
+
+def click(page: Page, label: str) -> None:
+    """Click a button, or the checkbox beside a label."""
+    page.run(f"""{{
+        const button = [...document.querySelectorAll("button")].find((b) => b.innerText === "{label}");
+        const text = [...document.querySelectorAll("label")].find((l) => l.innerText === "{label}");
+        (button || document.getElementById(text.htmlFor)).click();
+    }}""")
+
+
+@needs_browser
+def test_robot_and_spheres_are_drawn_and_those_that_touch_are_red(page, tmp_path):
+    import cv2
+
+    page.wait_for(r"[1-9]\d+ of 512 spheres touch")
+    end = time.monotonic() + 30
+    while time.monotonic() < end:
+        page.screenshot(tmp_path / "page.png")
+        image = cv2.imread(str(tmp_path / "page.png"))[:, :650].astype(int)
+        blue, green, red = np.moveaxis(image, -1, 0)
+        touching = (red > 90) & (red > 1.5 * green) & (red > 1.5 * blue)
+        if touching.sum() > 100:
+            break
+    assert touching.sum() > 100
+    # The whole hand is in view, and no single colour is all there is.
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 200
+    assert page.messages == []
+
+
+@needs_browser
+def test_controls_pause_step_and_begin_anew(page):
+    first = clock(page)
+    page.wait_for(rf"Stage insert, (?!{first:.2f} )")
+    click(page, "Running")
+    time.sleep(1)
+    stopped = clock(page)
+    time.sleep(1)
+    assert clock(page) == stopped
+    click(page, "Step")
+    page.wait_for(rf"Stage insert, {stopped + 0.05:.2f} s|success|missed")
+    click(page, "Reset")
+    page.wait_for("Stage insert, 0.00 s")
+    click(page, "Running")
+    page.wait_for(r"Stage insert, 0\.[1-9]")
+    assert page.messages == []
+
+
+@needs_browser
+def test_episodes_are_counted_on_the_page(page):
+    page.wait_for(r"[1-9]\d* episodes?: [1-9]\d* (success|missed)")
+
+
+def test_policy_is_shown_in_the_stand_in_world_for_so_many_episodes(capsys):
+    command = ["play", "--pretrained", "--world", "reality", "--hide", "mass=1.5", "--states", "1", "--episodes", "1"]
+    assert main([*command, "--speed", "4", "--port", "8766"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"http://127.0.0.1:87\d\d shows it", said)
+    assert re.search(r"1 episode: 1 (success|missed)", said)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--hide", "mass=1.5"], "hidden in the stand-in world alone"),
+        (["--states", "0"], "number of states"),
+        (["--states", "1", "--speed", "9"], "speed is not right; expected 0.1 to 4"),
+        (["--states", "1", "--host", "203.0.113.7"], "no page can be served at this address"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(options, sentence, capsys):
+    assert main(["play", "--pretrained", *options]) == 2
+    assert sentence in capsys.readouterr().err
