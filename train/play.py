@@ -75,7 +75,7 @@ class Player:
         environment, task = self.environment, self.environment.task
         position = environment.physics.position[0].cpu().numpy().astype(float)
         quaternion = environment.physics.quaternion[0].cpu().numpy().astype(float)
-        stage = self.stage
+        stage = int(environment.stage[0])
         return Moment(
             position=position,
             quaternion=quaternion,
@@ -84,11 +84,6 @@ class Player:
             pairs=pairs(task, stage, position, quaternion),
             time=self._length * environment.control_step,
         )
-
-    @property
-    def stage(self) -> int:
-        """The stage that the world is in."""
-        return self.environment.task.stage
 
 
 class Touches:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg, TrainError
 from concent_warp.train.environment import Environment
 from concent_warp.train.ppo import CHECKPOINT, OFFENCE, Round, Trainer
 from concent_warp.train.worlds import make_environment
@@ -20,7 +20,9 @@ engines = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 def made(task, states, engine: str) -> Environment:
     torch.manual_seed(0)
-    cfg = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=2, episode=0.4)
+    # Commands that act late are kept for a while, and must be forgotten with the rest of a world.
+    late = RandomisationCfg(delay=(0.01, 0.02))
+    cfg = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=2, episode=0.4, randomisation=late)
     return make_environment(task, cfg, states, device="cpu")
 
 
