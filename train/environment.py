@@ -7,6 +7,7 @@ is a captured graph.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, cast
@@ -152,7 +153,7 @@ class Environment(VecEnv):
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
-        self._offence = torch.zeros(m.nq + m.nv + m.nu, device=device)
+        self._offence = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
         self._offended = torch.zeros((), dtype=torch.bool, device=device)
         self._none = torch.zeros(n, device=device)
 
@@ -222,11 +223,18 @@ class Environment(VecEnv):
         return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
 
     def offending_state(self) -> dict[str, np.ndarray] | None:
-        """Return the state and commands at the start of the step in which a world first diverged, None if none has."""
+        """Return the state at the start of the step in which a world first diverged, None if none has.
+
+        It consists of "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, where objects stand that do not move,
+        "mocap_pos" (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the number of the "world", shape ().
+        """
         if not bool(self._offended):
             return None
         m, values = self.task.compiled, self._offence.cpu().numpy()
-        return {"qpos": values[: m.nq], "qvel": values[m.nq : m.nq + m.nv], "ctrl": values[m.nq + m.nv :]}
+        shapes = {"qpos": (m.nq,), "qvel": (m.nv,), "ctrl": (m.nu,), "mocap_pos": (m.nmocap, 3)}
+        shapes |= {"mocap_quat": (m.nmocap, 4), "world": ()}
+        parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
+        return {name: part.reshape(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return everything that the future depends on besides the random number generators."""
@@ -388,7 +396,8 @@ class Environment(VecEnv):
     def _note_offence(self, diverged: torch.Tensor) -> None:
         """Keep the state before the step of the first world that diverged."""
         world = diverged.to(torch.uint8).argmax()
-        state = torch.cat([values.index_select(0, world[None])[0].float() for values in self._before])
+        parts = [*self._before, *self.physics.mocap, self._worlds]
+        state = torch.cat([values.index_select(0, world[None]).flatten().double() for values in parts])
         first = diverged.any() & ~self._offended
         self._offence.copy_(torch.where(first, state, self._offence))
         self._offended.logical_or_(first)

@@ -71,6 +71,25 @@ def test_what_is_not_finite_stays_in_its_world_and_goes_with_its_episode(task, s
 
 
 @engines
+def test_kept_state_diverges_again(task, states, engine):
+    environment = made(task, states, engine)
+    run(environment, {"qvel": 1e9})
+    offence = environment.offending_state()
+    assert offence is not None
+    assert offence["world"] == WORLD
+    again = made(task, states, engine)
+    again.start_from(list(range(WORLDS)))
+    for name in ("qpos", "qvel", "ctrl"):
+        state = getattr(again.physics, name)
+        state[0] = torch.as_tensor(offence[name]).to(state.dtype)
+    for state, name in zip(again.physics.mocap, ("mocap_pos", "mocap_quat"), strict=True):
+        assert offence[name].shape == state[0].shape
+        state[0] = torch.as_tensor(offence[name]).to(state.dtype)
+    again.step(torch.zeros(WORLDS, again.num_actions))
+    assert again.failure[:, 2].tolist() == [True, *[False] * (WORLDS - 1)]
+
+
+@engines
 def test_policy_is_the_same_whether_a_world_ends_not_finite_or_too_fast(task, states, engine, tmp_path):
     found = []
     for value in (NAN, 1e9):

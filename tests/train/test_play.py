@@ -36,6 +36,17 @@ def test_contact_points_are_at_their_targets_when_the_target_event_is_there(play
     assert together < 0.002 < apart
 
 
+def test_targets_are_those_of_the_stage_that_the_world_is_in(player):
+    environment, task = player.environment, player.environment.task
+    for number, stage in enumerate(task.events.stages):
+        put(environment, stage.event.time)
+        environment.stage[0] = number
+        moment = player.moment()
+        assert moment.stage == stage.name
+        assert len(moment.pairs) == task.table.used[number].sum()
+        assert np.linalg.norm(np.diff(moment.pairs, axis=1), axis=-1).max() < 0.002
+
+
 def test_spheres_that_touch_are_those_in_contact_and_none_in_the_air(player):
     environment, task = player.environment, player.environment.task
     put(environment, task.events.stages[task.stage].event.time)
