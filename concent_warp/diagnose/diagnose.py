@@ -184,7 +184,8 @@ class Procedure:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         group = alike(base, good)
-        better = settled(base, polish_candidate(base, group[0][0], thorough=True), self.settling)
+        polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
+        better = settled(base, polished, self.settling, self.threads)
         # What was accepted stays so: its gain is the evidence, even if a rough cost tells little of the value.
         found = replace(self.finding(base, better, null, step, chosen), accepted=True, reason="")
         findings[findings.index(group[0][1])] = found
@@ -243,10 +244,10 @@ class Procedure:
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
         hoped = np.maximum(hoped, [c.share(base) for c in found])
-        leader = polished_leader(base, found, ROUNDS)
+        leader = polished_leader(base, found, ROUNDS, self.threads)
         self.level(base, found, leader, hoped)
         if np.argmax([c.share(base) for c in found]) != leader:
-            leader = polished_leader(base, found, 1)
+            leader = polished_leader(base, found, 1, self.threads)
         return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
 
     def level(self, base: Node, found: list[Candidate], leader: int, hoped: np.ndarray) -> None:
@@ -321,6 +322,11 @@ class Procedure:
             self.progress(self._done + span * (i + 1) / max(len(tasks), 1), f"{text}, {i + 1} of {len(tasks)}")
         self._done += span
         return results
+
+    @property
+    def threads(self) -> int | None:
+        """Simulations at a time in work that is not in pieces, None for one a CPU."""
+        return self.cfg.jobs if self.cfg.jobs > 0 else None
 
     def settling(self, work: Callable[..., Look], tasks: Sequence[tuple[Any, ...]]) -> list[Look]:
         """Do the looks around a fit, see `settled`."""
@@ -421,11 +427,12 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
     return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks))
 
 
-def polished_leader(base: Node, found: list[Candidate], rounds: int) -> int:
+def polished_leader(base: Node, found: list[Candidate], rounds: int, threads: int | None) -> int:
     """Take up the best fit again as long as that betters it, in place; return which one it is."""
     leader = int(np.argmax([c.share(base) for c in found]))
     for _ in range(rounds):
-        better = polish_candidate(base, found[leader]) if found[leader].ratio > SETTLED else found[leader]
+        rough = found[leader].ratio > SETTLED
+        better = polish_candidate(base, found[leader], threads=threads) if rough else found[leader]
         if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
             break
         found[leader] = better

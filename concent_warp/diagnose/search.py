@@ -20,6 +20,8 @@ from concent_warp.fit.robust import HUBER, huber, huber_limit, huber_weight, tru
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
+BETTER = 0.01
+"""Share of the cost by which other initial states have to better a fit to be worth another one."""
 FAR = 1.0
 """Errors of initial states, in units of their spread, that count as far from what was measured."""
 
@@ -215,11 +217,9 @@ def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> 
     return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
 
 
-def polish_candidate(
-    base: Node, candidate: Candidate, cfg: FitCfg | None = None, *, thorough: bool = False
-) -> Candidate:
+def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False, threads: int | None = 1) -> Candidate:
     """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
-    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1), cfg)
+    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=threads))
     found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough))
     return found if found.fit.cost < candidate.fit.cost else candidate
 
@@ -233,6 +233,8 @@ def restarted_candidate(base: Node, candidate: Candidate, leader: Fit) -> Candid
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1))
     some = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
     fresh = min(some, solver.led(candidate.fit, leader), key=lambda f: f.cost)
+    if fresh.cost > (1 - BETTER) * candidate.fit.cost:
+        return candidate
     found = judged(base, candidate.effect, solver, solver.fit(fresh.values, fresh.offsets, fresh.starts))
     return found if found.fit.cost < candidate.fit.cost else candidate
 

@@ -112,35 +112,44 @@ class Pull(Law):
             body = m.geom_bodyid[g]
             pose = d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3)
             parts.append((*pose, points, radius, reach, d.xipos[body], d.xfrc_applied[body]))
-        still = [
-            (d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3), None if m.geom_type[g] == GEOM.mjGEOM_PLANE else half)
-            for g, half in ((int(g), m.geom_size[g].copy()) for g in self.still)
+        flat = [int(g) for g in self.still if m.geom_type[g] == GEOM.mjGEOM_PLANE]
+        boxes = [
+            (d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3), m.geom_size[g].copy())
+            for g in self.still
+            if m.geom_type[g] != GEOM.mjGEOM_PLANE
         ]
+        planes: list[tuple[np.ndarray, float, float, float, float]] = []
 
         def act() -> None:
             if not d.time:
                 return
+            if len(planes) < len(flat):  # poses of what stands still are known from the first step on
+                for g in flat:
+                    normal = d.geom_xmat[g].reshape(3, 3)[:, 2].copy()
+                    planes.append((normal, float(d.geom_xpos[g] @ normal), *(-strength * normal).tolist()))
             for centre, turn, points, radius, reach, middle, applied in parts:
-                for origin, axes, half in still:
+                for normal, level, fx, fy, fz in planes:
+                    height = float(centre @ normal) - level
+                    if height > reach:
+                        continue
+                    near = points @ (normal @ turn) < self.gap + radius - height
+                    count = np.count_nonzero(near)
+                    if count:
+                        # All pull alike, so that their forces act as one at the sum of their arms.
+                        x, y, z = (turn @ (near @ points) + count * (centre - radius * normal - middle)).tolist()
+                        n = float(count)
+                        applied += (n * fx, n * fy, n * fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
+                for origin, axes, half in boxes:
                     away = (centre - origin) @ axes
-                    if half is None:
-                        if away[2] > reach:
-                            continue
-                        local = points @ (turn.T @ axes) + away
-                        height, normal = local[:, 2], axes[:, 2]
-                        near = np.flatnonzero(height - radius < self.gap)
-                        normals = [normal] * len(near)
-                    else:
-                        if (np.abs(away) > half + reach).any():
-                            continue
-                        local = points @ (turn.T @ axes) + away
-                        beyond = np.abs(local) - half
-                        face = beyond.argmax(axis=1)
-                        row = np.arange(len(local))
-                        over = (beyond > 0).sum(axis=1) <= 1
-                        near = np.flatnonzero(over & (beyond[row, face] - radius < self.gap))
-                        normals = [np.sign(local[i, face[i]]) * axes[:, face[i]] for i in near]
-                    for i, normal in zip(near, normals, strict=True):
+                    if (np.abs(away) > half + reach).any():
+                        continue
+                    local = points @ (turn.T @ axes) + away
+                    beyond = np.abs(local) - half
+                    face = beyond.argmax(axis=1)
+                    row = np.arange(len(local))
+                    over = (beyond > 0).sum(axis=1) <= 1
+                    for i in np.flatnonzero(over & (beyond[row, face] - radius < self.gap)):
+                        normal = np.sign(local[i, face[i]]) * axes[:, face[i]]
                         x, y, z = centre + turn @ points[i] - radius * normal - middle
                         fx, fy, fz = -strength * normal
                         applied += (fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)

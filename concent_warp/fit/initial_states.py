@@ -7,11 +7,12 @@ help on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.fit.fading import Known, is_long, residuals_near
 from concent_warp.fit.prediction import Prediction, Trial
 from concent_warp.fit.robust import far, huber, huber_limit, huber_weight, trust
 
@@ -35,6 +36,8 @@ RESTARTS = 4
 """How often such a window is begun anew from a drawn initial state."""
 FALL = 3e-3
 """A window's initial state is found once a step lowers its cost by less than this share."""
+PROSPECT = 3.0
+"""How many times the last fall of a cost the falls to come may add up to."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class StartSearch:
         """Prepare to look for those of `prediction`."""
         self.p = prediction
         self.probe = [np.full(len(w.spread), PROBE_FIRST) for w in prediction.windows]
+        self.fading = [np.full(len(w.spread), is_long(prediction, i)) for i, w in enumerate(prediction.windows)]
+        """Components of each window's initial state whose errors have faded so far."""
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
         """Return one trial a window."""
@@ -72,14 +77,16 @@ class StartSearch:
             residuals: Residuals of all windows there.
             windows: Which ones to look at.
         """
-        trials, moved = [], []
+        trials, moved, hoped = [], [], []
         for w in windows:
             moved.append(offsets[w] + np.diag(self.probe[w]))
             trials += [Trial(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
-        found, at = self.p.residuals(trials), 0
-        looks = []
+            hoped += self.fading[w].tolist()
+        found, faded = residuals_near(self.p, self.known(values, offsets, residuals, windows), trials, hoped)
+        looks, at = [], 0
         for w, offset in zip(windows, moved, strict=True):
             seen = found[at : at + len(offset)]
+            self.fading[w] &= faded[at : at + len(offset)]
             at += len(offset)
             columns = np.stack([(r - residuals[w]) / h for r, h in zip(seen, self.probe[w], strict=True)], axis=1)
             wild = np.abs(columns).max(axis=0) * self.probe[w] > 0.5 * np.abs(residuals[w]).max() + 1e2
@@ -87,13 +94,33 @@ class StartSearch:
             looks.append(_Look(columns, offset, seen))
         return looks
 
+    def known(
+        self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
+    ) -> dict[int, Known]:
+        """Return the simulations of some windows that others are close to."""
+        return {w: Known(Trial(w, values, offsets[w] * self.p.windows[w].spread), residuals[w]) for w in windows}
+
     def refined(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray], windows: Sequence[int], rounds: int
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        windows: Sequence[int],
+        rounds: int,
+        rival: Mapping[int, float] | None = None,
     ) -> tuple[list[np.ndarray], dict[int, np.ndarray], list[np.ndarray]]:
-        """Fit the initial states of some windows; returns all states, the dependence of those, and all residuals."""
+        """Fit the initial states of some windows; returns all states, the dependence of those, and all residuals.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states of all windows, in units of their spread.
+            windows: Whose initial states are fitted.
+            rounds: How often the dependence on the initial states is computed at most.
+            rival: Costs that windows are to get below, or else are of no use; they are given up where the falls of
+                their costs do not promise it.
+        """
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
-        self._settle(values, offsets, residuals, starts, windows, rounds, rng)
+        self._settle(values, offsets, residuals, starts, windows, rounds, rng, rival or {})
         for _ in range(RESTARTS if rounds == ROUNDS else 0):
             size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
             odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))]
@@ -103,7 +130,7 @@ class StartSearch:
             for w in odd:
                 begin[w] = rng.normal(size=len(offsets[w]))
             there = self.p.residuals(self.trials(values, begin))
-            self._settle(values, begin, there, found, odd, rounds, rng)
+            self._settle(values, begin, there, found, odd, rounds, rng, {})
             limit = huber_limit(residuals)
             for w in odd:
                 if start_cost(there[w], begin[w], limit) < start_cost(residuals[w], offsets[w], limit):
@@ -119,6 +146,7 @@ class StartSearch:
         windows: Sequence[int],
         rounds: int,
         rng: np.random.Generator,
+        rival: Mapping[int, float],
     ) -> None:
         """Take the initial states of some windows to where no step helps any more; writes into what it is given."""
         unsettled, aim = list(windows), [0] * len(offsets)
@@ -126,14 +154,16 @@ class StartSearch:
         for _ in range(rounds):
             looks = self.look_around(values, offsets, residuals, unsettled)
             limit = huber_limit(residuals)
-            tried, rows = [], []
+            tried, rows, hoped = [], [], []
             for w, look in zip(unsettled, looks, strict=True):
                 there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
                 if np.mean(residuals[w] ** 2) > odd**2:
                     there += around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
                 tried.append(there)
                 rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
-            found, moving, at = self.p.residuals(rows), [], 0
+                hoped += [bool(self.fading[w].all())] * len(there)
+            known = self.known(values, offsets, residuals, unsettled)
+            (found, _), moving, at = residuals_near(self.p, known, rows, hoped), [], 0
             for k, (w, look) in enumerate(zip(unsettled, looks, strict=True)):
                 starts[w] = look.columns
                 there = [*tried[k], *look.offsets]
@@ -146,7 +176,8 @@ class StartSearch:
                     offsets[w], residuals[w] = there[best], seen[best]
                 if costs[best] > (1 - FALL) * cost:
                     aim[w] += 1 if np.mean(residuals[w] ** 2) > odd**2 else len(SEEN)
-                if aim[w] < len(SEEN):
+                short = min(costs[best], cost) - rival.get(w, np.inf)
+                if aim[w] < len(SEEN) and short <= PROSPECT * max(cost - costs[best], 0.0):
                     moving.append(w)
                     change = np.sqrt(np.mean(look.columns**2, axis=0))
                     self.probe[w] = np.clip(SEEN[aim[w]] / np.maximum(change, 1e-12), *PROBE)

@@ -126,20 +126,28 @@ class Solver:
 
         Initial states that have made up for a wrong parameter do not always find back on their own, and hold it there:
         so the parameters are then led on by steps after each of which the initial states are fitted anew; if
-        `thorough`, also where all but the noise is explained, for the sake of their values.
+        `thorough`, also where all but the noise is explained, for the sake of their values: there from the initial
+        states that go with the step alone, which make up for nothing any more.
         """
         measured = [np.zeros_like(o) for o in fit.offsets]
         fresh = self.better_starts(fit, [measured])
-        best = self.fit(fresh.values, fresh.offsets, fresh.starts)
+        # Where none was better, steps that failed with initial states fitted anew would fail again.
+        refits = None if fresh.cost < (1 - WORTH) * fit.cost else 0
+        best = self.fit(fresh.values, fresh.offsets, fresh.starts, refits=refits)
         noise, worth = (0.0, NEXT_TO_NOTHING) if thorough else (NOISE, WORTH)
         for _ in range(LEAPS if len(fit.values) else 0):
-            if np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2) < noise**2:
+            size = np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2)
+            if size < noise**2:
                 break
             move, _ = self.solve(best.linear, best.starts, best.offsets, best.values, self.cfg.damping)
             found = best
-            for size in LEAP:
-                values = self.inside(best.values + size * move * self.scale)
-                there = self.better_starts(replace(best, values=values), [measured], noise)
+            for leap in LEAP:
+                values = self.inside(best.values + leap * move * self.scale)
+                if size < NOISE**2:
+                    led = tuple(self.follow(best, leap * move))
+                    there = self.better_starts(replace(best, values=values, offsets=led), [])
+                else:
+                    there = self.better_starts(replace(best, values=values), [measured], noise)
                 found = min(found, there, key=lambda f: f.cost)
             if found.cost > (1 - worth) * best.cost:
                 break
@@ -159,7 +167,8 @@ class Solver:
         limit = huber_limit(residuals)
         unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > noise**2]
         for begin in others if unsettled else ():
-            there, found, left = self.search.refined(fit.values, begin, unsettled, ROUNDS)
+            rival = {w: start_cost(residuals[w], offsets[w], limit) for w in unsettled}
+            there, found, left = self.search.refined(fit.values, begin, unsettled, ROUNDS, rival)
             for w in unsettled:
                 if start_cost(left[w], there[w], limit) < start_cost(residuals[w], offsets[w], limit):
                     offsets[w], starts[w], residuals[w] = there[w], found[w], left[w]
@@ -256,6 +265,7 @@ class Solver:
         offsets: Sequence[np.ndarray] | None = None,
         starts: tuple[np.ndarray, ...] | None = None,
         progress: Callable[[float], None] | None = None,
+        refits: int | None = None,
     ) -> Fit:
         """Fit from a start.
 
@@ -264,6 +274,7 @@ class Solver:
             offsets: Errors of the initial states in units of their spread.
             starts: See `Fit.starts`; computed where not given.
             progress: Called with the share done, 0..1.
+            refits: See `FitCfg.refits`; by default as there.
         """
         values = self.inside(self.p.start if values is None else values)
         offsets = [np.zeros(len(w.spread)) for w in self.p.windows] if offsets is None else list(offsets)
@@ -273,7 +284,8 @@ class Solver:
             linear = self.linearise(values, offsets)
             cost = self.cost([piece.residual for piece in linear], offsets, values)
             return Fit(values, tuple(offsets), cost, linear, starts, True, self.p.simulated)
-        damping, refits, converged = self.cfg.damping, self.cfg.refits, False
+        damping, converged = self.cfg.damping, False
+        refits = self.cfg.refits if refits is None else refits
         linear = self.linearise(values, offsets)
         cost = self.cost([piece.residual for piece in linear], offsets, values)
         for iteration in range(self.cfg.iterations):

@@ -25,6 +25,8 @@ LOST = 1e3
 """Residual, in units of noise, of what is not predicted because the simulation has diverged."""
 BEYOND = 0.05
 """How far predictions are continued in a straight line before and after a window [s]."""
+MEMORY = 2**25
+"""Size of the simulations that are kept in case they are asked for again [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,20 @@ class Trial:
     """Shape (P,)."""
     offset: np.ndarray | None = None
     """Difference of the initial state, positions then velocities, shape (2 nv,); None for none."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a simulation went through."""
+
+    reader: Reader
+    """What the model's instruments read; times count from the window's start."""
+    qpos: np.ndarray
+    """Shape (K + 1, nq)."""
+    qvel: np.ndarray
+    """Shape (K + 1, nv)."""
+    size: int
+    """Of what the instruments read [bytes]."""
 
 
 class Prediction:
@@ -85,6 +101,7 @@ class Prediction:
         for e, part in zip(self.effects, self.split, strict=True):
             pure = e.measures and not e.edits and not e.commands and type(e).write is Effect.write
             self.measured_only[part] = pure
+        self._kept: dict[tuple[int, bytes, bytes], tuple[Reader, int]] = {}
         self.simulated = 0
         """Simulated time so far [s]."""
 
@@ -117,27 +134,44 @@ class Prediction:
     def readers(self, trials: Sequence[Trial]) -> list[Reader]:
         """Simulate, and return what the model's instruments read in each trial; times count from the window's start.
 
-        Effects of measurement are applied on top, by `observed`.
+        Effects of measurement are applied on top, by `observed`. What was simulated lately is not simulated again.
         """
-        readers: list[Reader | None] = [None] * len(trials)
+        keys = [self._key(trial) for trial in trials]
+        new = {key: i for i, key in enumerate(keys) if key not in self._kept}
+        fresh = dict(zip(new, self.courses([trials[i] for i in new.values()]), strict=True))
+        found = [fresh[key].reader if key in fresh else self._kept[key][0] for key in keys]
+        self._kept |= {key: (course.reader, course.size) for key, course in fresh.items()}
+        size = sum(size for _, size in self._kept.values())
+        while size > MEMORY:
+            size -= self._kept.pop(next(iter(self._kept)))[1]
+        return found
+
+    def _key(self, trial: Trial) -> tuple[int, bytes, bytes]:
+        """Return what a simulation depends on."""
+        offset = b"" if trial.offset is None else trial.offset.tobytes()
+        return trial.window, trial.values[~self.measured_only].tobytes(), offset
+
+    def courses(self, trials: Sequence[Trial], time: float | None = None) -> list[Course]:
+        """Simulate trials, each to the end of its window or for some time [s] only."""
+        courses: list[Course | None] = [None] * len(trials)
         groups: dict[tuple[tuple[float, ...], int], list[int]] = {}
         for i, trial in enumerate(trials):
             key = tuple(float(v) for e in self._edits for v in trial.values[self.split[e]])
-            groups.setdefault((key, self._steps(trial.window)), []).append(i)
+            groups.setdefault((key, self._steps(trial.window, time)), []).append(i)
         for (_, steps), members in groups.items():
             engine, bare = self._engine(trials[members[0]].values)
-            for found, i in zip(
-                self._simulate(engine, bare, [trials[i] for i in members], steps), members, strict=True
-            ):
-                readers[i] = found
-        return [r for r in readers if r is not None]
+            simulated = self._simulate(engine, bare, [trials[i] for i in members], steps)
+            for i, course in zip(members, simulated, strict=True):
+                courses[i] = course
+        return [c for c in courses if c is not None]
 
-    def _steps(self, window: int) -> int:
-        """Return how many steps cover a window."""
+    def _steps(self, window: int, time: float | None) -> int:
+        """Return how many steps cover a window, or its first part of some time [s]."""
         w = self.windows[window]
-        return max(int(np.ceil((w.end - w.start) / self._base.scene.model.opt.timestep - 1e-9)), 1)
+        span = w.end - w.start if time is None else min(time, w.end - w.start)
+        return max(int(np.ceil(span / self._base.scene.model.opt.timestep - 1e-9)), 1)
 
-    def _simulate(self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[Trial], steps: int) -> list[Reader]:
+    def _simulate(self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[Trial], steps: int) -> list[Course]:
         """Simulate trials of equal length in one engine."""
         m, n = engine.compiled, len(trials)
         values = np.array([t.values for t in trials])
@@ -161,7 +195,11 @@ class Prediction:
         variants = Variants(n, qpos=qpos, qvel=qvel, fields=fields, laws=laws)
         rollout = engine.run(variants, ctrl, bodies=[]).numpy()
         self.simulated += n * steps * m.opt.timestep
-        return [SensorReader(m, rollout.time, rollout.sensordata[i]) for i in range(n)]
+        courses = []
+        for qpos, qvel, read in zip(rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
+            own = read.copy()  # not a part of the array of all, which would live as long
+            courses.append(Course(SensorReader(m, rollout.time, own), qpos, qvel, own.nbytes))
+        return courses
 
     def _commands(self, m: mujoco.MjModel, w: Window, steps: int) -> np.ndarray:
         """Return the commands of a window and of the time before it that effects reach back to, shape (H + K, nu)."""

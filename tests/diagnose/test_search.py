@@ -1,9 +1,21 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from concent_warp.diagnose.blocks import cut_blocks
-from concent_warp.diagnose.search import chance, extended, fit_candidate, node, polish_candidate, screen
+from concent_warp.diagnose.search import (
+    chance,
+    extended,
+    fit_candidate,
+    node,
+    polish_candidate,
+    restarted_candidate,
+    screen,
+)
 from concent_warp.effects.registry import effect_class
+from concent_warp.fit.least_squares import Solver
+from concent_warp.fit.prediction import Prediction
 from tests.fit.swinging import DAMPING, drawing, swung, windows_of
 
 NAMES = ("joint_damping", "joint_friction", "armature")
@@ -49,6 +61,22 @@ def test_a_fit_of_the_missing_effect_leaves_noise_alone_and_gains_in_every_fold(
     assert all(gain[lacking.blocks.fold == f].sum() > 0 for f in range(5))
     assert polish_candidate(lacking, found).fit.cost <= found.fit.cost
     assert extended(lacking, found).ratio == pytest.approx(found.ratio)
+
+
+def test_a_fit_that_others_initial_states_do_not_better_is_left_as_it_is(lacking):
+    right, wrong = (fit_candidate(lacking, screen(lacking, effect(name))) for name in ("joint_damping", "armature"))
+    assert restarted_candidate(lacking, right, wrong.fit) is right
+
+
+def test_a_fit_with_wrong_initial_states_finds_back_from_the_leaders(lacking):
+    right = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    solver = Solver(Prediction(lacking.model, (right.effect,), lacking.windows))
+    astray = tuple(o + 3.0 for o in right.fit.offsets)
+    linear = solver.linearise(right.fit.values, astray)
+    cost = solver.cost([piece.residual for piece in linear], astray, right.fit.values)
+    assert cost > 1.1 * right.fit.cost
+    stuck = replace(right, fit=replace(right.fit, offsets=astray, cost=cost, linear=linear))
+    assert restarted_candidate(lacking, stuck, right.fit).fit.cost < 1.01 * right.fit.cost
 
 
 def test_an_effect_that_is_not_missing_gains_no_more_than_chance(complete):

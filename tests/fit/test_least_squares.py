@@ -55,6 +55,16 @@ def test_initial_states_alone_are_fitted_at_fixed_parameters():
     assert [a.shape for a in starts] == [(w.count, 2) for w in solver.p.windows]
 
 
+def test_initial_states_that_cannot_get_below_a_rival_are_given_up():
+    solver = solver_for(swung(told=0.006))
+    zero, simulated = [np.zeros(2)], []
+    for rival in (None, {0: -1e9}):
+        before = solver.p.simulated
+        solver.search.refined(np.zeros(0), zero, [0], 6, rival)
+        simulated.append(solver.p.simulated - before)
+    assert simulated[1] < simulated[0]
+
+
 def test_outliers_hardly_move_the_estimate():
     recording = swung()
     channel = recording.demonstrations[0].measured["angle"]

@@ -56,6 +56,34 @@ def test_effects_of_the_model_come_first_and_take_part(recording, windows):
     ]
 
 
+def test_what_was_simulated_lately_is_not_simulated_again(recording, windows):
+    prediction = damped(recording, windows)
+    first = prediction.residuals([Trial(0, np.array([DAMPING])), Trial(1, np.array([DAMPING]))])
+    once = prediction.simulated
+    again = prediction.residuals([Trial(1, np.array([DAMPING])), Trial(0, np.array([DAMPING]))])
+    assert prediction.simulated == once
+    for mine, other in zip(again, first[::-1], strict=True):
+        np.testing.assert_array_equal(mine, other)
+    prediction.residuals([Trial(0, np.array([DAMPING]), np.array([0.0, 1e-9]))])
+    assert prediction.simulated > once
+
+
+def test_one_simulation_serves_all_values_of_an_effect_of_measurement(recording, windows):
+    prediction = Prediction(drawing(recording), (effect_class("latency")("angle"),), windows[:1])
+    first, later = (prediction.residuals([Trial(0, np.array([delay]))])[0] for delay in (0.0, 0.01))
+    assert prediction.simulated == pytest.approx(windows[0].end - windows[0].start, abs=0.01)
+    assert np.std(later - first) > 1
+
+
+def test_no_more_simulations_are_kept_than_memory_allows(recording, windows, monkeypatch):
+    monkeypatch.setattr("concent_warp.fit.prediction.MEMORY", 5000)
+    prediction = damped(recording, windows[:1])
+    for _ in range(2):
+        before = prediction.simulated
+        prediction.residuals([Trial(0, np.array([value])) for value in np.linspace(0.0, 0.1, 20)])
+        assert prediction.simulated - before > 15 * (windows[0].end - windows[0].start)
+
+
 def test_an_offset_moves_the_start_of_the_simulation(recording, windows):
     prediction = damped(recording, windows[:1])
     at_rest, moved = prediction.readers([Trial(0, prediction.start), Trial(0, prediction.start, np.array([0.02, 0.5]))])
