@@ -6,6 +6,7 @@ import contextlib
 import io
 import random
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -207,7 +208,12 @@ class Trainer:
         if self.folder is None or not self.ranks.first:
             yield ignore
             return
-        from torch.utils.tensorboard.writer import SummaryWriter
+        try:
+            from torch.utils.tensorboard.writer import SummaryWriter
+        except ImportError:
+            warnings.warn("no curves are written for TensorBoard, which is not installed here", stacklevel=2)
+            yield ignore
+            return
 
         with SummaryWriter(str(self.folder), purge_step=self.steps + 1, flush_secs=10) as writer:
 

@@ -1,0 +1,136 @@
+"""What the trainings that are compared are made from: models and demonstrations, one of each for every case and seed.
+
+    python benchmarks/train_cases.py --out runs/table1 --processes 8    # 4-6 minutes of a core for each fit
+
+A seed is a demonstration of its own, recorded in the stand-in world, and everything that follows from it. In some cases
+a physical effect is hidden in that world. What is made already is not made again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from joblib import Parallel, delayed
+
+from concent_warp.cli.terminal import quiet_warp
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.effects import fit_effects
+from concent_warp.fit.geometry import FitCfg, fit_geometry
+from concent_warp.model import Model
+from concent_warp.reality.hidden_in_task import TaskWorld, wanted
+from concent_warp.reality.record import RealityCfg, record
+from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.load import load_recording
+from concent_warp.recording.recording import Recording
+from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.scene import Scene
+
+HIDDEN = "gravity_compensation=-0.4"
+"""What is hidden in the stand-in world of some cases: the drives hold up 40 % less of the arm's weight."""
+MODEL, DEMONSTRATION = "model.toml", "demonstration.h5"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table."""
+
+    title: str
+    geometry: Literal["fitted", "surface", "inset"] = "fitted"
+    """Contact geometry: fitted to the demonstration from the inset one, or as laid on the surface or within it."""
+    reward: Literal["contact", "engineered"] = "contact"
+    world: Literal["plain", "hidden"] = "plain"
+    """Whether an effect is hidden where the demonstration is recorded and the policy is tried."""
+    added: bool = False
+    """Whether the model has the effect, fitted to the demonstration, before its geometry is fitted."""
+
+    def material(self, seed: int) -> str:
+        """Return the name of the folder of model and demonstration."""
+        return "_".join([self.geometry, *(["hidden"] * (self.world == "hidden")), *(["added"] * self.added), str(seed)])
+
+
+CASES = {
+    "ours": Case("ours"),
+    "surface": Case("without contact geometry optimisation", "surface"),
+    "inset": Case("without optimisation, spheres inset", "inset"),
+    "engineered": Case("without contact-event reward", reward="engineered"),
+    "unconstrained": Case("unconstrained", "surface", "engineered"),
+    "unaware": Case("ours, an effect hidden", world="hidden"),
+    "aware": Case("ours, the hidden effect added", world="hidden", added=True),
+}
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    out: Path
+    """Folder; models and demonstrations go to its folder models."""
+    cases: tuple[str, ...] = tuple(CASES)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    processes: int = 1
+    hidden: str = HIDDEN
+    """Effect that is hidden, with its magnitude."""
+    spheres: int = 512
+    fit: FitCfg = field(default_factory=FitCfg)
+
+
+def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
+    """Return a demonstration of the stand-in world, with these effects hidden in it."""
+    cfg = RealityCfg()
+    effects = ()
+    if hidden:
+        world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, wanted(hidden))
+        effects = tuple(one.effect for one in world.hidden())
+    return record(cfg, [1000 * seed], effects=effects)[0]
+
+
+def make(case: Case, seed: int, args: Args) -> None:
+    """Make model and demonstration of a case, in one piece or not at all."""
+    folder = args.out / "models" / case.material(seed)
+    if folder.exists():
+        return
+    quiet_warp()
+    recording = demonstrate(seed, (args.hidden,) if case.world == "hidden" else ())
+    scene = Scene(recording.scene)
+    placement = "surface" if case.geometry == "surface" else "inset"
+    model = Model(scene, ContactGeometryCfg(count=args.spheres, placement=placement, seed=seed).build(scene))
+    if case.added:
+        kind = effect_class(args.hidden.split("=")[0])
+        for names in kind.targets(model.compile()):
+            model = model.add(kind(*names))
+        model = fit_effects(model, recording).model
+        print(
+            f"{folder.name}: {[(a.effect.name, a.effect.target, a.values, a.intervals) for a in model.effects]}",
+            flush=True,
+        )
+    if case.geometry == "fitted":
+        model = fit_geometry(model, recording, replace(args.fit, seed=seed), engine="mujoco").model
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    model.save(partial / MODEL)
+    slim = replace(recording[0], image={})
+    write_hdf5(replace(recording, demonstrations=(slim,)), partial / DEMONSTRATION)
+    partial.rename(folder)
+    print(f"made {folder.name}", flush=True)
+
+
+def material(out: Path, case: Case, seed: int) -> tuple[Model, Recording]:
+    """Return model and demonstration of a case."""
+    folder = out / "models" / case.material(seed)
+    return Model.load(folder / MODEL), load_recording(folder / DEMONSTRATION)
+
+
+def main() -> None:
+    """Make all that is asked for."""
+    args = tyro.cli(Args, description=__doc__)
+    wanted_ = {CASES[name].material(seed): (CASES[name], seed) for name in args.cases for seed in args.seeds}
+    Parallel(n_jobs=args.processes)(delayed(make)(case, seed, args) for case, seed in wanted_.values())
+
+
+if __name__ == "__main__":
+    main()
