@@ -20,6 +20,7 @@ from statistics import median
 from typing import Literal
 
 import tyro
+from concent_warp.train.curve import read_curve
 from measurements import Measurements, Row
 from pages import machine, machine_line, read_data, table, write_data, write_page
 
@@ -73,20 +74,11 @@ def trained(args: Args, given: list[str], folder: Path, gpus: int, worlds: int, 
     command += [part for option in args.options for part in option.split()]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     subprocess.run(command, env=environment, check=True)
-    curve = read_curve(folder)
+    curve = [(point["steps"], point["seconds"], point["success"]) for point in read_curve(folder)]
     late = curve[len(curve) // 2 :]
     first, last = late[0], late[-1]
     rate = (last[0] - first[0]) / (last[1] - first[1]) if len(late) > 1 else curve[-1][0] / curve[-1][1]
     return {"gpus": gpus, "worlds": worlds, "seed": seed, "steps_per_second": rate, "curve": curve}
-
-
-def read_curve(folder: Path) -> list[tuple[int, float, float]]:
-    """Return steps, seconds and success of each round, as TensorBoard has them."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
-    return [(int(row.step), float(row.wall_time), float(row.value)) for row in events.Scalars("success")]
 
 
 def measure(args: Args, out: Path) -> None:

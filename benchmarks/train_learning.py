@@ -27,13 +27,14 @@ from typing import Any, Literal
 
 import tyro
 from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.curve import CURVE
 from concent_warp.train.run import Run, train
 from pages import machine
 from train_cases import CASES, Case, material
 
 from concent_warp.model import write_text
 
-CURVE, RESULT, POLICY, LOG = "curve.jsonl", "result.json", "policy", "log.txt"
+RESULT, POLICY, LOG = "result.json", "policy", "log.txt"
 PACKED = 14 * 2**20
 """Largest packed file [byte]."""
 
@@ -84,13 +85,9 @@ def train_one(args: Args, name: str, seed: int) -> None:
     model, recording = material(args.out, case, seed)
     run = with_stage(Run.new(model, recording, settings(args, case, seed)), args.stage)
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoint, curve = folder / CHECKPOINT, folder / CURVE
+    checkpoint = folder / CHECKPOINT
 
     def note(this: Round) -> None:
-        row = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds}
-        row |= {"wall": time.monotonic() - begun, "collecting": this.collecting, "updating": this.updating, **this.log}
-        with curve.open("a") as file:
-            file.write(json.dumps(row) + "\n")
         if this.iteration % 10 == 1:
             print(f"{folder.name}: {this.seconds:.0f} s, {this.log['success']:.1%}", flush=True)
 

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from concent_warp.train.curve import read_curve
 from pages import FOLDER, machine_line, read_data, table, write_data, write_page
 from train_cases import CASES
-from train_learning import CURVE, RESULT
+from train_learning import RESULT
 
 NAME = "train_learning"
 KEPT = ("steps", "seconds", "success", "chain success", "return")
@@ -35,8 +36,7 @@ def taken(folder: Path, stage: str) -> dict[str, Any]:
     """Return the trainings of a folder."""
     found = {}
     for path in sorted((folder / "runs").glob(f"*_{stage}_*/{RESULT}")):
-        rows = {row["iteration"]: row for row in map(json.loads, (path.parent / CURVE).read_text().splitlines())}
-        ordered = [rows[k] for k in sorted(rows)]
+        ordered = read_curve(path.parent)
         step = max(1, len(ordered) // POINTS)
         thinned = [*ordered[:-1:step], ordered[-1]]
         result = json.loads(path.read_text())

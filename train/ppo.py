@@ -6,7 +6,6 @@ import contextlib
 import io
 import random
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.curve import curve
 from concent_warp.train.distribution import SquashedGaussian
 from concent_warp.train.ranks import Ranks
 from rsl_rl.algorithms import PPO
@@ -77,7 +77,7 @@ class Trainer:
         Args:
             environment: What to train in.
             cfg: Settings; of its environment part nothing is read.
-            folder: Run folder for checkpoints and TensorBoard; None keeps everything in memory.
+            folder: Run folder for checkpoints and curves; None keeps everything in memory.
             ranks: The processes that train together, joined already; this one alone by default.
         """
         self.environment, self.cfg, self.folder = environment, cfg, folder
@@ -204,26 +204,19 @@ class Trainer:
 
     @contextlib.contextmanager
     def _writer(self) -> Iterator[Report]:
-        """Give what writes a round to TensorBoard."""
+        """Give what writes a round to the run folder."""
         if self.folder is None or not self.ranks.first:
             yield ignore
             return
-        try:
-            from torch.utils.tensorboard.writer import SummaryWriter
-        except ImportError:
-            warnings.warn("no curves are written for TensorBoard, which is not installed here", stacklevel=2)
-            yield ignore
-            return
+        with curve(self.folder, self.steps) as write:
 
-        with SummaryWriter(str(self.folder), purge_step=self.steps + 1, flush_secs=10) as writer:
+            def write_round(this: Round) -> None:
+                spent = {"collecting": this.collecting, "updating": this.updating}
+                rate = self.steps_of_round / sum(spent.values())
+                point = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds}
+                write({**point, **this.log, **spent, "steps_per_second": rate})
 
-            def write(this: Round) -> None:
-                for name, value in this.log.items():
-                    writer.add_scalar(name.replace(" ", "_"), value, this.steps, this.seconds)
-                rate = self.steps_of_round / (this.collecting + this.updating)
-                writer.add_scalar("steps_per_second", rate, this.steps, this.seconds)
-
-            yield write
+            yield write_round
 
     def save(self) -> None:
         """Write a checkpoint, in one piece or not at all, with the worlds and generators of all processes."""
