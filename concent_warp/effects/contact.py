@@ -101,7 +101,8 @@ class SlidingFriction(FrictionEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """One coefficient."""
-        return (Parameter("coefficient", "-", self.null(m), 0.0, 3.0, 0.15),)
+        null = self.null(m)
+        return (Parameter("coefficient", "-", null, 0.0, 3.0, 0.15, scan=(0.7 * null, 1.4 * null)),)
 
 
 class TorsionalFriction(FrictionEffect):

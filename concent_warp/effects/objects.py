@@ -33,7 +33,7 @@ class Mass(BodyEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One factor."""
-        return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3),)
+        return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3, scan=(0.7, 1.4)),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Mass and inertia."""
