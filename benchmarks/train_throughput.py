@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 import tyro
 from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
@@ -91,7 +92,8 @@ class Args:
     @property
     def counts(self) -> tuple[int, ...]:
         """Numbers of worlds."""
-        return self.worlds or (COUNTS if self.cuda else (8,))
+        # From few to many: what is kept of a smaller environment is then no part of the memory of a larger one.
+        return tuple(sorted(self.worlds)) or (COUNTS if self.cuda else (8,))
 
 
 @dataclass(frozen=True)
@@ -102,25 +104,41 @@ class Alternative:
     """Changed settings of the environment."""
     options: dict[str, Any] = field(default_factory=dict)
     """Changed options of the simulator."""
+    threads: int | None = None
+    """Changed threads of a world's virtual collisions."""
+    touching: bool = False
+    """Of the robot, leave in the physics what takes part in a contact event alone, as of the objects."""
 
 
+TIGHT = {"nconmax": 64, "njmax": 256}
+QUICK = {**TIGHT, "solver_iterations": 6, "jacobian": "sparse"}
 ALTERNATIVES = {
     "as it is": Alternative(),
-    "10 iterations": Alternative({"solver_iterations": 10}),
-    "10 iterations, 20 of the line search": Alternative({"solver_iterations": 10, "ls_iterations": 20}),
-    "5 iterations, 10 of the line search": Alternative({"solver_iterations": 5, "ls_iterations": 10}),
-    "64 contacts, 256 rows": Alternative({"nconmax": 64, "njmax": 256}),
-    "64 contacts, 256 rows, 10 iterations": Alternative({"nconmax": 64, "njmax": 256, "solver_iterations": 10}),
+    "sparse": Alternative({"jacobian": "sparse"}),
+    "6 iterations": Alternative({"solver_iterations": 6}),
+    "64 contacts, 256 rows": Alternative(TIGHT),
+    "sparse, 6 iterations, 64 contacts, 256 rows": Alternative(QUICK),
+    "the same, touching links alone": Alternative(QUICK, touching=True),
+    "the same, touching links alone, fused, 32 threads": Alternative(
+        {**QUICK, "fuse": True}, threads=32, touching=True
+    ),
+    "6 iterations, 64 contacts, 256 rows": Alternative({**TIGHT, "solver_iterations": 6}),
+    "6 iterations, 20 of the line search": Alternative({"solver_iterations": 6, "ls_iterations": 20}),
+    "4 iterations": Alternative({"solver_iterations": 4}),
+    "32 threads": Alternative(threads=32),
+    "64 threads": Alternative(threads=64),
+    "fused": Alternative({"fuse": True}),
+    "touching links alone": Alternative(touching=True),
     "pyramidal cones": Alternative(options={"cone": 0, "impratio": 1.0}),
     "5 steps of 10 ms": Alternative({"decimation": 5}, {"timestep": 0.01}),
-    "fused": Alternative({"fuse": True}),
     "torch outside of graphs": Alternative({"capture": "physics"}),
 }
-PPO_ALTERNATIVES: dict[str, dict[str, Any]] = {
-    "as it is": {},
-    "products in float32": {"tf32": False},
-    "2 batches": {"batches": 2},
-    "16 steps": {"steps": 16},
+PPO_ALTERNATIVES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "as it is": ({}, {}),
+    "sparse, 6 iterations, 64 contacts, 256 rows": (QUICK, {}),
+    "the same, fused": ({**QUICK, "fuse": True}, {}),
+    "products in float32": ({}, {"tf32": False}),
+    "2 batches": ({}, {"batches": 2}),
 }
 
 
@@ -138,6 +156,8 @@ class Bench:
     args: Args
     run: Run
     tasks: dict[str, tuple[Task, InitialStates]] = field(default_factory=dict)
+    base: int | None = None
+    """Memory in use before anything large is made [byte]."""
     room: tuple[int, int] | None = None
     """Contacts and rows a world that were found to fit all spheres so far."""
 
@@ -150,10 +170,22 @@ class Bench:
             self.tasks[collision] = task, states
         return self.tasks[collision]
 
+    def base_memory(self) -> int:
+        """Return the memory that is in use after a small environment, for modules and the like [byte]."""
+        if self.base is None:
+            task, states = self.task("vcp")
+            small = make_environment(task, replace(self.args.cfg, worlds=16), states, device=self.args.device)
+            with torch.inference_mode():
+                environment_rounds(small, random_actions(small), 2, 1)
+            del small
+            release()
+            self.base = memory_used(self.args.device)
+        return self.base
+
     def rate(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
         """Return rates, profile, contacts dropped and memory of an environment."""
         args = self.args
-        before = memory_used(args.device)
+        before = self.base_memory()
         environment = make_environment(task, cfg, states, device=args.device)
         actions = random_actions(environment)
         with torch.inference_mode():
@@ -250,14 +282,22 @@ def random_actions(environment: Environment) -> torch.Tensor:
     return 0.5 * torch.randn(16, environment.num_envs, environment.num_actions, device=environment.device)
 
 
-def altered(task: Task, options: dict[str, Any]) -> Task:
-    """Return a task with other options of the simulator."""
-    if not options:
-        return task
+def altered(task: Task, other: Alternative) -> Task:
+    """Return a task with other options of the simulator, or with less of the robot in it."""
     compiled = copy.copy(task.compiled)
-    for name, value in options.items():
+    for name, value in other.options.items():
         setattr(compiled.opt, name, value)
+    if other.touching:
+        touching = {compiled.body(entity.body).id for entity in task.events.entities}
+        idle = ~np.isin(compiled.geom_bodyid, sorted({0, *task.objects, *touching}))
+        compiled.geom_contype[idle] = compiled.geom_conaffinity[idle] = 0
     return replace(task, compiled=compiled)
+
+
+def settings(cfg: EnvironmentCfg, other: Alternative) -> EnvironmentCfg:
+    """Return the settings of an alternative."""
+    threads = cfg.virtual.threads if other.threads is None else other.threads
+    return replace(cfg, **other.environment, virtual=replace(cfg.virtual, threads=threads))
 
 
 def attempt(kept: Measurements, key: str, expected: float, measure: Callable[[], Row], device: str) -> None:
@@ -309,10 +349,10 @@ def measure_one(bench: Bench, kept: Measurements, what: What, cfg: EnvironmentCf
         one(name, 30, lambda: bench.ppo(cfg, task, states, PpoCfg()))
     else:
         for title, other in ALTERNATIVES.items():
-            rate = partial(bench.rate, replace(cfg, **other.environment), altered(task, other.options), states)
-            one(f"{name}: {title}", 30, rate)
-        for title, changed in PPO_ALTERNATIVES.items():
-            one(f"{name}, PPO: {title}", 30, partial(bench.ppo, cfg, task, states, replace(PpoCfg(), **changed)))
+            one(f"{name}: {title}", 30, partial(bench.rate, settings(cfg, other), altered(task, other), states))
+        for title, (environment, ppo) in PPO_ALTERNATIVES.items():
+            changed = replace(cfg, **environment), task, states, replace(PpoCfg(), **ppo)
+            one(f"{name}, PPO: {title}", 30, partial(bench.ppo, *changed))
 
 
 if __name__ == "__main__":

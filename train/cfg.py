@@ -128,6 +128,8 @@ class CollisionCfg:
     physics leaves out."""
     band: float = 0.01
     """Penalty of a sphere in touch, falling to 0 at the margin."""
+    threads: int = 128
+    """Threads of a GPU that share a world's spheres."""
 
 
 @dataclass(frozen=True)
@@ -230,6 +232,8 @@ class EnvironmentCfg:
     """Most iterations of the solver in a simulation step; by default the model's."""
     ls_iterations: int | None = None
     """Most iterations of its line search; by default the model's."""
+    jacobian: Literal["auto", "dense", "sparse"] = "auto"
+    """How the solver keeps the constraints' derivatives: the same results, at other speeds; "auto" as MuJoCo does."""
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)

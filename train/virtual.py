@@ -66,6 +66,7 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
         depth_weight=cfg.depth,
         band_weight=cfg.band,
         severe_penalty=0.0,
+        threads=cfg.threads,
     )
 
 

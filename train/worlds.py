@@ -18,6 +18,10 @@ ROOM = 2.0
 """Contacts and constraint rows to make room for, relative to the most of the demonstration."""
 SPARE = 16
 """Contacts beyond that."""
+JACOBIANS = {
+    "dense": mujoco.mjtJacobian.mjJAC_DENSE,
+    "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
+}
 
 
 def make_environment(
@@ -32,7 +36,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = preferred_device() if device is None else device
-    m = solver_limited(task.compiled, cfg)
+    m = solver_chosen(task.compiled, cfg)
     on_cpu = not device.startswith("cuda")
     plain = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
     if plain:
@@ -59,9 +63,10 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     )
 
 
-def solver_limited(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
-    """Return a model with the iterations that the settings allow its solver."""
+def solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
+    """Return a model with the solver that the settings ask for."""
     limited = copy.copy(m)
+    limited.opt.jacobian = m.opt.jacobian if cfg.jacobian == "auto" else JACOBIANS[cfg.jacobian]
     limited.opt.iterations = m.opt.iterations if cfg.solver_iterations is None else cfg.solver_iterations
     limited.opt.ls_iterations = m.opt.ls_iterations if cfg.ls_iterations is None else cfg.ls_iterations
     return limited
