@@ -218,6 +218,8 @@ class EnvironmentCfg:
     """Length of an episode [s]; by default 3 s, where stages are chained 12 s."""
     dropped: float = 0.02
     """Distance of a contact pair with the robot at which a held object counts as lost [m]."""
+    lost: float = 1.0
+    """Distance between objects 1 and 2 at which an episode ends, for one of them has been knocked away [m]."""
     success: float = 0.003
     """Largest deviation, per axis, of object 1 from its demonstrated place in object 2 that counts as success [m]."""
     capture: Literal["none", "physics", "step"] = "step"

@@ -117,7 +117,7 @@ class Environment(VecEnv):
         keeps = np.array([task.keeps(s) for s in stages])
         self._watched = torch.as_tensor(task.held & keeps[:, None], device=self.device)
         self._place = None if task.place is None else real(task.place)
-        self._success, self._dropped = cfg.success, cfg.dropped
+        self._success, self._dropped, self._lost = cfg.success, cfg.dropped, cfg.lost
         self._rest = max(1, round(cfg.chain.rest / self.control_step))
         self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
         pool = self._states
@@ -318,11 +318,12 @@ class Environment(VecEnv):
         """Reward the step, let worlds move on, end episodes, and start new ones in their worlds."""
         p, cfg, stage = self.physics, self._settings.reward, self.stage.long()
         sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
-        sane &= p.ctrl.isfinite().all(
-            dim=1
-        )  # the simulators put a command of their own in the place of one that is not
+        # The simulators put a command of their own in the place of one that is not finite.
+        sane &= p.ctrl.isfinite().all(dim=1)
         diverged = ~sane
         dropped = ((self._distance > self._dropped) & self._watched[stage]).any(dim=1) & sane
+        if len(self._objects) > 1:
+            dropped |= (torch.linalg.vector_norm(self.place(), dim=1) > self._lost) & sane
         severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
         failed = diverged | dropped | severe
         self.failure.copy_(torch.stack([dropped, severe & ~dropped, diverged], dim=1))

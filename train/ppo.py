@@ -16,6 +16,7 @@ import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.curve import curve
 from concent_warp.train.distribution import SquashedGaussian
+from concent_warp.train.normalisation import BoundedNormalization
 from concent_warp.train.ranks import Ranks
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
@@ -143,6 +144,7 @@ class Trainer:
                 ppo.process_env_step(observations, rewards, dones, extras)
             ppo.compute_returns(observations)
         log = environment.read_log(self.ranks.total)
+        self._keep_offence(log)
         collected = time.monotonic()
         losses = self._update()
         end = time.monotonic()
@@ -154,7 +156,6 @@ class Trainer:
         log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
         this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, log)
         self.history.append(this)
-        self._keep_offence(this)
         return this, observations
 
     @property
@@ -192,9 +193,9 @@ class Trainer:
         values = torch.tensor([float(value) for value in losses.values()], device=self.device)
         return dict(zip(losses, (self.ranks.total(values) / self.ranks.count).tolist(), strict=True))
 
-    def _keep_offence(self, this: Round) -> None:
-        """Save the first state from which a world diverged."""
-        if self._offended or not this.log.get("diverged worlds"):
+    def _keep_offence(self, log: dict[str, float]) -> None:
+        """Save the first state from which a world diverged, where the log of a round tells of one."""
+        if self._offended or not log.get("diverged worlds"):
             return
         states = [state for state in self.ranks.gathered(self.environment.offending_state()) if state is not None]
         self._offended = bool(states)
@@ -301,12 +302,16 @@ def make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
         },
     }
     with contextlib.redirect_stdout(io.StringIO()):  # it prints the networks
-        return PPO.construct_algorithm(
+        algorithm = PPO.construct_algorithm(
             environment.get_observations(),
             environment,  # pyright: ignore[reportArgumentType]
             settings,
             str(environment.device),
         )
+    if cfg.normalise:
+        for model in (algorithm.actor, algorithm.critic):
+            model.obs_normalizer = BoundedNormalization(model.obs_dim).to(environment.device)
+    return algorithm
 
 
 def network(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
