@@ -99,14 +99,13 @@ def make(case: Case, seed: int, args: Args) -> None:
     placement = "surface" if case.geometry == "surface" else "inset"
     model = Model(scene, ContactGeometryCfg(count=args.spheres, placement=placement, seed=seed).build(scene))
     if case.added:
-        kind = effect_class(args.hidden.split("=")[0])
-        for names in kind.targets(model.compile()):
-            model = model.add(kind(*names))
-        model = fit_effects(model, recording).model
-        print(
-            f"{folder.name}: {[(a.effect.name, a.effect.target, a.values, a.intervals) for a in model.effects]}",
-            flush=True,
-        )
+        # What acts on the arm shows as well with the shapes as drawn, which are much quicker than spheres.
+        drawn, kind = Model(scene), effect_class(args.hidden.split("=")[0])
+        for names in kind.targets(drawn.compile()):
+            drawn = drawn.add(kind(*names))
+        model = replace(model, effects=fit_effects(drawn, recording).model.effects)
+        for added in model.effects:
+            print(f"{folder.name}: {added.effect.name} {added.values} {added.intervals}", flush=True)
     if case.geometry == "fitted":
         model = fit_geometry(model, recording, replace(args.fit, seed=seed), engine="mujoco").model
     partial = folder.with_name(f".{folder.name}.partial")
