@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
 from concent_warp.train.cfg import TrainCfg, TrainError
+from concent_warp.train.normalisation import bound_observations
 from concent_warp.train.observation import Layout
 from concent_warp.train.ppo import load_checkpoint, network
 from concent_warp.train.run import Run
@@ -64,6 +65,7 @@ def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: dict[
     settings = network(cfg.ppo, actor=True)
     del settings["class_name"]
     actor = MLPModel(example, {"actor": ["policy"]}, "actor", actions, **settings)
+    bound_observations(actor)
     try:
         actor.load_state_dict(weights)
     except RuntimeError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 
 LARGEST = 10.0
@@ -23,3 +24,10 @@ class BoundedNormalization(EmpiricalNormalization):
         super().update(x)
         # Of what never changes, rounding may leave a variance below 0, whose root is not a number.
         self._std = torch.sqrt(self.get_buffer("_var").clamp_(min=0.0))
+
+
+def bound_observations(model: MLPModel) -> None:
+    """Have a network normalise its observations within bounds, if it normalises them."""
+    if model.obs_normalization:
+        where = next(model.parameters()).device
+        model.obs_normalizer = BoundedNormalization(model.obs_dim).to(where)

@@ -16,7 +16,7 @@ import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.curve import curve
 from concent_warp.train.distribution import SquashedGaussian
-from concent_warp.train.normalisation import BoundedNormalization
+from concent_warp.train.normalisation import bound_observations
 from concent_warp.train.ranks import Ranks
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
@@ -308,9 +308,8 @@ def make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
             settings,
             str(environment.device),
         )
-    if cfg.normalise:
-        for model in (algorithm.actor, algorithm.critic):
-            model.obs_normalizer = BoundedNormalization(model.obs_dim).to(environment.device)
+    for model in (algorithm.actor, algorithm.critic):
+        bound_observations(model)
     return algorithm
 
 

@@ -11,17 +11,23 @@ from concent_warp.train.cfg import CollisionCfg
 from concent_warp.train.physics import Physics
 from concent_warp.train.task import Task
 
+from concent_warp.scene.sampling import farthest_point_sampling
 from concent_warp.scene.surface import Surface
 
 if TYPE_CHECKING:
     import trimesh
 
+CANDIDATES = 20_000
+"""Surface points to choose from."""
+
 
 def virtual_collision(task: Task, physics: Physics, stage: object, cfg: CollisionCfg) -> VirtualCollision | None:
     """Return the penalty of a task's left-out spheres, None where there are none.
 
-    Each object's left-out spheres keep clear of the surfaces of all other objects and of the robot's links. The margin
-    band does not count between an object and what the stage's target event has it touch.
+    Each object's left-out spheres keep clear of the surfaces of all other objects and of the robot's links. Points of
+    its own surface keep out of the other objects: spheres round off edges, and what slides over such an edge in the
+    simulation would catch on a sharp one. The margin band does not count between an object and what the stage's target
+    event has it touch.
 
     Args:
         task: The task.
@@ -31,11 +37,14 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     """
     geometry, m = task.model.geometry, task.compiled
     assert geometry is not None
-    sets = []
+    sets, points = [], []
+    stages = task.table.used.shape[0]
     for body in geometry.bodies:
+        surface = Surface.of_body(task.model.scene, body)
+        if cfg.points:
+            points.append(SphereSet(m.body(body).id, surface_points(surface, cfg), np.zeros(cfg.points)))
         left = geometry.of(body)[~task.collidable[geometry.of(body)]]
         if len(left):
-            surface = Surface.of_body(task.model.scene, body)
             covered = within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
             sets.append(SphereSet(m.body(body).id, *covered))
     links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
@@ -47,17 +56,17 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
         mesh = body_mesh(scene, body, visual=body in task.objects)
         if mesh is not None:
             targets.append(TargetMesh(body, *mesh))
-    stages = task.table.used.shape[0]
+    reaches = {0: range(len(targets)), 1: [j for j, b in enumerate(targets) if b.body in task.objects]}
     pairs = [
-        VirtualPair(i, j, cfg.margin, cfg.severe, tuple(gate(task, s, a.body, b.body) for s in range(stages)))
-        for i, a in enumerate(sets)
-        for j, b in enumerate(targets)
-        if a.body != b.body
+        VirtualPair(i, j, cfg.margin, cfg.severe, tuple(gate(task, s, a.body, targets[j].body) for s in range(stages)))
+        for i, a in enumerate([*sets, *points])
+        for j in reaches[i >= len(sets)]
+        if a.body != targets[j].body
     ]
     if not pairs:
         return None
     return VirtualCollision(
-        sets,
+        [*sets, *points],
         targets,
         pairs,
         *physics.poses(),
@@ -80,6 +89,13 @@ def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: floa
     deep = np.clip(-distance, 0.0, radius)
     inward = np.maximum(distance + np.maximum(deep, slack), 0.0)
     return centre - inward[:, None] * outward, np.maximum(deep - slack, 0.0)
+
+
+def surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
+    """Return points spread over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
+    found, outward = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
+    chosen = farthest_point_sampling(found, cfg.points)
+    return found[chosen] - cfg.slack * outward[chosen]
 
 
 def gate(task: Task, stage: int, a: int, b: int) -> float:

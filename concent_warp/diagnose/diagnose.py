@@ -18,7 +18,7 @@ from concent_warp.diagnose.blocks import bootstrap_interval, cut_blocks, sign_fl
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verdict
-from concent_warp.diagnose.evidence import alike, detectable_size, distances, fitted_parameters, removed
+from concent_warp.diagnose.evidence import alike, detectable_size, fitted_parameters, removed
 from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.flexible import unknown_force
 from concent_warp.diagnose.noise import UNDERESTIMATE
@@ -248,7 +248,6 @@ class Procedure:
         self.level(base, found, leader, hoped)
         if np.argmax([c.share(base) for c in found]) != leader:
             leader = polished_leader(base, found, 1, self.threads)
-        self.doubted(base, found)
         return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
 
     def level(self, base: Node, found: list[Candidate], leader: int, hoped: np.ndarray) -> None:
@@ -262,16 +261,6 @@ class Procedure:
         tasks = [(base, found[k], best.fit) for k in close]
         again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
         for k, c in zip(close, again, strict=True):
-            found[k] = c
-
-    def doubted(self, base: Node, found: list[Candidate]) -> None:
-        """Take up the fits of candidates that are a little behind: too far to be called alike, but not by much.
-
-        The best was taken up again more often than they, and a rough cost gives way a little each time.
-        """
-        near = [k for k, d in enumerate(distances(found)) if 1.0 < d < DOUBTED]
-        again = self.parallel(polish_candidate, [(base, found[k]) for k in near], "polishing rivals", 0.0)
-        for k, c in zip(near, again, strict=True):
             found[k] = c
 
     def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
@@ -410,8 +399,6 @@ NEAR = 0.7
 """Share of the best gain from which on a candidate is worth a second fit, where none has left but noise."""
 CLOSE = 0.85
 """Share of the best gain from which on a candidate may be its equal."""
-DOUBTED = 2.0
-"""How far behind the best a candidate may be to be fitted once more, see `distances`."""
 SETTLED = 1.03
 """Residual over noise at which a fit needs no second one."""
 QUIET = 0.25

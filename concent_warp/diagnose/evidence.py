@@ -54,20 +54,14 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[C
     They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it. Among
     them those come first that leave less, need fewer parameters and smaller values of them, see `plausibility`.
     """
-    behind = distances([c for c, _ in good])
-    group = [pair for pair, d in zip(good, behind, strict=True) if d <= 1.0]
-    return sorted(group, key=lambda pair: -plausibility(base, *pair))
-
-
-def distances(candidates: Sequence[Candidate]) -> list[float]:
-    """Return how far each candidate is behind the one that leaves least, see `alike`; up to 1 they are alike."""
-    best = min(candidates, key=lambda c: c.errors.sum())
-    found = []
-    for c in candidates:
-        difference = c.errors - best.errors
+    best = max(good, key=lambda pair: pair[1].gain)
+    group = []
+    for c, f in good:
+        difference = c.errors - best[0].errors
         error = np.sqrt(len(difference)) * difference.std()
-        found.append(float(difference.sum() / max(2 * error, SAME * best.errors.sum(), 1e-12)))
-    return found
+        if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
+            group.append((c, f))
+    return sorted(group, key=lambda pair: -plausibility(base, *pair))
 
 
 def plausibility(base: Node, c: Candidate, f: Finding) -> float:

@@ -1,8 +1,14 @@
-"""Spheres left out of the physics count no farther than the surface of their object."""
+"""Spheres left out of the physics count no farther than the surface of their object, points of it up to its edges."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from concent_warp.train.virtual import within
+import torch
+from concent_warp.train.cfg import CollisionCfg
+from concent_warp.train.virtual import surface_points, within
+from concent_warp.train.worlds import make_environment
+from small_insertion import SETTINGS
 
 from concent_warp.scene.solid import Box
 from concent_warp.scene.surface import Surface
@@ -27,3 +33,31 @@ def test_spheres_that_stand_out_end_the_slack_below_the_surface(out):
     aside = [[1, 2], [0, 2]]
     for row in range(2):
         np.testing.assert_array_equal(moved[row, aside[row]], centre[row, aside[row]])
+
+
+def test_points_lie_just_below_the_surface_and_reach_into_the_corners():
+    cfg = CollisionCfg(points=300, slack=SLACK)
+    points = surface_points(CUBE, cfg)
+    assert points.shape == (300, 3)
+    depth = -CUBE.signed_distance(points)
+    assert depth.min() > -1e-6
+    assert depth.max() < SLACK + 1e-6
+    assert np.median(depth) == pytest.approx(SLACK, abs=1e-6)
+    corners = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    assert np.linalg.norm(points[None] - corners[:, None], axis=2).min(axis=1).max() < 0.003
+
+
+def test_points_tell_of_an_object_that_stands_in_another_where_its_spheres_do_not(task, states):
+    def penalty(points: int) -> torch.Tensor:
+        cfg = replace(SETTINGS, virtual=replace(SETTINGS.virtual, points=points))
+        environment = make_environment(task, cfg, states, device="cpu")
+        environment.start_from(list(range(environment.num_envs)))
+        free = task.compiled.jnt_qposadr[task.compiled.body_jntadr[task.objects[0]]]
+        environment.physics.qpos[:, free] += 0.003
+        environment.refresh()
+        environment._measured.launch()
+        return environment._penalty.clone()
+
+    plain, pointed = penalty(0), penalty(300)
+    assert (pointed <= plain + 1e-6).all()
+    assert (pointed < plain - 0.01).any()
