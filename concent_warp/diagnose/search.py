@@ -87,6 +87,8 @@ class Candidate:
     spread: np.ndarray | None = None
     """Standard deviations of the parameters in units of their scale, shape (P,), where more than the linear ones are
     known, see `concent_warp.diagnose.settle`."""
+    polished: bool = False
+    """Whether it has been taken up again in vain: once more would do the same."""
 
     def gain(self, base: Node) -> np.ndarray:
         """Return by how much the held-out error of each block falls against a node, shape (B,)."""
@@ -219,9 +221,11 @@ def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> 
 
 def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False, threads: int | None = 1) -> Candidate:
     """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
+    if candidate.polished and not thorough:
+        return candidate
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=threads))
     found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough))
-    return found if found.fit.cost < candidate.fit.cost else candidate
+    return found if found.fit.cost < candidate.fit.cost else replace(candidate, polished=True)
 
 
 def restarted_candidate(base: Node, candidate: Candidate, leader: Fit) -> Candidate:

@@ -63,6 +63,17 @@ def test_a_fit_of_the_missing_effect_leaves_noise_alone_and_gains_in_every_fold(
     assert extended(lacking, found).ratio == pytest.approx(found.ratio)
 
 
+def test_a_fit_that_was_taken_up_again_in_vain_is_left_as_it_is(lacking):
+    found = fit_candidate(lacking, screen(lacking, effect("joint_friction")))
+    for _ in range(20):
+        if found.polished:
+            break
+        found = polish_candidate(lacking, found)
+    assert found.polished
+    assert polish_candidate(lacking, found) is found
+    assert polish_candidate(lacking, found, thorough=True) is not found
+
+
 def test_a_fit_that_others_initial_states_do_not_better_is_left_as_it_is(lacking):
     right, wrong = (fit_candidate(lacking, screen(lacking, effect(name))) for name in ("joint_damping", "armature"))
     assert restarted_candidate(lacking, right, wrong.fit) is right
