@@ -42,6 +42,11 @@ its graphs included, beyond one of 16 worlds.
 """
 
 
+def memory(r: Row) -> str:
+    """Return the memory of a measurement in words; a dash where it was not measured apart from others."""
+    return f"{r['memory_gib']:.2f}" if "memory_gib" in r else "-"
+
+
 def at(row: Row, name: str) -> float:
     """Return environment steps per second of a median time."""
     return 1e3 * row["worlds"] / median(row[name])
@@ -66,7 +71,7 @@ def throughput(rows: list[Row]) -> list[str]:
         lines.append([
             name, *(f"{rate:,.0f}" for rate in rates), f"{share(r):.1%}", f"{r['contacts']:.0f}", f"{r['rows']:.0f}",
             f"{r['solver_iterations']['mean']:.1f}", f"{r['solver_iterations']['most']:.0f}", f"{r['overflow']:.2%}",
-            f"{r['memory_gib']:.1f}",
+            memory(r),
         ])  # fmt: skip
         total = median(r["environment_ms"])
         profiles.append([name, f"{total:.2f}", *(f"{value:.2f}" for value in r["profile_ms"].values())])
@@ -142,7 +147,7 @@ def cells(r: Row, name: str) -> list[str]:
     return [
         f"{r['worlds']:,}", f"{r['spheres']} ({name})", f"{at(r, 'environment_ms'):,.0f}",
         f"{r['nconmax']} / {r['njmax']}", f"{r['contacts']:.0f}", f"{r['overflow']:.2%}",
-        f"{r['diverged']:.0f} of {r['episodes']:.0f}", f"{r['memory_gib']:.2f}",
+        f"{r['diverged']:.0f} of {r['episodes']:.0f}", memory(r),
     ]  # fmt: skip
 
 
