@@ -206,6 +206,8 @@ class RandomisationCfg:
     """Factor on the damping of the joints."""
     mass: Range = (1.0, 1.0)
     """Factor on mass and inertia of the objects."""
+    joint_friction: Range = (0.0, 0.0)
+    """Dry friction of the joint with the strongest drive [N m or N]; less in the others, as their drives are weaker."""
     delay: Range = (0.0, 0.0)
     """Delay of the arm's commands [s]."""
     lag: Range = (0.0, 0.0)

@@ -55,6 +55,13 @@ def drawn_fields(
         scaled("actuator_biasprm", factor, column=1)
     if cfg.damping != ONE:
         scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
+    if cfg.joint_friction != NONE:
+        actuator, dof = task.robot.actuator, task.robot.dof
+        strongest = np.where(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator, 1], np.inf)
+        share = np.ones(len(dof)) if np.isinf(strongest).any() else strongest / strongest.max()
+        loss = found.get("dof_frictionloss", np.tile(m.dof_frictionloss, (worlds, 1))).copy()
+        loss[:, dof] += rng.uniform(*cfg.joint_friction, (worlds, 1)) * share
+        found["dof_frictionloss"] = loss
     if cfg.mass != ONE:
         factor, bodies = rng.uniform(*cfg.mass, worlds), np.array(task.objects)
         scaled("body_mass", factor, rows=bodies)

@@ -213,6 +213,23 @@ def test_randomised_fields_differ_between_worlds_and_are_used(task):
     assert len(torch.unique(moved)) == 4
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_drawn_joint_friction_holds_the_arm(task, engine):
+    cfg = replace(SETTINGS.randomisation, joint_friction=(50.0, 60.0))
+    moved = []
+    for randomisation in (SETTINGS.randomisation, cfg):
+        settings = replace(SETTINGS, worlds=2, engine=engine, randomisation=randomisation)
+        physics = make_physics(task, settings, device="cpu")
+        physics.qpos[:] = torch.as_tensor(task.replay.qpos[0]).to(physics.qpos.dtype)
+        physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)
+        before = physics.qpos.clone()
+        physics.ctrl[:, 0] += 0.015  # 45 N at first, less than the friction
+        physics.advance()
+        moved.append(float((physics.qpos - before)[0, task.robot.qpos[0]]))
+    assert moved[0] > 1e-3
+    assert abs(moved[1]) < 0.2 * moved[0]
+
+
 def test_collidable_spheres_are_those_of_the_events(task):
     spheres = [g for g in range(task.compiled.ngeom) if task.compiled.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE]
     touched = {e.name for e in task.events.entities if e.sphere is not None}
