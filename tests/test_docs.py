@@ -48,8 +48,9 @@ def blocks(page: Path, *languages: str) -> list[str]:
 
 
 def commands() -> list[str]:
-    """Return every line of the pages that calls the command."""
-    lines = [line.strip() for page in PAGES for text in blocks(page, "console") for line in text.splitlines()]
+    """Return every line of the pages that calls the command, with what a backslash carries over to the next line."""
+    texts = [text.replace("\\\n", " ") for page in PAGES for text in blocks(page, "console")]
+    lines = [line.strip() for text in texts for line in text.splitlines()]
     lines += [code for page in PAGES for code in re.findall(r"`(concent [^`]+)`", page.read_text())]
     return sorted({line for line in lines if line.startswith("concent ")})
 
