@@ -101,12 +101,19 @@ class RewardCfg:
     """Penalty of the squared action."""
     velocity: float = 0.001
     """Penalty of the squared arm joint velocity [s^2/rad^2]."""
+    press: float = 0.0
+    """Penalty of the squared lead of a joint's command over the joint, relative to the largest allowed: of force and
+    haste."""
     disturb_position: float = 2.0
     """Penalty of moving an object between steps [1/m]: in the hand where the stage holds it, else in the world."""
     disturb_rotation: float = 0.2
     """The same for turning it [1/rad]."""
     failure: float = 5.0
     """Fixed penalty of an episode that ends in failure."""
+    lenience: float = 1.0
+    """Share of the penalties of virtual collisions and failure that counts while no episode succeeds; it rises to 1
+    with the square of the share of those that do. Large penalties that count from the start keep a policy away from its
+    target."""
     scale: float = 0.05
     """Factor on all of it, so that values are of order 1, which the value function learns sooner; divided by the number
     of stages that are chained."""

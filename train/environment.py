@@ -27,7 +27,7 @@ from concent_warp.train.virtual import virtual_collision
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-TERMS = ("reach", "stages", "action", "velocity", "disturb", "vcp", "failure")
+TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
 """Terms of the reward, in the order of `Environment.terms`."""
 SPEED = 1e4
 """Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
@@ -156,6 +156,7 @@ class Environment(VecEnv):
         self._offence = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
         self._offended = torch.zeros((), dtype=torch.bool, device=device)
         self._none = torch.zeros(n, device=device)
+        self._skill = torch.zeros((), device=device)
 
     def reset(self) -> None:
         """Start an episode in every world, at random places of the episode, so that they do not end all at once."""
@@ -163,8 +164,8 @@ class Environment(VecEnv):
             self._start(torch.ones_like(self.done))
             self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
             self._return.zero_()
-            self._sums.zero_()
-            self._offended.zero_()
+            for value in (self._sums, self._skill, self._offended):
+                value.zero_()
             self.refresh()
 
     def start_from(self, rows: Sequence[int]) -> None:
@@ -259,7 +260,8 @@ class Environment(VecEnv):
         parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
         parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
         parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
-        return parts | {"most": self._most, "near": self._near, "resting": self._resting} | p.memory
+        parts |= {"most": self._most, "near": self._near, "resting": self._resting, "skill": self._skill}
+        return parts | p.memory
 
     def parts(self) -> tuple[Callable[[], None], ...]:
         """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
@@ -331,13 +333,15 @@ class Environment(VecEnv):
             self.success.copy_((self._worst < self._success) & sane)
         else:
             self.success.copy_(((self.place() - self._place).abs() < self._success).all(dim=1))
-        action, velocity = effort(cfg, self.action, p.qvel[:, self._arm_dof].float())
+        lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
+        arm = effort(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
         disturb = disturbance(cfg, self._pose_before, self._object_poses())
         weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
-        weighted += [cfg.regularisation * t for t in (action, velocity, disturb)]
-        weighted += [cfg.vcp * self._penalty, self._none]
+        weighted += [cfg.regularisation * t for t in (*arm, disturb)]
+        strictness = cfg.lenience + (1 - cfg.lenience) * self._skill.square()
+        weighted += [cfg.vcp * strictness * self._penalty, self._none]
         terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
-        terms[:, -1] = -cfg.failure * failed
+        terms[:, -1] = -cfg.failure * strictness * failed
         self.terms.copy_(terms)
         self.reward.copy_(cfg.scale / len(self.task.chained) * terms.sum(dim=1))
 
@@ -384,6 +388,10 @@ class Environment(VecEnv):
         """Add a step to the sums of the log."""
         p, ended = self.physics, self.done.double()
         succeeded, chains = self.success & self.time_out, self.done & self._begun
+        # Of as many episodes as there are worlds, those before count by 1 / e.
+        keep = torch.exp(-ended.sum() / self.num_envs)
+        share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
+        self._skill.copy_(torch.lerp(share, self._skill.double(), keep))
         counts = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
         sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
         sums += [count.double().sum() for count in counts]

@@ -7,9 +7,19 @@ from concent_warp.train.cfg import EngineeredCfg, RewardCfg
 from concent_warp.train.rotation import angle, inverse, multiply, rotate
 
 
-def effort(cfg: RewardCfg, action: torch.Tensor, velocity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the penalties of actions (N, A) and arm joint velocities (N, J) [rad/s], each 0 or less, shape (N,)."""
-    return -cfg.action * action.square().sum(dim=1), -cfg.velocity * velocity.square().sum(dim=1)
+def effort(
+    cfg: RewardCfg, action: torch.Tensor, velocity: torch.Tensor, lead: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    """Return the penalties of what the arm does, each 0 or less, shape (N,).
+
+    Args:
+        cfg: Their weights.
+        action: Shape (N, A).
+        velocity: Of the arm's joints [rad/s], shape (N, J).
+        lead: Of the commands over the joints, relative to the largest allowed, shape (N, J).
+    """
+    terms = ((cfg.action, action), (cfg.velocity, velocity), (cfg.press, lead))
+    return tuple(-weight * values.square().sum(dim=1) for weight, values in terms)
 
 
 def relative_pose(

@@ -11,6 +11,7 @@ from concent_warp.train.cfg import CollisionCfg
 from concent_warp.train.physics import Physics
 from concent_warp.train.task import Task
 
+from concent_warp.scene.inset import inset
 from concent_warp.scene.sampling import farthest_point_sampling
 from concent_warp.scene.surface import Surface
 
@@ -93,9 +94,8 @@ def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: floa
 
 def surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
     """Return points spread over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
-    found, outward = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
-    chosen = farthest_point_sampling(found, cfg.points)
-    return found[chosen] - cfg.slack * outward[chosen]
+    found, _ = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
+    return inset(surface, found[farthest_point_sampling(found, cfg.points)], cfg.slack)[0]
 
 
 def gate(task: Task, stage: int, a: int, b: int) -> float:

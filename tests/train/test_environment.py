@@ -124,6 +124,42 @@ def test_success_is_block_in_its_demonstrated_place(environment, task):
     assert environment.success[::2].float().mean() > environment.success[1::2].float().mean()
 
 
+def test_leads_are_penalised_relative_to_the_largest(task, states):
+    cfg = replace(SETTINGS, worlds=4, reward=replace(SETTINGS.reward, press=0.3))
+    environment = make_environment(task, cfg, states, device="cpu")
+    start(environment)
+    environment.step(torch.full((4, environment.num_actions), 0.7))
+    p, robot = environment.physics, task.robot
+    ahead = (p.ctrl[:, robot.actuator] - p.qpos[:, robot.qpos]) / torch.as_tensor(robot.lead)
+    assert ahead.abs().max() > 0.03
+    np.testing.assert_allclose(environment.terms[:, TERMS.index("press")], -0.3 * ahead.square().sum(dim=1), rtol=1e-4)
+
+
+def test_penalties_become_strict_with_success(task, states):
+    count = len(states.qpos)
+    cfg = replace(SETTINGS, worlds=count, reward=replace(SETTINGS.reward, failure=7.0, lenience=0.25))
+    environment = make_environment(task, cfg, states, device="cpu")
+    environment.reset()
+
+    def finish(rows: list[int]) -> None:
+        """End an episode from each of these states at once, but one that fails for its block was taken away."""
+        environment.start_from(rows)
+        environment.physics.qpos[3, 2] += 0.3
+        environment.episode_length_buf[:] = environment.max_episode_length
+        environment.step(still(environment))
+        assert environment.failure[3, 0]
+
+    finish(list(range(count)))
+    assert environment.terms[3, TERMS.index("failure")] == pytest.approx(-0.25 * 7.0)
+    inserted = (environment.success & ~environment.failure.any(dim=1)).nonzero().ravel().tolist()
+    for _ in range(10):
+        finish((inserted * count)[:count])
+    share = float((environment.success & ~environment.failure.any(dim=1)).float().mean())
+    assert share > 0.9
+    expected = -7.0 * (0.25 + 0.75 * share**2)
+    assert environment.terms[3, TERMS.index("failure")] == pytest.approx(expected, rel=0.02)
+
+
 def test_saved_state_is_gone_on_with_exactly(environment):
     start(environment)
     environment.step(0.3 * torch.ones(environment.num_envs, environment.num_actions))

@@ -38,10 +38,11 @@ def test_rotations_agree_with_matrices():
 
 def test_effort_is_the_papers():
     rng = np.random.default_rng(0)
-    action, velocity = rng.normal(size=(6, 8)), rng.normal(size=(6, 7))
-    found = effort(RewardCfg(), torch.as_tensor(action), torch.as_tensor(velocity))
+    action, velocity, lead = rng.normal(size=(6, 8)), rng.normal(size=(6, 7)), rng.normal(size=(6, 7))
+    found = effort(RewardCfg(press=0.2), torch.as_tensor(action), torch.as_tensor(velocity), torch.as_tensor(lead))
     np.testing.assert_allclose(found[0], -0.01 * (action**2).sum(axis=1))
     np.testing.assert_allclose(found[1], -0.001 * (velocity**2).sum(axis=1))
+    np.testing.assert_allclose(found[2], -0.2 * (lead**2).sum(axis=1))
 
 
 def test_disturbance_counts_shifts_and_turns_of_every_object():
