@@ -158,6 +158,8 @@ class ResetCfg:
     """Largest upward displacement of what is held [m]."""
     turn: float = 0.15
     """Half width of the rotation about the vertical [rad]."""
+    held: float = 0.0
+    """Half width of the rotation of a held object in the hand, about the axis along which it is held [rad]."""
     solver: Literal["auto", "newton", "posture"] = "auto"
     """Inverse kinematics: all states at once by Newton, from several seeds, or one after the other from the
     demonstrated posture; "auto" takes Newton on a GPU (on a CPU its kernels take a minute to compile)."""

@@ -151,6 +151,7 @@ class Drawing:
             self.scatter(draft)
         elif not kept:
             self.displace(draft)
+            self.turn_in_hand(draft)
         return draft
 
     def demonstrated(self, time: float, kept: bool, stage: int) -> Draft:
@@ -242,6 +243,20 @@ class Drawing:
         for address in self.free[: 1 + together]:
             assert address is not None
             place(draft.qpos, address, pivot, (shift, turn))
+
+    def turn_in_hand(self, draft: Draft) -> None:
+        """Turn object 1 in the hand about the axis along which it is held, as it turns where an edge of it catches."""
+        address, table, stage = self.free[0], self.task.table, draft.stage
+        held = self.task.held[stage] & (table.body_b[stage] == self.task.objects[0])
+        if not self.cfg.held or address is None or not held.any():
+            return
+        axis = np.linalg.svd(table.normal[stage][held])[2][0]
+        half = 0.5 * self.rng.uniform(-self.cfg.held, self.cfg.held)
+        turned = np.zeros(4)
+        mujoco.mju_mulQuat(
+            turned, draft.qpos[address + 3 : address + 7], np.array([np.cos(half), *np.sin(half) * axis])
+        )
+        draft.qpos[address + 3 : address + 7] = turned
 
     def displacement(self, *, lift: bool) -> tuple[np.ndarray, float]:
         """Return a drawn shift [m], shape (3,), and a turn about the vertical [rad]."""

@@ -78,9 +78,9 @@ class Run:
     def evaluation_states(self, task: Task, count: int, seed: int) -> InitialStates:
         """Return initial states to judge a policy by, none of which training has seen.
 
-        They are displaced ones alone; where stages are chained, starts of the whole alone.
+        They are displaced ones alone, held as demonstrated; where stages are chained, starts of the whole alone.
         """
-        cfg = replace(self.cfg.environment.reset, demonstrated=0.0, free=1.0)
+        cfg = replace(self.cfg.environment.reset, demonstrated=0.0, held=0.0, free=1.0)
         return draw_states(task, cfg, seed + 1_000_000, count=count)
 
 

@@ -110,6 +110,17 @@ def test_displaced_states_keep_the_block_in_the_hand(task, states):
     assert set(states.case) <= {2, 3}
 
 
+def test_what_is_held_is_turned_about_the_axis_along_which_it_is_held(task):
+    cfg = replace(SETTINGS.reset, demonstrated=0.0, turn=0.0, held=0.2)
+    found = draw_states(task, cfg, 0, count=24)
+    # The fingers close along y: the block turns about y by up to 0.2 rad, and about nothing else.
+    angles = 2 * np.arcsin(found.qpos[:, 4:7] * np.sign(found.qpos[:, 3:4]))
+    assert np.abs(angles[:, 1]).max() > 0.1
+    assert np.ptp(angles[:, 1]) > 0.2
+    assert np.abs(angles[:, 1]).max() < 0.25
+    assert np.abs(angles[:, [0, 2]]).max() < 0.05
+
+
 def test_states_follow_from_the_seed_and_arms_reach_theirs(sorter):
     first, again, other = (draw_states(sorter, ResetCfg(), seed, count=8) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.qpos, again.qpos)
