@@ -47,3 +47,7 @@ class EngineError(ConcentError):
 
 class EventsError(ConcentError):
     """A contact event sequence that cannot be extracted, read or compared."""
+
+
+class RenderError(ConcentError):
+    """Splats, images or settings with which nothing can be rendered."""

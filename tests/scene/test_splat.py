@@ -3,9 +3,10 @@ import pytest
 
 from concent_warp.errors import SceneError
 from concent_warp.scene.ply import read_vertices
-from concent_warp.scene.splat import read_splats
+from concent_warp.scene.splat import read_splats, write_splats
 
-FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0", "opacity"]
+FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+FIELDS += [f"f_rest_{k}" for k in range(24)]
 FIELDS += [*(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
 
 
@@ -45,6 +46,31 @@ def test_splats_are_read_by_name_in_any_order(tmp_path, form):
         np.einsum("nd,nd->n", splats.rotation, turned), np.linalg.norm(turned, axis=1), rtol=1e-5
     )
     np.testing.assert_allclose(splats.rgb[:, 2], 0.28209479 * values["f_dc_2"] + 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 9, 24, 45])
+def test_written_splats_are_read_back_with_harmonics_of_any_degree(tmp_path, count):
+    rng = np.random.default_rng(3)
+    values = {name: column for name, column in table().items() if not name.startswith("f_rest")}
+    values |= {f"f_rest_{k}": rng.normal(size=200).astype(np.float32) for k in range(count)}
+    splats = read_splats(write_ply(tmp_path / "s.ply", values))
+    assert splats.harmonics.shape == (200, 1 + count // 3, 3)
+    if count:
+        # Green follows red as a whole.
+        np.testing.assert_array_equal(splats.harmonics[:, 2, 1], values[f"f_rest_{count // 3 + 1}"])
+    write_splats(splats, tmp_path / "again.ply")
+    again = read_splats(tmp_path / "again.ply")
+    for name in ("mean", "scale", "rotation", "opacity", "harmonics"):
+        np.testing.assert_allclose(getattr(again, name), getattr(splats, name), rtol=1e-5, atol=1e-6, err_msg=name)
+    original, written = read_vertices(tmp_path / "s.ply"), read_vertices(tmp_path / "again.ply")
+    for name in ("f_dc_1", *(f"f_rest_{k}" for k in range(count))):
+        np.testing.assert_array_equal(original[name], written[name])
+
+
+def test_opaque_splats_are_written_with_finite_logits(tmp_path):
+    splats = read_splats(write_ply(tmp_path / "s.ply", {**table(), "opacity": np.full(200, 400, np.float32)}))
+    write_splats(splats, tmp_path / "again.ply")
+    assert read_splats(tmp_path / "again.ply").opacity.min() > 0.999
 
 
 def test_faint_splats_and_floaters_are_no_surface(tmp_path):
@@ -92,6 +118,11 @@ BROKEN = {
         "follow lists",
     ),
     "no opacity": (lambda p: write_ply(p, {n: v for n, v in table().items() if n != "opacity"}), r"no \['opacity'\]"),
+    "odd harmonics": (
+        lambda p: write_ply(p, {n: v for n, v in table().items() if n != "f_rest_7"}),
+        "no known degree",
+    ),
+    "colour not finite": (lambda p: write_ply(p, {**table(), "f_rest_3": np.full(200, np.inf, np.float32)}), "colours"),
     "not finite": (lambda p: write_ply(p, {**table(), "y": np.full(200, np.nan, np.float32)}), "200 of 200"),
     "no rotation": (
         lambda p: write_ply(p, {**table(), **{f"rot_{k}": np.zeros(200, np.float32) for k in range(4)}}),
