@@ -12,6 +12,8 @@ Two sets of measurements, neither of which anything here was tuned to:
     python benchmarks/diagnose_real.py --parts servo               # one of them; the page keeps the other's figures
     python benchmarks/diagnose_real.py --table                     # the page again, from the figures
 
+What is killed goes on from its finished pieces, in runs/diagnose_real; empty that folder after a change of the method.
+
 What judges shares nothing with the diagnosis but the simulator: windows of the recordings that were held out, see
 `held_out.py`. After each addition the model predicts them; so it does with each decoy added to the final model, fitted
 to the same data as the diagnosis had.
@@ -32,7 +34,8 @@ from diagnose_real_report import NAME, write_report
 from held_out import Spans, by_demonstration, change, cut_spans, prediction_errors
 from pages import ROOT, machine, read_data, write_data
 
-from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, diagnose, silent
+from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.least_squares import FitCfg, Solver
@@ -81,6 +84,8 @@ class Args:
     """Of the split of the tosses."""
     jobs: int = 1
     """Processes of a diagnosis."""
+    pieces: Path = ROOT / "runs" / "diagnose_real"
+    """Where finished pieces of diagnoses are kept."""
     contrast: bool = False
     """Fit decoys and the ladder again, for the diagnoses that there are."""
     table: bool = False
@@ -186,7 +191,9 @@ def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
     title, model, seen, judges = case.title, case.model, case.seen, case.judges
     begin = time.perf_counter()
     cfg = DiagnosisCfg(additions=ADDITIONS[part], jobs=args.jobs, explain=False)
-    diagnosis = diagnose(model, seen, cfg, lambda share, text: progress(title, begin, share, text))
+    diagnosis = diagnose_with_checkpoint(
+        model, seen, args.pieces, cfg, lambda share, text: progress(title, begin, share, text)
+    )
     spent = time.perf_counter() - begin
     print(f"\n{title}: {diagnosis.verdict}, {[f.name for f in diagnosis.accepted]}, {spent:.0f} s", flush=True)
     steps = ["as published", *(f"+ {f.name}" for f in diagnosis.accepted)]
