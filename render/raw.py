@@ -1,0 +1,269 @@
+"""The raw simulation image: colour, depth and segmentation by MuJoCo-Warp's ray tracer, for all worlds at once.
+
+The first layer of the hybrid rendering (paper, section 3.2.3 and appendix E). What is returned are views of the ray
+tracer's own memory, overwritten by the next image.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import ConcentError
+from concent_warp.scene.contact_geometry import GROUP
+
+if TYPE_CHECKING:
+    import torch
+
+SHOWN, HIDDEN = 0, 5
+"""Groups that geoms are put in for a camera that shows or leaves out some."""
+
+
+class RenderError(ConcentError):
+    """Images that cannot be rendered, or networks and data sets of images that cannot be made or used."""
+
+
+@dataclass(frozen=True)
+class RawImages:
+    """Images of W worlds by C cameras, views of the ray tracer's memory on its device."""
+
+    rgb: torch.Tensor
+    """Colour 0..1, shape (W, C, H, W', 3) float32."""
+    depth: torch.Tensor
+    """Distance along the camera's axis [m], 0 where nothing is, shape (W, C, H, W') float32."""
+    segmentation: torch.Tensor
+    """MuJoCo's geom id, -1 where nothing is, shape (W, C, H, W') int32."""
+
+
+class Stage:
+    """Worlds of a model, posed for cameras: MuJoCo-Warp's model and data without a simulation."""
+
+    def __init__(self, model: mujoco.MjModel, worlds: int, *, device: str = "cpu") -> None:
+        """Put a model on a device.
+
+        Args:
+            model: Compiled model with its cameras.
+            worlds: W.
+            device: Warp's name of the device.
+        """
+        import mujoco_warp as mjw
+        import warp as wp
+
+        self.model, self.worlds, self.device = model, worlds, wp.get_device(device)
+        with wp.ScopedDevice(self.device):
+            drawn = bare(model)
+            data = mjw.make_data(drawn, nworld=worlds, nconmax=1, njmax=1)
+            self.simulator: tuple[Any, Any] = mjw.put_model(drawn), data
+            self.qpos = wp.to_torch(data.qpos)
+            """Positions, shape (W, nq)."""
+            self.mocap = (wp.to_torch(data.mocap_pos), wp.to_torch(data.mocap_quat)) if model.nmocap else None
+            """Places of what is fixed where a world has it [m] (W, nmocap, 3) and wxyz (W, nmocap, 4)."""
+            self.position, self.quaternion = wp.to_torch(data.xpos), wp.to_torch(data.xquat)
+            """Body origins [m] (W, nbody, 3) and orientations wxyz (W, nbody, 4), world frame, after `place`."""
+            self.camera_position, self._camera_matrix = wp.to_torch(data.cam_xpos), wp.to_torch(data.cam_xmat)
+        self._place = Launches(self._pose, self.device)
+
+    def place(
+        self,
+        qpos: torch.Tensor | np.ndarray,
+        mocap: tuple[torch.Tensor | np.ndarray, torch.Tensor | np.ndarray] | None = None,
+    ) -> None:
+        """Put the worlds into states, qpos (W, nq), mocap positions (W, nmocap, 3) [m] and wxyz (W, nmocap, 4)."""
+        import torch
+
+        self.qpos.copy_(torch.as_tensor(qpos))
+        if mocap is not None and self.mocap is not None:
+            for target, value in zip(self.mocap, mocap, strict=True):
+                target.copy_(torch.as_tensor(value))
+        self._place()
+
+    def camera_poses(self, cameras: Sequence[str]) -> torch.Tensor:
+        """Return poses of cameras, position [m] and wxyz, looking along -z with y up, shape (W, C, 7)."""
+        import torch
+
+        rows = camera_ids(self.model, cameras)
+        quaternion = torch.as_tensor(matrix_quaternions(self._camera_matrix[:, rows].cpu().numpy()))
+        return torch.cat([self.camera_position[:, rows], quaternion.to(self.camera_position)], dim=-1)
+
+    def _pose(self) -> None:
+        """Launch what poses follow from the positions."""
+        import mujoco_warp as mjw
+
+        mjw.kinematics(*self.simulator)
+        mjw.camlight(*self.simulator)
+
+
+class RawCamera:
+    """Cameras of a stage, and what they are to show."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        cameras: Sequence[str],
+        size: tuple[int, int],
+        *,
+        leave_out: Sequence[str] = (),
+        objects: Literal["visual", "spheres"] = "visual",
+        shadows: bool = False,
+    ) -> None:
+        """Set cameras up.
+
+        Args:
+            stage: The worlds.
+            cameras: Names of C cameras of the model.
+            size: Height and width of an image [px].
+            leave_out: Bodies that are not shown.
+            objects: Whether bodies with contact spheres show these or their own shapes.
+            shadows: Whether lights cast shadows.
+
+        Raises:
+            RenderError: The model has no such camera, or a size is not right.
+        """
+        import mujoco_warp as mjw
+        import warp as wp
+
+        if min(size) < 1:
+            raise RenderError("the size of images is not right", expected="at least 1 x 1", found=size)
+        rows = camera_ids(stage.model, cameras)
+        self.stage, self.cameras, self.size = stage, tuple(cameras), size
+        height, width = size
+        shown = grouped(stage.model, leave_out, objects)
+        with wp.ScopedDevice(stage.device):
+            self._context = mjw.create_render_context(
+                shown, nworld=stage.worlds, cam_res=(width, height), cam_active=rows, render_rgb=True,
+                render_depth=True, render_seg=True, use_shadows=shadows, enabled_geom_groups=[SHOWN],
+            )  # fmt: skip
+            shape = (stage.worlds, len(rows), height, width)
+            self._colour: Any = wp.zeros(shape, dtype=wp.vec3)
+            segmentation = wp.to_torch(self._context.seg_data).view(*shape, 2)[..., 0]
+            self._images = RawImages(
+                wp.to_torch(self._colour), wp.to_torch(self._context.depth_data).view(shape), segmentation
+            )
+        self._render = Launches(self._trace, stage.device)
+
+    def render(self) -> RawImages:
+        """Return images of the stage as it is placed; the next call overwrites them."""
+        self._render()
+        return self._images
+
+    def intrinsics(self) -> np.ndarray:
+        """Return the pinhole matrices of the cameras [px], shape (C, 3, 3)."""
+        return intrinsics(self.stage.model, self.cameras, self.size)
+
+    def _trace(self) -> None:
+        """Launch the ray tracer."""
+        import mujoco_warp as mjw
+
+        mjw.refit_bvh(*self.stage.simulator, self._context)
+        mjw.render(*self.stage.simulator, self._context)
+        for c in range(len(self.cameras)):
+            mjw.get_rgb(self._context, c, self._colour[:, c])
+
+
+class Launches:
+    """Warp launches on fixed memory; on CUDA they are recorded after the first time and replayed from then on."""
+
+    def __init__(self, launches: Any, device: Any) -> None:
+        """Keep what launches."""
+        self._launches, self._device = launches, device
+        self._graph: Any = None
+
+    def __call__(self) -> None:
+        """Launch, on the stream that torch works on."""
+        import warp as wp
+
+        if not self._device.is_cuda:
+            with wp.ScopedDevice(self._device):
+                self._launches()
+            return
+        import torch
+
+        stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self._device)))
+        with wp.ScopedDevice(self._device), wp.ScopedStream(stream):
+            if self._graph is None:
+                self._launches()
+                wp.synchronize_device(self._device)
+                with wp.ScopedCapture() as captured:
+                    self._launches()
+                self._graph = captured.graph
+            else:
+                wp.capture_launch(self._graph, stream=stream)
+
+
+def bare(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy without what only moves a model, as the ray tracer's simulator may not know it."""
+    drawn = copy.copy(model)
+    drawn.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    drawn.opt.noslip_iterations = 0
+    return drawn
+
+
+def grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["visual", "spheres"]) -> mujoco.MjModel:
+    """Return a copy whose geoms are in group SHOWN where they are to be seen, in HIDDEN otherwise.
+
+    Geoms in MuJoCo's groups 0 to 2 are seen as a rule; of bodies with contact spheres, the spheres where that is asked.
+    """
+    shown = copy.copy(model)
+    spheres = (model.geom_group == GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
+    covered = np.isin(model.geom_bodyid, np.unique(model.geom_bodyid[spheres])) if objects == "spheres" else False
+    seen = (model.geom_group < 3) & ~np.asarray(covered)
+    if objects == "spheres":
+        seen |= spheres
+        shown.geom_rgba[spheres, 3] = 1.0
+    out = [body_id(model, name) for name in leave_out]
+    seen &= ~np.isin(model.geom_bodyid, out)
+    shown.geom_group[:] = np.where(seen, SHOWN, HIDDEN)
+    return shown
+
+
+def body_id(model: mujoco.MjModel, name: str) -> int:
+    """Return the id of a body.
+
+    Raises:
+        RenderError: There is none of that name.
+    """
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if found < 0:
+        raise RenderError(
+            "the scene has no such body", expected=[model.body(i).name for i in range(model.nbody)], found=name
+        )
+    return found
+
+
+def camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
+    """Return the ids of cameras.
+
+    Raises:
+        RenderError: There is none of a name.
+    """
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if unknown := [name for name in cameras if name not in names]:
+        raise RenderError("the scene has no such camera", expected=f"some of {names}", found=unknown)
+    return [names.index(name) for name in cameras]
+
+
+def intrinsics(model: mujoco.MjModel, cameras: Sequence[str], size: tuple[int, int]) -> np.ndarray:
+    """Return pinhole matrices [px] of cameras given by their field of view, shape (C, 3, 3).
+
+    (0, 0) is the centre of the first pixel.
+    """
+    height, width = size
+    found = np.tile(np.eye(3), (len(cameras), 1, 1))
+    for matrix, row in zip(found, camera_ids(model, cameras), strict=True):
+        focal = height / 2 / np.tan(np.radians(float(model.cam_fovy[row])) / 2)
+        matrix[0, 0] = matrix[1, 1] = focal
+        matrix[:2, 2] = (width - 1) / 2, (height - 1) / 2
+    return found
+
+
+def matrix_quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Return unit quaternions wxyz (..., 4) of rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
+    return flat[:, [3, 0, 1, 2]].reshape(*matrices.shape[:-2], 4)
