@@ -17,7 +17,7 @@ def tree(tmp_path: Path, rooms: dict[str, Path]) -> Path:
     """Return a folder with a copy of the package as it is installed."""
     for package, folder in rooms.items():
         place = tmp_path.joinpath(*package.split("."))
-        shutil.copytree(folder, place, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(folder, place, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     return tmp_path
 
 

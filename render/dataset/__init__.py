@@ -1,0 +1,1 @@
+"""Data sets of rendered episodes, for policies that act on images."""

@@ -1,0 +1,93 @@
+"""Videos by PyAV: frames go in one by one, and whole videos are joined without being encoded again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+Codec = Literal["h264", "av1"]
+ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
+    # A key frame every second frame lets readers that pick frames at random decode little, as LeRobot has it.
+    "h264": ("libx264", {"g": "2", "crf": "20", "preset": "veryfast", "bf": "0"}),
+    "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "8", "svtav1-params": "pred-struct=1"}),
+}
+"""Encoder and its options, by codec. Pictures come in their order, so that videos can be joined."""
+PIXELS = "yuv420p"
+
+
+class VideoWriter:
+    """One video that grows frame by frame."""
+
+    def __init__(self, path: Path, rate: int, size: tuple[int, int], codec: Codec = "h264") -> None:
+        """Open it.
+
+        Args:
+            path: File to write.
+            rate: Frames a second.
+            size: Height and width [px], even.
+            codec: How frames are encoded.
+        """
+        import av
+
+        name, options = ENCODERS[codec]
+        self._container = av.open(str(path), "w", format="mp4")
+        stream: Any = self._container.add_stream(name, rate=rate, options=options)
+        stream.height, stream.width = size
+        stream.pix_fmt = PIXELS
+        stream.codec_context.thread_count = 1
+        self._stream = stream
+
+    def add(self, image: np.ndarray) -> None:
+        """Add a frame, shape (H, W, 3) uint8."""
+        import av
+
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+
+def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: Path) -> None:
+    """Put videos of the same encoding one after the other into one file, packet by packet.
+
+    Args:
+        paths: The videos.
+        lengths: Frames of each.
+        rate: Frames a second.
+        out: File to write.
+    """
+    import av
+
+    with av.open(str(out), "w", format="mp4") as whole:
+        stream: Any = None
+        before = 0
+        for path, length in zip(paths, lengths, strict=True):
+            with av.open(str(path)) as part:
+                source = part.streams.video[0]
+                if stream is None:
+                    stream = whole.add_stream_from_template(source)
+                    stream.time_base = source.time_base
+                assert source.time_base is not None
+                offset = round(Fraction(before, rate) / source.time_base)
+                for packet in part.demux(source):
+                    if packet.dts is None or packet.pts is None:
+                        continue
+                    packet.pts, packet.dts = packet.pts + offset, packet.dts + offset
+                    packet.stream = stream
+                    whole.mux(packet)
+            before += length
+
+
+def read_frames(path: Path) -> np.ndarray:
+    """Return all frames of a video, shape (T, H, W, 3) uint8."""
+    import av
+
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
