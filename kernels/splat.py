@@ -49,6 +49,11 @@ class SplatArrays:
     """fx, fy, cx, cy [px], (0, 0) the centre of the first pixel, float32, shape (W, C, 4)."""
     hidden: wp.array
     """Planar depth [m] beyond which pixels show nothing, 0 for none, float32, shape (W * C, H, W), or (0, 0, 0)."""
+    light: wp.array | None = None
+    """Directions that are not level, along which the splats of an image are flattened onto the ground, as their shadow,
+    `wp.vec3`, shape (W, C). Colours then mean nothing."""
+    ground: float = 0.0
+    """Height of the ground in the world's frame [m]."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -72,6 +77,8 @@ class SplatArrays:
                     f"SplatArrays: {name} must be of shape {shape} and type {dtype.__name__}; found {array.shape} of "
                     f"{array.dtype.__name__}."
                 )
+        if self.light is not None and (self.light.shape != (worlds, cameras) or self.light.dtype != wp.vec3):
+            raise ValueError(f"SplatArrays: light must be of shape {(worlds, cameras)}; found {self.light.shape}.")
         if k not in (1, 4, 9, 16):
             raise ValueError(f"SplatArrays: harmonics must have 1, 4, 9 or 16 coefficients; found {k}.")
 
@@ -79,7 +86,9 @@ class SplatArrays:
         """Return owners and poses as the kernels take them."""
         scene = Scene()
         scene.owner, scene.object_pose = self.owner, self.object_poses
-        scene.camera_pose, scene.pinhole = self.camera_poses, self.pinholes
+        scene.camera_pose, scene.pinhole, scene.ground = self.camera_poses, self.pinholes, self.ground
+        if self.light is not None:
+            scene.light = self.light
         return scene
 
 

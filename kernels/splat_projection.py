@@ -32,6 +32,8 @@ class Scene:
     object_pose: wp.array3d[float]  # position [m] and quaternion wxyz, shape (W, O, 7)
     camera_pose: wp.array3d[float]  # the same of cameras that look along -z, y up, shape (W, C, 7)
     pinhole: wp.array3d[float]  # fx, fy, cx, cy [px], (0, 0) the centre of the first pixel, shape (W, C, 4)
+    light: wp.array2d[wp.vec3]  # direction along which an image's splats are flattened, shape (W, C), or (0, 0)
+    ground: float  # height of the plane onto which they are [m]
 
 
 @wp.struct
@@ -67,6 +69,12 @@ def pose_matrix(pose: wp.array3d[float], world: int, k: int) -> wp.mat33:
 def pose_position(pose: wp.array3d[float], world: int, k: int) -> wp.vec3:
     """Position of a pose."""
     return wp.vec3(pose[world, k, 0], pose[world, k, 1], pose[world, k, 2])
+
+
+@wp.func
+def flattening(light: wp.vec3) -> wp.mat33:
+    """Projection onto the plane z = 0 along a direction."""
+    return wp.mat33(1.0, 0.0, -light[0] / light[2], 0.0, 1.0, -light[1] / light[2], 0.0, 0.0, 0.0)
 
 
 @wp.func
@@ -144,9 +152,15 @@ def project(
     # MuJoCo's camera looks along -z with y up; here z is forward and y down.
     flip = wp.mat33(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
     to_camera = flip * wp.transpose(pose_matrix(scene.camera_pose, world, camera))
-    turn = to_camera * pose_matrix(scene.object_pose, world, owner)
-    apart = pose_position(scene.object_pose, world, owner) - pose_position(scene.camera_pose, world, camera)
-    p = turn * mean[i] + to_camera * apart
+    of_object = pose_matrix(scene.object_pose, world, owner)
+    origin = wp.vec3(0.0, 0.0, scene.ground)
+    above = of_object * mean[i] + pose_position(scene.object_pose, world, owner) - origin
+    if scene.light.shape[0] > 0:
+        flat = flattening(scene.light[world, camera])
+        of_object = flat * of_object
+        above = flat * above
+    turn = to_camera * of_object
+    p = to_camera * (above + origin - pose_position(scene.camera_pose, world, camera))
     z = p[2]
     tiles = wp.int32(0)
     if z > NEAREST:

@@ -58,6 +58,8 @@ class Rasteriser:
         antialias: take back the opacity that Gaussians smaller than a pixel gain where they are blurred to its width.
         margin: how far behind the surface that the simulation sees a Gaussian still shows [m].
         gradient: make the buffers of `differentiable`.
+        ground: height [m] of the plane onto which splats are flattened along `light`, to be seen as their shadow; None
+            renders the splats themselves.
 
     Raises:
         RenderError: there are no splats, or the sizes make no image.
@@ -71,6 +73,8 @@ class Rasteriser:
     """fx, fy, cx, cy [px], shape (W, C, 4)."""
     hidden: torch.Tensor
     """Planar depth beyond which a pixel shows no splats [m], 0 for none, shape (W, C, H, W)."""
+    light: torch.Tensor
+    """Directions of light, downwards, shape (W, C, 3); of no effect without `ground`."""
 
     def __init__(
         self,
@@ -86,6 +90,7 @@ class Rasteriser:
         antialias: bool = True,
         margin: float = 0.003,
         gradient: bool = False,
+        ground: float | None = None,
     ) -> None:
         if not objects or min(len(o) for o in objects) < 1 or min(width, height, worlds, cameras) < 1:
             raise RenderError(
@@ -104,6 +109,8 @@ class Rasteriser:
         self.object_poses, self.camera_poses = new(worlds, len(objects), 7), new(worlds, cameras, 7)
         self.object_poses[..., 3] = self.camera_poses[..., 3] = 1
         self.pinholes, self.hidden = new(worlds, cameras, 4), new(worlds, cameras, height, width)
+        self.light = new(worlds, cameras, 3)
+        self.light[..., 2] = -1
         self.splats = Splats(*(t.detach() for t in together(objects, self.device).tensors()))
         owner = [torch.full((len(o),), k, dtype=torch.int32) for k, o in enumerate(objects)]
         kinds = dict(zip(PARAMETERS, (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3), strict=True))
@@ -114,6 +121,8 @@ class Rasteriser:
             camera_poses=wp.from_torch(self.camera_poses),
             pinholes=wp.from_torch(self.pinholes),
             hidden=wp.from_torch(self.hidden.view(-1, height, width)),
+            light=None if ground is None else wp.from_torch(self.light, dtype=wp.vec3),
+            ground=ground or 0.0,
         )
         self._measured = capacity is not None
         self._make(worlds * cameras * (4 * len(self.splats) if capacity is None else capacity))

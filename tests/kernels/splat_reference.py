@@ -27,7 +27,9 @@ def colours(harmonics, direction):
     return np.maximum(total, 0)
 
 
-def render(splats, pose, camera, pinhole, width, height, *, hidden=None, margin=0.0, antialias=True):
+def render(
+    splats, pose, camera, pinhole, width, height, *, hidden=None, margin=0.0, antialias=True, light=None, ground=0.0
+):
     """Return rgb (H, W, 3), alpha (H, W) and depth (H, W) of one camera.
 
     Args:
@@ -40,12 +42,18 @@ def render(splats, pose, camera, pinhole, width, height, *, hidden=None, margin=
         hidden: depth beyond which nothing shows, shape (H, W).
         margin: how far beyond something does.
         antialias: as the kernels take it.
+        light: direction along which the splats are flattened onto the ground, shape (3,); colours then mean nothing.
+        ground: its height.
     """
     means, quats, scales, opacities, harmonics, owner = splats
     fx, fy, cx, cy = pinhole
     to_camera = FLIP @ rotation(camera[3:]).T
     turn = to_camera @ rotation(pose[owner, 3:])
-    seen = np.einsum("nij,nj->ni", turn, means) + (pose[owner, :3] - camera[:3]) @ to_camera.T
+    world = np.einsum("nij,nj->ni", rotation(pose[owner, 3:]), means) + pose[owner, :3]
+    if light is not None:
+        world = world - light * ((world[:, 2:] - ground) / light[2])
+        turn = to_camera @ (np.eye(3) - np.outer(light / light[2], [0, 0, 1])) @ rotation(pose[owner, 3:])
+    seen = (world - camera[:3]) @ to_camera.T
     x, y, z = seen.T
     direction = np.einsum("nji,nj->ni", turn, seen / np.linalg.norm(seen, axis=1, keepdims=True))
     colour = colours(harmonics, direction)

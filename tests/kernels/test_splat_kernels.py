@@ -45,8 +45,11 @@ class Case:
         self.hidden = self.hidden.astype(np.float32).astype(float)
         self.options = {"margin": 0.002, "antialias": True} | options
         kinds: dict[str, Any] = dict(zip(NAMES, (wp.vec3, wp.vec4, wp.vec3, float, wp.vec3), strict=True))
+        given: dict[str, Any] = {
+            n: wp.array(v.astype(np.float32), dtype=kinds[n], device=device) for n, v in self.values.items()
+        }
         self.arrays = SplatArrays(
-            **{n: wp.array(v.astype(np.float32), dtype=kinds[n], device=device) for n, v in self.values.items()},
+            **given,
             owner=wp.array(self.owner, device=device),
             object_poses=wp.array(self.objects.astype(np.float32), device=device),
             camera_poses=wp.array(self.cameras.astype(np.float32), device=device),
@@ -95,6 +98,28 @@ def test_images_without_antialiasing_match_float64(device):
     plan = case.plan()
     plan.launch()
     case.check(plan)
+
+
+@on_each_device
+def test_shadows_match_splats_flattened_in_float64(device):
+    case = Case(device, degree=0)
+    light = np.random.default_rng(2).normal(size=(case.worlds, 2, 3)) * 0.4 + np.array([0, 0, -1.5])
+    flat = wp.array(light.astype(np.float32), dtype=wp.vec3, device=device)
+    case.arrays.hidden.zero_()
+    plan = SplatPlan(
+        SplatArrays(**{**vars(case.arrays), "light": flat, "ground": -0.1}),
+        case.width, case.height, capacity=200_000,
+    )  # fmt: skip
+    plan.launch()
+    for w, c in np.ndindex(case.worlds, 2):
+        _, alpha, depth = splat_reference.render(
+            (*case.values.values(), case.owner), case.objects[w], case.cameras[w, c], case.pinholes[w, c], case.width,
+            case.height, light=light[w, c], ground=-0.1,
+        )  # fmt: skip
+        assert 0.1 < alpha.mean() < 0.9
+        np.testing.assert_allclose(plan.alpha.numpy()[2 * w + c], alpha, atol=2e-4)
+        solid = alpha > 0.05
+        np.testing.assert_allclose(plan.depth.numpy()[2 * w + c][solid], depth[solid], rtol=1e-4)
 
 
 @on_each_device
