@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -37,28 +38,46 @@ class AnisotropicForce(Law):
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
         """See `Law.apply`."""
+        self.bound(m, d, values)()
+
+    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
+        """See `Law.bound`."""
         extra = float(values[0]) - 1.0
-        if not d.ncon or not extra:
-            return
-        contact = d.contact
-        first, second = contact.geom.T
-        backward = self.moving[first] & self.still[second]
-        mine = (backward | (self.moving[second] & self.still[first])) & (contact.dim >= 3)
-        active = np.flatnonzero(mine & (contact.efc_address >= 0))
-        if not len(active):
-            return
-        body = m.geom_bodyid[np.where(backward, first, second)[active]]
-        position, normal = contact.pos[active], contact.frame[active, :3]
-        load = normal_forces(m, d, active)
-        velocity = d.cvel[body, 3:] + cross(d.cvel[body, :3], position - d.subtree_com[m.body_rootid[body]])
-        velocity -= normal * (normal * velocity).sum(axis=1, keepdims=True)
-        speed = np.sqrt((velocity * velocity).sum(axis=1) + SMOOTH**2)
-        force = -extra * contact.friction[active, 0] * load * velocity[:, 1] / speed
-        arm = position - d.xipos[body]
-        for b, f, (x, _, z) in zip(body, force, arm, strict=True):
-            d.xfrc_applied[b, 1] += f
-            d.xfrc_applied[b, 3] -= z * f
-            d.xfrc_applied[b, 5] += x * f
+        if not extra:
+            return lambda: None
+        moving, still, body_of = self.moving.tolist(), self.still.tolist(), m.geom_bodyid.tolist()
+        root_of = m.body_rootid.tolist()
+        elliptic = m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+        twist, middle, about, applied = d.cvel, d.xipos, d.subtree_com, d.xfrc_applied
+
+        def act() -> None:
+            if not d.ncon:
+                return
+            # A handful of contacts: plain numbers are several times faster than arrays of them.
+            contact = d.contact
+            pairs, address = contact.geom.tolist(), contact.efc_address.tolist()
+            for i, (first, second) in enumerate(pairs):
+                geom = first if moving[first] and still[second] else second if moving[second] and still[first] else -1
+                dim = int(contact.dim[i])
+                if geom < 0 or dim < 3 or address[i] < 0:
+                    continue
+                # A pyramid's edges each carry a share of the normal force.
+                rows = 1 if elliptic else 2 * (dim - 1)
+                load = sum(d.efc_force[address[i] : address[i] + rows].tolist())
+                body = body_of[geom]
+                (px, py, pz), (nx, ny, nz) = contact.pos[i].tolist(), contact.frame[i, :3].tolist()
+                wx, wy, wz, vx, vy, vz = twist[body].tolist()
+                cx, cy, cz = about[root_of[body]].tolist()
+                rx, ry, rz = px - cx, py - cy, pz - cz
+                vx, vy, vz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
+                into = nx * vx + ny * vy + nz * vz
+                vx, vy, vz = vx - into * nx, vy - into * ny, vz - into * nz
+                speed = math.sqrt(vx * vx + vy * vy + vz * vz + SMOOTH**2)
+                force = -extra * float(contact.friction[i, 0]) * load * vy / speed
+                x, _, z = middle[body].tolist()
+                applied[body] += (0.0, force, 0.0, (z - pz) * force, 0.0, (px - x) * force)
+
+        return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
@@ -189,25 +208,3 @@ def outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:
         vertices = m.mesh_vert[first : first + m.mesh_vertnum[m.geom_dataid[geom]]]
         return vertices[np.unique((vertices @ sides.T).argmax(axis=0))].astype(float)
     return np.zeros((0, 3))
-
-
-def normal_forces(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.ndarray:
-    """Return the normal force [N] of active contacts, ids of shape (C,), as the last step had it."""
-    address, dim = d.contact.efc_address[active], d.contact.dim[active]
-    if m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        return d.efc_force[address]
-    # A pyramid's edges each carry a share of it: 2 (dim - 1) of them, one where there is no friction.
-    running = np.concatenate([[0.0], np.cumsum(d.efc_force)])
-    return running[address + np.where(dim > 1, 2 * (dim - 1), 1)] - running[address]
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the vector products of rows, shape (C, 3); for few rows faster than NumPy's own."""
-    return np.stack(
-        [
-            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
-            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
-            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
-        ],
-        axis=1,
-    )
