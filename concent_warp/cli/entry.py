@@ -26,6 +26,7 @@ COMMANDS = {
     "evaluate": "count how often a trained policy succeeds, in simulation and in the stand-in world",
     "play": "show a trained policy at work, live in the browser",
     "export": "write a trained policy as ONNX or TorchScript",
+    "splat-fit": "fit Gaussian splats, the looks of an object, to posed images",
     "add": "add a physical effect to a model, and fit it to a recording",
 }
 """Names of the commands, each a module of this package, with what they do."""
@@ -91,7 +92,7 @@ def run(command: str, arguments: Sequence[str]) -> int:
         from concent_warp.cli.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
-        module = import_module(f"concent_warp.cli.{command}")
+        module = import_module(f"concent_warp.cli.{command.replace('-', '_')}")
         settings = tyro.cli(
             module.Arguments,
             args=arguments,

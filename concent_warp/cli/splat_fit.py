@@ -1,0 +1,125 @@
+"""``concent splat-fit``: posed images of an object become Gaussian splats."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from concent_warp.cli.run_folder import CHECKPOINT, resuming_command, run_folder, write_settings
+from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
+from concent_warp.model import write_text
+from concent_warp.render.splat_cfg import SplatFitCfg
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from concent_warp.render.splat_fit import Score, SplatFit
+    from concent_warp.render.splat_views import SplatViews
+
+SPLATS, SCORES, PICTURE = "splats.ply", "scores.json", "held_out.png"
+MOST_PICTURES = 6
+"""Images in the picture."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fit Gaussian splats to posed images of an object.
+
+    Writes splats.ply, the peak signal-to-noise ratios of images that were not fitted (scores.json), and a picture of
+    these beside the splats (held_out.png) to a run folder.
+    """
+
+    images: tyro.conf.Positional[Path]
+    """Folder with a transforms.json, or such a file: images with an alpha channel, and where their cameras were."""
+    out: Path | None = None
+    """Run folder; by default runs/splats_<name of the folder>."""
+    points: Path | None = None
+    """Mesh or point cloud to start from, in the frame of the object; by default the hull that the masks agree on."""
+    scale: float = 1.0
+    """Factor from the unit of the points to metres."""
+    device: str = "auto"
+    """Where to compute: "cpu", "cuda:0", or "auto" for CUDA where there is a device."""
+    resume: bool = False
+    """Go on with an interrupted fit, to the same result."""
+    overwrite: bool = False
+    """Replace an earlier run in the folder."""
+    fit: SplatFitCfg = field(default_factory=SplatFitCfg)
+
+
+def run(arguments: Arguments) -> list[Score]:
+    """Fit and write the run folder."""
+    quiet_warp()
+    from concent_warp.render.splat_views import read_views
+
+    views = read_views(arguments.images)
+    source = arguments.images if arguments.images.is_dir() else arguments.images.parent
+    folder = arguments.out or Path("runs") / f"splats_{source.resolve().name}"
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
+        write_settings(folder, arguments)
+        try:
+            fit = fitted(arguments, views, folder / CHECKPOINT)
+        except KeyboardInterrupt:
+            saved = (folder / CHECKPOINT).exists()
+            ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was saved yet."
+            raise KeyboardInterrupt(ending) from None
+        return write_results(fit, folder)
+
+
+def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFit:
+    """Return the fit, gone through to its end."""
+    import numpy as np
+    import torch
+
+    from concent_warp.render.splat_fit import SplatFit
+
+    cfg = arguments.fit
+    device = arguments.device
+    if device == "auto":
+        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    fit = SplatFit(views, start(arguments, views, np.random.default_rng(cfg.seed)), cfg, device=device)
+    if arguments.resume and checkpoint.exists():
+        fit.resume(checkpoint)
+    with status_bar("fitting splats") as update:
+
+        def show(done: int, loss: float) -> None:
+            update(done / cfg.iterations, f"{len(fit):,} splats, loss {loss:.4f}", None)
+
+        fit.learn(show, checkpoint)
+    return fit
+
+
+def start(arguments: Arguments, views: SplatViews, rng: np.random.Generator) -> np.ndarray:
+    """Return the points to start from [m], shape (n, 3)."""
+    from concent_warp.render.splat_start import read_start, visual_hull
+
+    if arguments.points is None:
+        return visual_hull(views, arguments.fit.start, rng)
+    return read_start(arguments.points, arguments.fit.start, arguments.scale, rng)
+
+
+def write_results(fit: SplatFit, folder: Path) -> list[Score]:
+    """Write the splats, their scores and the picture, and say what came out."""
+    import cv2
+    import numpy as np
+    import torch
+
+    with torch.no_grad():
+        fit.splats().write(folder / SPLATS)
+    scores = fit.evaluate()
+    write_text(folder / SCORES, json.dumps([asdict(score) for score in scores], indent=1))
+    written = [folder / SPLATS, folder / SCORES]
+    if scores:
+        psnr = np.array([[score.psnr, score.psnr_object] for score in scores]).mean(axis=0)
+        say(
+            f"{len(fit):,} splats; {len(scores)} images that were not fitted: {psnr[0]:.1f} dB, "
+            f"{psnr[1]:.1f} dB over the object alone"
+        )
+        picture = np.hstack([fit.picture(v) for v in fit.held_out[:MOST_PICTURES]])
+        cv2.imwrite(str(folder / PICTURE), picture[..., ::-1])
+        written.append(folder / PICTURE)
+    say_written(*written)
+    return scores
