@@ -93,7 +93,7 @@ def test_faint_splats_go_and_split_ones_cover_the_same(views, hull):
     assert after.opacities.min() > 0.1
     torch.testing.assert_close(after.means.mean(dim=0), where, atol=2e-3, rtol=0)
     through = (1 - after.opacities[-40:-20]) * (1 - after.opacities[-20:])
-    torch.testing.assert_close(1 - through, before.opacities[60:80], atol=0.02, rtol=0)
+    torch.testing.assert_close(1 - through, before.opacities[60:80], atol=0.05, rtol=0)
 
 
 def test_start_from_a_mesh_or_from_splats(tmp_path):
