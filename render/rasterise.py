@@ -241,8 +241,11 @@ class Rasteriser:
                 ) from None
 
     def _stream(self) -> AbstractContextManager[Any]:
-        """On CUDA, Warp launches on torch's current stream, so that neither waits for the other."""
-        if self.device.type != "cuda":
+        """On CUDA, Warp launches on torch's current stream, so that neither waits for the other.
+
+        While a graph of Warp's is recorded, that is done on its own stream.
+        """
+        if self.device.type != "cuda" or wp.get_device(str(self.device)).is_capturing:
             return nullcontext()
         return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device)), sync_enter=False)
 
