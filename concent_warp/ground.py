@@ -22,7 +22,7 @@ from concent_warp.events.extract import extract
 from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid
 from concent_warp.events.schedule import plot_schedule
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
+from concent_warp.fit.geometry import FitCfg, FitResult, Method, Progress, fit_geometry
 from concent_warp.model import Model, write_text
 from concent_warp.report.report import write_report
 from concent_warp.scene.build_geometry import ContactGeometryCfg
@@ -49,6 +49,8 @@ class GroundCfg:
     """Engine of the fit: "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to fit; all where empty. The comparison is about all in any case."""
+    method: Method = "es"
+    """How the fit searches: evolution strategy, gradients through Newton, or the latter as a start for the former."""
 
 
 @dataclass(frozen=True)
@@ -108,13 +110,17 @@ def ground(
         recording,
         cfg.fit,
         demonstrations=fitted,
+        method=cfg.method,
         engine=cfg.engine,
         checkpoint=folder / "checkpoint.npz",
         resume=resume,
         progress=progress,
     )
     fit.model.save(folder / "model.toml")
-    write_json(folder / "history.json", {"stopped": fit.stopped, "generations": fit.history})
+    document = {"stopped": fit.stopped, "generations": fit.history}
+    if fit.gradients is not None:
+        document |= {"gradients": {"helped": fit.gradients.helped, "remark": fit.gradients.remark}}
+    write_json(folder / "history.json", document)
     models = {BEFORE: start, NULL: without_object_contact(fit.model), AFTER: fit.model}
     models = {name: model for name, model in models.items() if model is not None}
     events = extract_all(fit.model, recording)

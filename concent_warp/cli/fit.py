@@ -11,7 +11,7 @@ import tyro
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
-from concent_warp.fit.geometry import FitCfg
+from concent_warp.fit.geometry import FitCfg, Method
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
@@ -38,6 +38,9 @@ class Arguments:
     """MJCF scene in place of the recording's own; its actuators and sensors must have the same names."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to fit; all by default. The comparison is about all in any case."""
+    method: Method = "es"
+    """"es", the evolution strategy; "gradient", descent by gradients through Newton; "gradient+es", the latter as a
+    start for the former. Where gradients do not help, "es" is taken and said so."""
     engine: EngineName = "auto"
     """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
     resume: bool = False
@@ -54,7 +57,13 @@ def run(arguments: Arguments) -> Grounded:
     recording.only(arguments.demonstrations)
     start = starting_model(arguments, recording)
     folder = arguments.out or Path("runs") / arguments.recording.stem
-    cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, arguments.demonstrations)
+    cfg = GroundCfg(
+        geometry=arguments.geometry,
+        fit=arguments.fit,
+        method=arguments.method,
+        engine=arguments.engine,
+        demonstrations=arguments.demonstrations,
+    )
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
         settings = write_settings(folder, arguments)
         with fit_progress() as progress:

@@ -29,7 +29,9 @@ def fit_progress() -> Iterator[Callable[[Progress], None]]:
         with status_bar("fitting") as update:
 
             def show(progress: Progress) -> None:
-                text = f"generation {progress.generation}/{progress.generations}, best {1e3 * progress.best:.2f} mm"
+                text = (
+                    f"{progress.what} {progress.generation}/{progress.generations}, best {1e3 * progress.best:.2f} mm"
+                )
                 update(progress.generation / max(progress.generations, 1), text, progress.seconds_left)
 
             yield show
@@ -64,6 +66,8 @@ def say_grounded(found: Grounded, folder: Path) -> None:
         table.add_row(f"{', '.join(chosen)} ({label})", *cells)
     say(table)
     say(f"fit: {found.fit.stopped}; {int(found.fit.mask.sum())} of {len(found.fit.mask)} spheres moved")
+    if found.fit.gradients is not None:
+        say(escape(found.fit.gradients.remark))
     say_events(found.events)
     say_written(folder / "model.toml", folder / "report.html")
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -15,10 +15,12 @@ from concent_warp.errors import ModelError, RecordingError
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
 from concent_warp.fit.faces import Faces, flattened
+from concent_warp.fit.gradient import GradientCfg
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
 from concent_warp.fit.offset import offset_directions
 from concent_warp.fit.target import Segment, observed_states, whole
+from concent_warp.fit.warm_start import Warming, WarmStart
 from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
@@ -26,6 +28,8 @@ from concent_warp.simulate.engine import Engine
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.select import EngineName, make_engine
 
+Method = Literal["es", "gradient", "gradient+es"]
+"""Evolution strategy; gradients through Newton; gradients that seed the evolution strategy."""
 GRIP = 5e-4
 """A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
 GAIN = 1e-3
@@ -66,6 +70,8 @@ class FitCfg:
     """Spheres that stay farther than this from everything else [m] are left out of the collisions of the search."""
     seed: int = 0
     """Seed of all random draws."""
+    gradient: GradientCfg = field(default_factory=GradientCfg)
+    """Settings of the gradients, for the methods that use them."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,8 @@ class Progress:
     seconds_left: float
     """Estimate of the time to the last generation [s]."""
     simulations: int
+    what: str = "generation"
+    """What is counted."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +105,8 @@ class FitResult:
     """Spheres that have moved, shape (S,) bool."""
     stopped: str
     """Why the fit ended."""
+    gradients: WarmStart | None = None
+    """What gradients found, where they were asked for."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,7 @@ def fit_geometry(
     *,
     demonstrations: Sequence[str] | None = None,
     segments: Sequence[Segment] | None = None,
+    method: Method = "es",
     engine: EngineName = "auto",
     checkpoint: Path | None = None,
     resume: bool = False,
@@ -133,8 +144,10 @@ def fit_geometry(
         cfg: Settings.
         demonstrations: Names of the demonstrations to fit; all by default.
         segments: Stretches to simulate instead of whole demonstrations.
+        method: Evolution strategy, gradients through Newton, or the latter as a start for the former. Where gradients
+            do not help, the evolution strategy is taken in any case; `FitResult.gradients` says so.
         engine: "mujoco", "warp" or "auto".
-        checkpoint: File that holds the state of the fit after each generation.
+        checkpoint: File that holds the state of the fit after each generation; that of the gradients lies beside it.
         resume: Go on from the checkpoint, to the same result as without the interruption.
         progress: Called after each generation.
 
@@ -144,10 +157,15 @@ def fit_geometry(
     """
     if model.geometry is None:
         raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
+    shown: list[Demonstration] = []
     if segments is None:
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
-        segments = cut(model, [recording[name] for name in names], cfg)
+        chosen = [recording[name] for name in names]
+        shown = chosen if cfg.window is None else []
+        segments = cut(model, chosen, cfg)
     search = Search(model, list(segments), cfg, engine)
+    if method != "es":
+        search.warm(method, shown, checkpoint, resume, progress)
     if resume and checkpoint is not None and checkpoint.is_file():
         search.restore(Checkpoint.load(checkpoint))
     while search.stopped is None:
@@ -204,6 +222,49 @@ class Search:
         self.simulations = 0
         self.seconds = 0.0
         self.stopped: str | None = None if cfg.generations > 0 else "no generations asked for"
+        self.gradients: WarmStart | None = None
+
+    def warm(
+        self,
+        method: Method,
+        demonstrations: Sequence[Demonstration],
+        checkpoint: Path | None,
+        resume: bool,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        """Begin with gradients, see `fit_geometry`; without help from them nothing changes but the count."""
+
+        def show(iteration: int, lowest: float, left: float) -> None:
+            if progress is not None:
+                count = self.cfg.gradient.iterations
+                progress(Progress(iteration, count, lowest, lowest, left, self.simulations, "gradient step"))
+
+        flat = self.evolution.mean.copy()
+        warming = Warming(self, demonstrations)
+        file = None if checkpoint is None else checkpoint.with_suffix(".descent.npz")
+        self.gradients = found = warming.run(file, resume, show)
+        self.evolution.mean = found.mean if found.helped else flat
+        if found.helped:
+            survey = self.survey([*self.draw(), *self.held_out])
+            self.note(survey)
+            if method == "gradient":
+                self.stopped = "gradient descent done"
+                self.history += [self.entry(warming.survey, 0.0), self.entry(survey, 0.0)]
+
+    def entry(self, survey: Survey, sigma: float, candidates: float | None = None) -> dict[str, Any]:
+        """Return what the history says of the present generation."""
+        return {
+            "generation": self.evolution.generation,
+            "loss": survey.loss,
+            "held_out": survey.held_out,
+            "best": min(self.best, survey.held_out) if candidates is None else self.best,
+            "candidates": survey.loss if candidates is None else candidates,
+            "sigma": sigma,
+            "moving": int(survey.mask.sum()),
+            "collidable": int(self.collidable.sum()),
+            "simulations": self.simulations,
+            "seconds": self.seconds,
+        }
 
     def step(self) -> None:
         """Run one generation."""
@@ -211,11 +272,12 @@ class Search:
         cfg, evolution = self.cfg, self.evolution
         segments = self.draw()
         survey = self.survey([*segments, *self.held_out])
-        if evolution.generation == 0:
+        if evolution.generation == 0 and not (self.gradients and self.gradients.helped):
             survey = self.flattened(survey, [*segments, *self.held_out])
+        if evolution.generation == 0:
             evolution.scale_to(np.sqrt(survey.loss) if cfg.squared else survey.loss)
         self.note(survey)
-        mask, loss, held_out = survey.mask, survey.loss, survey.held_out
+        mask = survey.mask
         values = evolution.ask(mask, self.rng)
         objective = self.objective(self.prepared(survey.reachable | mask), self.jittered(segments))
         losses = objective(evolution.candidates(values))
@@ -223,20 +285,7 @@ class Search:
         sigma = evolution.sigma * evolution.shrink
         evolution.tell(values, losses.fit, mask)
         self.seconds += time.perf_counter() - start
-        self.history.append(
-            {
-                "generation": evolution.generation,
-                "loss": loss,
-                "held_out": held_out,
-                "best": self.best,
-                "candidates": float(np.median(losses.fit)),
-                "sigma": sigma,
-                "moving": int(mask.sum()),
-                "collidable": int(self.collidable.sum()),
-                "simulations": self.simulations,
-                "seconds": self.seconds,
-            }
-        )
+        self.history.append(self.entry(survey, sigma, float(np.median(losses.fit))))
         if evolution.generation >= cfg.generations:
             self.stopped = f"all {cfg.generations} generations done"
         elif evolution.generation - self.last_gain > cfg.patience:
@@ -351,7 +400,7 @@ class Search:
         """Return the best estimate."""
         moved = (self.best_mean != 0).any(axis=1)
         fitted = self.model.with_geometry(self.evolution.geometry(self.best_mean))
-        return FitResult(fitted, self.model, self.history, moved, self.stopped or "interrupted")
+        return FitResult(fitted, self.model, self.history, moved, self.stopped or "interrupted", self.gradients)
 
     def checkpoint(self) -> Checkpoint:
         """Return all that is needed to go on."""

@@ -120,23 +120,33 @@ class Objective:
         """Return the losses of `count` candidates from a rollout of candidates times segments."""
         import torch
 
-        n = len(self.segments)
         # Clouds are compared on the graphics processor where there is one, wherever they were simulated.
         device = "cuda" if has_cuda() else None
         position = torch.as_tensor(rollout.body_position, device=device)
         quaternion = torch.as_tensor(rollout.body_quaternion, device=device)
+        diverged = torch.as_tensor(rollout.diverged, device=device).reshape(count, -1).any(dim=1)
+        both = torch.stack(self.means(position, quaternion))
+        both = torch.where(diverged | ~torch.isfinite(both), torch.inf, both).cpu().numpy().astype(float)
+        return Losses(both[0], both[1])
+
+    def means(self, position: torch.Tensor, quaternion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the losses of `Losses` as tensors, shape (P,) each, differentiable with respect to the poses.
+
+        Args:
+            position: Recorded origins of the bodies [m], shape (P * n, R, B, 3).
+            quaternion: Their orientations, wxyz, shape (P * n, R, B, 4).
+        """
+        import torch
+
         fit, held = [], []
         for aim in self.aims(position.device, position.dtype):
-            mine = slice(aim.segment, None, n), slice(None), aim.body
+            mine = slice(aim.segment, None, len(self.segments)), slice(None), aim.body
             distance = self.distances(position[mine], quaternion[mine], aim)
             for losses, frames in ((fit, aim.fit), (held, aim.held)):
                 if frames is not None:
                     losses.append(distance[:, frames].mean(dim=1))
         fit, held = fit or held, held or fit
-        diverged = torch.as_tensor(rollout.diverged, device=device).reshape(count, n).any(dim=1)
-        both = torch.stack([torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)])
-        both = torch.where(diverged | ~torch.isfinite(both), torch.inf, both).cpu().numpy().astype(float)
-        return Losses(both[0], both[1])
+        return torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)
 
     def distances(self, position: torch.Tensor, quaternion: torch.Tensor, aim: Aim) -> torch.Tensor:
         """Return Chamfer distances [m], shape (P, T).
