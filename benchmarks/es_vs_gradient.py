@@ -4,8 +4,8 @@ Four scenes (settle, push, tumble, insertion), five seeds each. The error is the
 where the model has them, in the MuJoCo engine, on the demonstration that was fitted and on another one; judging costs
 no simulations. A rollout in MuJoCo counts as one simulation, one in Newton with its gradient as two.
 
-    python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl            # resumable; --seconds 200 to stop early
-    python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl --report   # page and figure into docs/benchmarks
+    python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl            # resumable; --seconds 200 ends early
+    python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl --report   # page and figure, in docs
 """
 
 from __future__ import annotations
@@ -202,11 +202,11 @@ def report(args: Args) -> None:
     assert __doc__ is not None
     text = ["# Evolution strategy, gradients, and both", "", "\n".join(__doc__.split("\n")[2:6]).strip(), ""]
     text += [
-        "`python benchmarks/es_vs_gradient.py`. Medians over seeds (range); errors in mm. *gradient*: the iterate that",
-        "gradients end with, as scored in MuJoCo; *helped*: seeds in which it was more than 5 % better than the start, so",
+        "`python benchmarks/es_vs_gradient.py`. Medians over seeds (range); errors in mm. *gradient*: the iterate",
+        "that gradients end with, as scored in MuJoCo; *helped*: seeds in which it was over 5 % better than the start, so",
         "that the strategy began there, else at the start. *at equal budget*: gradient+es after as many simulations as",
         "es took in all. *share*: simulations until gradient+es is within 5 % of the final error of es, relative to",
-        "those of es; *a third*: seeds in which that is at most a third. *ratio*: error at equal budget over that of es.",
+        "those of es; *a third*: seeds in which that is at most a third. *ratio*: error at equal budget over es.",
         "",
     ]
     head = [
