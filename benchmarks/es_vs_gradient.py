@@ -203,7 +203,7 @@ def report(args: Args) -> None:
     text = ["# Evolution strategy, gradients, and both", "", "\n".join(__doc__.split("\n")[2:6]).strip(), ""]
     text += [
         "`python benchmarks/es_vs_gradient.py`. Medians over seeds (range); errors in mm. *gradient*: the iterate",
-        "that gradients end with, as scored in MuJoCo; *helped*: seeds in which it was over 5 % better than the start, so",
+        "that gradients end with, as scored in MuJoCo; *helped*: seeds in which it beat the start by 5 %, so",
         "that the strategy began there, else at the start. *at equal budget*: gradient+es after as many simulations as",
         "es took in all. *share*: simulations until gradient+es is within 5 % of the final error of es, relative to",
         "those of es; *a third*: seeds in which that is at most a third. *ratio*: error at equal budget over es.",

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from concent_warp.errors import EngineError, ModelError
 from concent_warp.fit.newton_physics import FEWEST, Inertia, NewtonCfg, Physics, choose_physics, coupling
 from concent_warp.fit.target import Segment, observed_states
-from concent_warp.kernels.newton_contacts import CAPSULE, KINDS, LARGER, OTHER, OWN, SPHERE
 from concent_warp.model import Model
 from concent_warp.simulate.engine import Rollout, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -53,6 +52,8 @@ class Pairs:
     @property
     def round(self) -> np.ndarray:
         """Radius of the other geom where it is a sphere or a capsule, else 0 [m], shape (C,)."""
+        from concent_warp.kernels.newton_contacts import CAPSULE, SPHERE
+
         return np.where(np.isin(self.kind, (SPHERE, CAPSULE)), self.size[:, 0], 0.0)
 
 
@@ -170,6 +171,8 @@ def near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float
         states: States to look at, shape (T, nq).
         reach: Distance between surfaces [m].
     """
+    from concent_warp.kernels.newton_contacts import KINDS, LARGER, OTHER, OWN, SPHERE
+
     assert model.geometry is not None
     names = model.geometry.names()
     spec = model.spec()
