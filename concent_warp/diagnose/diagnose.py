@@ -149,20 +149,20 @@ class Procedure:
         noise = channel_noises(self.model, self.recording)
         recorded = [d.measured for d in self.recording.demonstrations]
         told = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
-        base = self.fitted_baseline(noise)
-        larger = {c: r for c, r in quiet_ratios(base).items() if c not in told and r > UNDERESTIMATE}
-        if larger:
-            base = self.fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
-        return base
+        if told >= set(noise):
+            return self.fitted_baseline(noise)
+        seen = quiet_ratios(self.fitted_baseline(noise, rough=True))
+        larger = {c: r for c, r in seen.items() if c not in told and r > UNDERESTIMATE}
+        return self.fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
 
-    def fitted_baseline(self, noise: Mapping[str, float]) -> Node:
+    def fitted_baseline(self, noise: Mapping[str, float], *, rough: bool = False) -> Node:
         """Return the model as it is, fitted to readings of some noise."""
         cfg = self.cfg
         self.noise = dict(noise)
         windows = observe(self.model, self.recording, length=cfg.window, noise=noise, engine=cfg.engine, seed=cfg.seed)
         self.progress(0.03, "fitting the model as it is")
         check_finite(Prediction(self.model, (), windows, engine=cfg.engine), self.model.scene.source)
-        return node(self.model, windows, cut_blocks(windows), cfg.engine, None)
+        return node(self.model, windows, cut_blocks(windows), cfg.engine, None, rough=rough)
 
     def addition(self, base: Node, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
         """Look for one effect that the node's model lacks; return it, and what could have been seen."""

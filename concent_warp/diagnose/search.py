@@ -13,6 +13,7 @@ import numpy as np
 
 from concent_warp.diagnose.blocks import Blocks, HeldOut, Sums, block_sums
 from concent_warp.effects.effect import Effect
+from concent_warp.fit.initial_states import ROUNDS
 from concent_warp.fit.least_squares import Fit, FitCfg, Linear, Solver, projected
 from concent_warp.fit.observation import Window
 from concent_warp.fit.prediction import Prediction
@@ -22,6 +23,8 @@ from concent_warp.simulate.select import EngineName
 
 BETTER = 0.01
 """Share of the cost by which other initial states have to better a fit to be worth another one."""
+ROUGH = 3
+"""How often the dependence on the initial states is computed for a rough fit."""
 FAR = 1.0
 """Errors of initial states, in units of their spread, that count as far from what was measured."""
 
@@ -105,11 +108,20 @@ def noise_ratio(pieces: Sequence[Linear]) -> float:
     return float(np.sqrt(np.mean(2 * huber(pooled, HUBER))))
 
 
-def node(model: Model, windows: Sequence[Window], blocks: Blocks, engine: EngineName, threads: int | None) -> Node:
-    """Fit a model's own parameters and the initial states."""
+def node(
+    model: Model,
+    windows: Sequence[Window],
+    blocks: Blocks,
+    engine: EngineName,
+    threads: int | None,
+    *,
+    rough: bool = False,
+) -> Node:
+    """Fit a model's own parameters and the initial states; `rough`ly where all that counts is the calmest part."""
     solver = Solver(Prediction(model, (), windows, engine=engine, threads=threads))
-    fit = solver.fit()
-    if len(fit.values):
+    measured = [np.zeros(len(w.spread)) for w in windows]
+    fit = solver.fit(None, *solver.refine_starts(solver.p.start, measured, ROUGH if rough else ROUNDS))
+    if len(fit.values) and not rough:
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
     return assessed(model, windows, blocks, fit, engine)
@@ -224,7 +236,9 @@ def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False
     if candidate.polished and not thorough:
         return candidate
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=threads))
-    found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough))
+    # To the last bit: a fit that no step has helped is the node's own at the value at which the effect does nothing.
+    stuck = candidate.fit.cost == base.fit.cost
+    found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough, stuck=stuck))
     return found if found.fit.cost < candidate.fit.cost else replace(candidate, polished=True)
 
 

@@ -33,6 +33,8 @@ NEXT_TO_NOTHING = 3e-4
 """Share of the cost that counts as a gain where values matter."""
 LEAPS, LEAP, WORTH = 4, (1.0, 3.0), 5e-3
 """How often parameters are led on at most, over how many of their steps, and for what gain."""
+MANY, SAMPLE = 16, 8
+"""Number of windows beyond which a sample tells whether it is worth taking a fit up again, and the sample's size."""
 REFIT_ROUNDS = 2
 """The same within a step of the parameters."""
 
@@ -121,19 +123,23 @@ class Solver:
         found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), rounds)
         return found, tuple(starts[w] for w in range(len(offsets)))
 
-    def polish(self, fit: Fit, *, thorough: bool = False) -> Fit:
+    def polish(self, fit: Fit, *, thorough: bool = False, stuck: bool = False) -> Fit:
         """Return a fit taken up again from initial states fitted anew: from where they are, and from the measured ones.
 
         Initial states that have made up for a wrong parameter do not always find back on their own, and hold it there:
         so the parameters are then led on by steps after each of which the initial states are fitted anew; if
         `thorough`, also where all but the noise is explained, for the sake of their values: there from the initial
-        states that go with the step alone, which make up for nothing any more.
+        states that go with the step alone, which make up for nothing any more. A fit that is `stuck` where it set out
+        has had its initial states fitted there from the measured ones: this is not done again.
         """
-        measured = [np.zeros_like(o) for o in fit.offsets]
-        fresh = self.better_starts(fit, [measured])
-        # Where none was better, steps that failed with initial states fitted anew would fail again.
-        refits = None if fresh.cost < (1 - WORTH) * fit.cost else 0
-        best = self.fit(fresh.values, fresh.offsets, fresh.starts, refits=refits)
+        if len(self.p.windows) > MANY:
+            return self._polish_by_sample(fit, thorough=thorough, stuck=stuck)
+        measured, best = [np.zeros_like(o) for o in fit.offsets], fit
+        if not stuck:
+            fresh = self.better_starts(fit, [measured])
+            # Where none was better, steps that failed with initial states fitted anew would fail again.
+            refits = None if fresh.cost < (1 - WORTH) * fit.cost else 0
+            best = self.fit(fresh.values, fresh.offsets, fresh.starts, refits=refits)
         noise, worth = (0.0, NEXT_TO_NOTHING) if thorough else (NOISE, WORTH)
         for _ in range(LEAPS if len(fit.values) else 0):
             size = np.mean(np.concatenate([piece.residual for piece in best.linear]) ** 2)
@@ -153,6 +159,22 @@ class Solver:
                 break
             best = found
         return best
+
+    def _polish_by_sample(self, fit: Fit, *, thorough: bool, stuck: bool) -> Fit:
+        """Polish a fit on a sample of the windows; where that helps there, go on with all of them from its values."""
+        some = np.linspace(0, len(self.p.windows) - 1, SAMPLE).round().astype(int).tolist()
+        part = Solver(self.p.only(some), self.cfg)
+        linear, offsets, starts = (tuple(rows[w] for w in some) for rows in (fit.linear, fit.offsets, fit.starts))
+        cost = part.cost([piece.residual for piece in linear], offsets, fit.values)
+        begin = replace(fit, linear=linear, offsets=offsets, starts=starts, cost=cost)
+        found = part.polish(begin, thorough=thorough, stuck=stuck)
+        if found.cost > (1 - (NEXT_TO_NOTHING if thorough else WORTH)) * begin.cost:
+            return fit
+        known = dict(zip(some, found.offsets, strict=True))
+        led = tuple(known.get(w, o) for w, o in enumerate(fit.offsets))
+        measured = [np.zeros_like(o) for o in fit.offsets]
+        there = self.better_starts(replace(fit, values=found.values, offsets=led), [measured])
+        return min(fit, self.fit(there.values, there.offsets, there.starts, refits=0), key=lambda f: f.cost)
 
     def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]], noise: float = NOISE) -> Fit:
         """Return a fit at the same parameters with the best initial state of each window that is found.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -109,6 +110,12 @@ class Prediction:
     def compiled(self) -> mujoco.MjModel:
         """The compiled model at the start values, prepared for the effects."""
         return self._engine(self.start)[0].compiled
+
+    def only(self, windows: Sequence[int]) -> Prediction:
+        """Return the prediction of some of the windows, with a memory of its own."""
+        found = copy(self)
+        found.windows, found._kept = [self.windows[w] for w in windows], {}
+        return found
 
     def model(self, values: np.ndarray, intervals: Sequence[tuple[float, float]] = ()) -> Model:
         """Return the model with all effects at some values, shape (P,), and their intervals."""
