@@ -150,3 +150,21 @@ def test_what_cannot_be_rendered_is_refused(pair):
         rasteriser.render(objects, cameras, intrinsics.expand(5, 1, 3, 3))
     with pytest.raises(RenderError, match="degree 2"):
         rasteriser.differentiable([ball([1.0, 0, 0])], objects, cameras, intrinsics)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_shows_what_the_cpu_does_also_from_recorded_graphs(pair):
+    rasteriser, objects, cameras, intrinsics = pair
+    expected = rasteriser.render(objects, cameras, intrinsics).rgb.clone()
+    on_gpu = Rasteriser([ball([1.0, 0, 0]), ball([0, 0, 1.0], degree=2)], 48, 40, 3, 2, device="cuda")
+    found = on_gpu.render(objects.cuda(), cameras.cuda(), intrinsics.cuda()).rgb
+    torch.testing.assert_close(found.cpu(), expected, atol=1e-4, rtol=0)
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        on_gpu.launch()
+    found.zero_()
+    torch.cuda.synchronize()
+    assert capture.graph is not None
+    wp.capture_launch(capture.graph)
+    wp.synchronize_device("cuda:0")
+    torch.testing.assert_close(found.cpu(), expected, atol=1e-4, rtol=0)
