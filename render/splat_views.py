@@ -56,6 +56,28 @@ class SplatViews:
         quaternions = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat(scalar_first=True)
         return np.concatenate([self.poses[:, :3, 3], quaternions], axis=1)
 
+    def shrunk(self, longest: int) -> SplatViews:
+        """Return the views with images whose longer edge is at most so many pixels."""
+        import cv2
+
+        width, height = self.size
+        if max(width, height) <= longest:
+            return self
+        size = [max(1, round(edge * longest / max(width, height))) for edge in (width, height)]
+        rgba = np.empty((len(self), size[1], size[0], 4), np.uint8)
+        for v, image in enumerate(self.rgba):
+            # Colours weigh by how much of a pixel they cover.
+            covering = image.astype(np.float32)
+            covering[..., :3] *= covering[..., 3:] / 255
+            small = cv2.resize(covering, size, interpolation=cv2.INTER_AREA)
+            small[..., :3] /= np.maximum(small[..., 3:] / 255, 1e-3)
+            rgba[v] = np.round(np.clip(small, 0, 255))
+        intrinsics = self.intrinsics.copy()
+        for k, (new, old) in enumerate(zip(size, (width, height), strict=True)):
+            intrinsics[:, k] *= new / old
+            intrinsics[:, k, 2] += 0.5 * new / old - 0.5
+        return SplatViews(rgba, self.poses, intrinsics, self.masked)
+
     def write(self, folder: Path) -> None:
         """Write the images as PNG and the file that tells of them; this comes last."""
         import cv2

@@ -41,6 +41,8 @@ class Arguments:
     """Mesh or point cloud to start from, in the frame of the object; by default the hull that the masks agree on."""
     scale: float = 1.0
     """Factor from the unit of the points to metres."""
+    longest: int = 800
+    """Larger images are made smaller, so that their longer edge has so many pixels."""
     device: str = "auto"
     """Where to compute: "cpu", "cuda:0", or "auto" for CUDA where there is a device."""
     resume: bool = False
@@ -55,7 +57,7 @@ def run(arguments: Arguments) -> list[Score]:
     quiet_warp()
     from concent_warp.render.splat_views import read_views
 
-    views = read_views(arguments.images)
+    views = read_views(arguments.images).shrunk(arguments.longest)
     source = arguments.images if arguments.images.is_dir() else arguments.images.parent
     folder = arguments.out or Path("runs") / f"splats_{source.resolve().name}"
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):

@@ -61,6 +61,19 @@ def test_pose_of_the_object_moves_the_cameras_into_its_frame(folder):
     np.testing.assert_allclose(after[:, 1, 3], 0.1 - before[:, 0, 3], atol=1e-9)
 
 
+def test_shrunk_views_show_the_same_from_the_same_cameras():
+    large, small = photographed(3, 64), photographed(3, 32)
+    shrunk = large.shrunk(32)
+    assert shrunk.size == (32, 32)
+    np.testing.assert_allclose(shrunk.intrinsics, small.intrinsics, atol=1e-9)
+    solid = (small.rgba[..., 3] > 250) & (shrunk.rgba[..., 3] > 250)
+    assert np.abs(shrunk.rgba[solid].astype(float) - small.rgba[solid]).mean() < 8
+    for one, other in zip(shrunk.rgba[..., 3], small.rgba[..., 3], strict=True):
+        middles = [np.average(np.indices((32, 32)), axis=(1, 2), weights=np.tile(a, (2, 1, 1))) for a in (one, other)]
+        np.testing.assert_allclose(*middles, atol=0.1)
+    assert large.shrunk(64) is large
+
+
 def test_images_without_alpha_have_no_mask(folder):
     for path in folder.glob("*.png"):
         cv2.imwrite(str(path), np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR)))
