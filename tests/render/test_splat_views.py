@@ -70,7 +70,7 @@ def test_shrunk_views_show_the_same_from_the_same_cameras():
     assert np.abs(shrunk.rgba[solid].astype(float) - small.rgba[solid]).mean() < 8
     for one, other in zip(shrunk.rgba[..., 3], small.rgba[..., 3], strict=True):
         middles = [np.average(np.indices((32, 32)), axis=(1, 2), weights=np.tile(a, (2, 1, 1))) for a in (one, other)]
-        np.testing.assert_allclose(*middles, atol=0.1)
+        np.testing.assert_allclose(middles[0], middles[1], atol=0.1)
     assert large.shrunk(64) is large
 
 
