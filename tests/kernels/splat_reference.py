@@ -2,7 +2,7 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import sph_harm_y
+from scipy.special import factorial, lpmv
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -13,16 +13,18 @@ def rotation(quaternion):
 
 def colours(harmonics, direction):
     """Real spherical harmonics with the Condon-Shortley phase, plus 0.5, shape (N, 3)."""
-    polar, azimuth = np.arccos(np.clip(direction[:, 2], -1, 1)), np.arctan2(direction[:, 1], direction[:, 0])
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     total, k = np.full((len(direction), 3), 0.5), 0
     for degree in range(4):
         for order in range(-degree, degree + 1):
             if k == harmonics.shape[1]:
                 return np.maximum(total, 0)
-            value = sph_harm_y(degree, abs(order), polar, azimuth)
+            m = abs(order)
+            size = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial(degree - m) / factorial(degree + m))
+            value = size * lpmv(m, degree, np.clip(direction[:, 2], -1, 1))
             if order:
-                value = np.sqrt(2) * (value.real if order > 0 else value.imag)
-            total += np.real(value)[:, None] * harmonics[:, k]
+                value = np.sqrt(2) * value * (np.cos(m * azimuth) if order > 0 else np.sin(m * azimuth))
+            total += value[:, None] * harmonics[:, k]
             k += 1
     return np.maximum(total, 0)
 
