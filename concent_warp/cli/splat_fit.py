@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import tyro
 
 from concent_warp.cli.run_folder import CHECKPOINT, resuming_command, run_folder, write_settings
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
+from concent_warp.errors import RenderError
 from concent_warp.model import write_text
 from concent_warp.render.splat_cfg import SplatFitCfg
 
@@ -82,13 +84,21 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
     device = arguments.device
     if device == "auto":
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise RenderError(
+            "no such device", expected='"cpu", "cuda:0" or "auto"', found=f"{device!r} ({str(error).splitlines()[0]})"
+        ) from None
     fit = SplatFit(views, start(arguments, views, np.random.default_rng(cfg.seed)), cfg, device=device)
     if arguments.resume and checkpoint.exists():
         fit.resume(checkpoint)
+    first, begun = fit.iteration, time.monotonic()
     with status_bar("fitting splats") as update:
 
         def show(done: int, loss: float) -> None:
-            update(done / cfg.iterations, f"{len(fit):,} splats, loss {loss:.4f}", None)
+            left = (time.monotonic() - begun) / (done - first) * (cfg.iterations - done)
+            update(done / cfg.iterations, f"{len(fit):,} splats, loss {loss:.4f}", left)
 
         fit.learn(show, checkpoint)
     return fit
@@ -121,7 +131,9 @@ def write_results(fit: SplatFit, folder: Path) -> list[Score]:
             f"{psnr[1]:.1f} dB over the object alone"
         )
         picture = np.hstack([fit.picture(v) for v in fit.held_out[:MOST_PICTURES]])
-        cv2.imwrite(str(folder / PICTURE), picture[..., ::-1])
+        partial = folder / f".partial_{PICTURE}"
+        cv2.imwrite(str(partial), picture[..., ::-1])
+        partial.replace(folder / PICTURE)
         written.append(folder / PICTURE)
     say_written(*written)
     return scores

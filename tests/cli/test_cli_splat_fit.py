@@ -52,3 +52,12 @@ def test_what_is_no_image_folder_is_said_in_one_sentence(tmp_path, capsys):
     assert "no posed images" in message
     assert "Traceback" not in message
     assert not (tmp_path / "run").exists()
+
+
+def test_device_that_is_not_there_is_said_in_one_sentence(block, tmp_path, capsys):
+    assert main(["splat-fit", str(block), "--out", str(tmp_path / "run"), "--device", "toaster:7"]) == 2
+    message = capsys.readouterr().err
+    assert "no such device" in message
+    assert "'toaster:7'" in message
+    assert message.count("\n") == 1
+    assert not (tmp_path / "run").exists()
