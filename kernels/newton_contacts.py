@@ -8,6 +8,9 @@ With c the sphere's centre, p the nearest point of the other shape and n = (c - 
 both radii. The other shape is a point with a radius (a sphere, or the nearest point of a capsule's axis) or a surface
 (plane, box, cylinder). Where the centre lies within a box or a cylinder, p and n are those of the nearest face.
 
+A damper that acts in full at the first touch makes the motion jump with the step in which that happens, which no
+gradient sees. So damping grows with the depth, up to its full value at `onset`.
+
 Newton wants the normal from the first body to the second, -n, and takes material from shapes of bodies; stiffness,
 damping and friction are given for each contact, the shapes' friction being 1.
 """
@@ -163,9 +166,14 @@ def write_contacts(
     size: wp.array(dtype=wp.vec3),
     position: wp.array2d(dtype=wp.vec3),
     point0: wp.array(dtype=wp.vec3),
+    margin0: wp.array(dtype=float),
+    margin1: wp.array(dtype=float),
+    full_damping: wp.array(dtype=float),
+    onset: float,
     body_q: wp.array(dtype=wp.transform),
     point1: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
+    damping: wp.array(dtype=float),
 ):
     """Write the contact points and normals of one step; one thread a world and pair.
 
@@ -176,27 +184,29 @@ def write_contacts(
         body1: the other shape's body, shape (C,).
         other: the other fitted sphere, -1 where it is a geom, shape (C,).
         kind: kind of the other shape, shape (C,).
-        frame: pose of the other geom in its body, shape (C,).
+        frame: pose of the other geom in its body, identity for fitted spheres, shape (C,).
         size: MuJoCo's size of the other geom [m], shape (C,).
         position: sphere centres [m], body frame, shape (P, S).
         point0: centres of the pairs' spheres [m], body frame, shape (W * C,).
+        margin0: radii of these spheres [m], shape (W * C,).
+        margin1: radii of the other shapes [m], 0 for surfaces, shape (W * C,).
+        full_damping: damping beyond the onset [N s/m], shape (W * C,).
+        onset: depth at which damping is full [m].
         body_q: poses of all bodies, shape (W * bodies,).
         point1: nearest points [m], frame of the second body, written, shape (W * C,).
         normal: from the first body to the second, world frame, written, shape (W * C,).
+        damping: at this step [N s/m], written, shape (W * C,).
     """
     w, c = wp.tid()
     i = w * body0.shape[0] + c
     pose = body_q[w * bodies + body1[c]]
     world = wp.transform_point(body_q[w * bodies + body0[c]], point0[i])
-    if other[c] >= 0:
-        middle = position[w // segments, other[c]]
-        point1[i] = middle
-        normal[i] = -direction(world - wp.transform_point(pose, middle))
-        return
     local = wp.transform_point(wp.transform_inverse(pose * frame[c]), world)
     half = size[c]
     point = wp.vec3(0.0, 0.0, 0.0)
-    outward = direction(local)
+    if other[c] >= 0:
+        point = position[w // segments, other[c]]
+    outward = direction(local - point)
     if kind[c] == _PLANE:
         point = wp.vec3(local[0], local[1], 0.0)
         outward = wp.vec3(0.0, 0.0, 1.0)
@@ -209,6 +219,8 @@ def write_contacts(
         point, outward = cylinder_surface(local, half[0], half[1])
     point1[i] = wp.transform_point(frame[c], point)
     normal[i] = -wp.transform_vector(pose, wp.transform_vector(frame[c], outward))
+    depth = margin0[i] + margin1[i] - wp.dot(outward, local - point)
+    damping[i] = full_damping[i] * wp.clamp(depth / onset, 0.0, 1.0)
 
 
 @wp.kernel

@@ -36,6 +36,9 @@ class NewtonCfg:
     damping: float = 2.0
     """Damping ratio of that motion [-]. Newton's dampers act on approach only: with less of it bodies bounce off, where
     MuJoCo's contacts take the speed out."""
+    onset: float = 3e-4
+    """Depth at which a damper acts in full [m]. One that acts at once makes the motion jump with the step of the first
+    touch, and gradients wrong."""
     longest_step: float = 5e-4
     """Longest time step [s]."""
     shortest_step: float = 1e-4
@@ -73,6 +76,8 @@ class Physics:
     """[N s/m], shape (D,)."""
     friction_slope: float
     """Of every contact [N s/m]."""
+    onset: float
+    """Depth at which damping is full [m]."""
 
 
 def coupling(body: Inertia, points: np.ndarray) -> float:
@@ -135,10 +140,4 @@ def choose_physics(
         )
     k = int(fine.argmax())
     step = float(steps[k, 0])
-    return Physics(
-        first + k,
-        step,
-        stiffness,
-        np.minimum(damping, DAMPER / (step * strength)),
-        float(DAMPER / (step * strength.max())),
-    )
+    return Physics(first + k, step, stiffness, np.minimum(damping, limit[k]), float(limit[k].min()), cfg.onset)

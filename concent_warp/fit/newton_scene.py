@@ -38,7 +38,7 @@ class Pairs:
     kind: np.ndarray
     """Kind of the other shape, a number of `mujoco.mjtGeom`, shape (C,) int."""
     frame: np.ndarray
-    """Pose of the other geom in its body, position [m] and quaternion xyzw, shape (C, 7)."""
+    """Pose of the other geom in its body, position [m] and quaternion xyzw, shape (C, 7); none for fitted spheres."""
     size: np.ndarray
     """MuJoCo's size of the other geom [m], shape (C, 3)."""
     friction: np.ndarray
@@ -208,13 +208,15 @@ def near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float
         )
     ids = list(moving) + sorted({int(b) for b in m.geom_bodyid[second]} - set(moving))
     row = {b: k for k, b in enumerate(ids)}
+    frame = np.concatenate([m.geom_pos[second], m.geom_quat[second][:, [1, 2, 3, 0]]], axis=1)
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     priority = np.sign(m.geom_priority[second] - m.geom_priority[first])
     return ids, Pairs(
         sphere=sphere[first],
         other=sphere[second],
         body=np.array([[row[int(b)] for b in m.geom_bodyid[g]] for g in (first, second)]).T,
         kind=np.where(sphere[second] >= 0, SPHERE, kind),
-        frame=np.concatenate([m.geom_pos[second], m.geom_quat[second][:, [1, 2, 3, 0]]], axis=1),
+        frame=np.where(sphere[second, None] >= 0, still, frame),
         size=m.geom_size[second],
         friction=m.geom_friction[second, 0],
         rule=np.choose(priority + 1, [OWN, LARGER, OTHER]),

@@ -153,6 +153,7 @@ class NewtonWorlds:
         self._body_qd: Any = free((steps + 1, rows), wp.spatial_vector)
         self._force: Any = free((steps, rows), wp.spatial_vector)
         self._point1, self._normal = free((steps, self.worlds * c), wp.vec3), free((steps, self.worlds * c), wp.vec3)
+        self._damping: Any = free((steps, self.worlds * c), float)
         self._fixed = {"point0": free(self.worlds * c, wp.vec3)} | {
             name: free(self.worlds * c, float) for name in ("margin0", "margin1", "stiffness", "damping", "mu")
         }
@@ -180,10 +181,7 @@ class NewtonWorlds:
         contact.rigid_contact_shape0, contact.rigid_contact_shape1 = shape
         contact.rigid_contact_point0 = self._fixed["point0"]
         contact.rigid_contact_margin0, contact.rigid_contact_margin1 = self._fixed["margin0"], self._fixed["margin1"]
-        contact.rigid_contact_stiffness, contact.rigid_contact_damping = (
-            self._fixed["stiffness"],
-            self._fixed["damping"],
-        )
+        contact.rigid_contact_stiffness = self._fixed["stiffness"]
         contact.rigid_contact_friction = self._fixed["mu"]
         state = self._model.state(requires_grad=False)
         states, contacts = [], []
@@ -194,6 +192,7 @@ class NewtonWorlds:
                 now.body_f = self._force[k]
                 here = copy.copy(contact)
                 here.rigid_contact_point1, here.rigid_contact_normal = self._point1[k], self._normal[k]
+                here.rigid_contact_damping = self._damping[k]
                 contacts.append(here)
             states.append(now)
         return states, contacts
@@ -228,7 +227,7 @@ class NewtonWorlds:
 
         from concent_warp.kernels import newton_contacts as kernels
 
-        scene, pairs, position = self.scene, self._pairs, self.parameters["position"]
+        scene, pairs, fixed, position = self.scene, self._pairs, self._fixed, self.parameters["position"]
         bodies, control = len(scene.bodies), self._model.control()
         self._force.zero_()
         for k in range(steps):
@@ -238,9 +237,10 @@ class NewtonWorlds:
                 dim=(self.worlds, len(scene.pairs)),
                 inputs=[
                     bodies, self.segments, pairs["body0"], pairs["body1"], pairs["other"], pairs["kind"],
-                    pairs["frame"], pairs["size"], position, self._fixed["point0"], self._states[k].body_q,
+                    pairs["frame"], pairs["size"], position, fixed["point0"], fixed["margin0"], fixed["margin1"],
+                    fixed["damping"], scene.physics.onset, self._states[k].body_q,
                 ],
-                outputs=[contacts.rigid_contact_point1, contacts.rigid_contact_normal],
+                outputs=[contacts.rigid_contact_point1, contacts.rigid_contact_normal, contacts.rigid_contact_damping],
             )  # fmt: skip
             self._solver.step(self._states[k], self._states[k + 1], control, contacts, scene.physics.timestep)
             if len(self._replayed):
@@ -334,7 +334,8 @@ class NewtonWorlds:
         carried = wp.zeros_like(states[0][0]), wp.zeros_like(states[1][0])
         for c in reversed(range(self.chunks)):
             self._chunk(c)
-            for array in (*states, self._force.grad, self._point1.grad, self._normal.grad):
+            written = (self._force, self._point1, self._normal, self._damping)
+            for array in (*states, *(a.grad for a in written)):
                 array.zero_()
             for state, end in zip(states, carried, strict=True):
                 wp.copy(state[self.chunk], end)
@@ -366,5 +367,5 @@ class NewtonWorlds:
     @property
     def memory(self) -> int:
         """Bytes that a step of all worlds takes within a chunk: states, forces, contacts, and their gradients."""
-        arrays = (self._body_q, self._body_qd, self._force, self._point1, self._normal)
+        arrays = (self._body_q, self._body_qd, self._force, self._point1, self._normal, self._damping)
         return 2 * sum(a.strides[0] for a in arrays)

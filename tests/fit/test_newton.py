@@ -84,9 +84,9 @@ def test_gradient_of_pushing_is_that_of_central_differences(pushed, thick):
         up, down = loss.losses(Parameters(**stacked))
         return (up - down) / 2
 
-    for direction in (towards, np.where(np.abs(towards) > 0, [1.0, 0.0, 0.0], 0.0)):
+    for direction in (towards, np.where(position[:, :1] < 0, [1.0, 0.0, 0.0], 0.0)):
         step = 5e-5 * direction
-        assert float((found.position * step).sum()) == pytest.approx(slope(position=(position, step)), rel=0.05)
+        assert float((found.position * step).sum()) == pytest.approx(slope(position=(position, step)), rel=0.06)
     assert found.mass_scale["block"] * 0.02 == pytest.approx(slope(mass_scale=(np.ones(1), np.full(1, 0.02))), rel=0.2)
     assert found.friction_scale * 0.02 == pytest.approx(slope(friction_scale=(np.array(1.0), np.array(0.02))), rel=0.2)
 

@@ -21,7 +21,7 @@ TURNED = wp.transform(wp.vec3(0.1, -0.2, 0.3), wp.quat_rpy(0.4, -0.6, 0.7))
 STILL = wp.transform_identity()
 SIZE = (0.03, 0.02, 0.01)
 """Half sizes of the box; radius and half length of the capsule and the cylinder."""
-RADIUS, CAP = 0.005, 0.03
+RADIUS, CAP, ONSET = 0.005, 0.03, 0.004
 KNOWN = [
     # kind, centre of the sphere in the shape's frame, distance of the centre from the surface, normal to the centre
     (PLANE, (0.4, 0.1, 0.02), 0.02, (0, 0, 1)),
@@ -65,6 +65,7 @@ def placed(kind, centre, pose0, pose1, *, grad=False):
     round_one = CAP if kind in (SPHERE, CAPSULE) else 0.0
     out = {name: array([0.0], float) for name in ("margin0", "margin1", "stiffness", "damping", "mu")}
     point0, point1, normal = (array(np.zeros((1, 3)), wp.vec3) for _ in range(3))
+    damping = array([0.0], float)
     constants = [array([v], float) for v in (round_one, 0.3, 5.0, 2.0)]
     scales = [array([v], float) for v in (0.5, 4.0)]
     wp.launch(
@@ -74,14 +75,23 @@ def placed(kind, centre, pose0, pose1, *, grad=False):
         outputs=[point0, *out.values()],
         device="cpu",
     )
+    fixed = [out[name] for name in ("margin0", "margin1", "damping")]
     wp.launch(
         write_contacts,
         dim=(1, 1),
-        inputs=[2, 1, zero, one, minus, kinds, frame, size, position, point0, body_q],
-        outputs=[point1, normal],
+        inputs=[2, 1, zero, one, minus, kinds, frame, size, position, point0, *fixed, ONSET, body_q],
+        outputs=[point1, normal, damping],
         device="cpu",
     )
-    return {"position": position, "body_q": body_q, "frame": frame, "point1": point1, "normal": normal, **out}
+    return {
+        "position": position,
+        "body_q": body_q,
+        "frame": frame,
+        "point1": point1,
+        "normal": normal,
+        **out,
+        "damping": damping,
+    }
 
 
 def gap(found, centre, pose0, pose1):
@@ -102,6 +112,8 @@ def test_gap_and_normal_are_those_known_by_hand(kind, local, distance, normal):
     assert measured == pytest.approx(distance - RADIUS, abs=2e-6)
     expected = moved(TURNED, moved(frame, normal)) - moved(TURNED, moved(frame, (0, 0, 0)))
     np.testing.assert_allclose(towards, expected, atol=1e-4)
+    share = np.clip((RADIUS - distance) / ONSET, 0, 1)
+    assert found["damping"].numpy()[0] == pytest.approx(share * 2.0 * np.sqrt(4.0), abs=4e-3)
 
 
 @pytest.mark.parametrize(("kind", "local", "distance", "normal"), KNOWN)
@@ -132,14 +144,15 @@ def test_two_fitted_spheres_meet_and_both_carry_gradients():
     body_q = wp.array([wp.transform(wp.vec3(0.0, 0.006, 0.018), wp.quat_identity()), STILL], dtype=wp.transform)
     point0 = wp.zeros(1, dtype=wp.vec3, device="cpu")
     point1, normal = (wp.zeros(1, dtype=wp.vec3, device="cpu", requires_grad=True) for _ in range(2))
+    still, damping = [wp.zeros(1, dtype=float) for _ in range(3)], wp.zeros(1, dtype=float)
     kind, frame = wp.array([SPHERE], dtype=int), wp.array([STILL], dtype=wp.transform)
     size = wp.zeros(1, dtype=wp.vec3, device="cpu")
     with wp.Tape() as tape:
         wp.launch(
             write_contacts,
             dim=(1, 1),
-            inputs=[2, 1, *pair, pair[1], kind, frame, size, position, point0, body_q],
-            outputs=[point1, normal],
+            inputs=[2, 1, *pair, pair[1], kind, frame, size, position, point0, *still, ONSET, body_q],
+            outputs=[point1, normal, damping],
             device="cpu",
         )
     np.testing.assert_allclose(normal.numpy()[0], [0, -0.6, -0.8], atol=1e-6)

@@ -1,0 +1,129 @@
+"""Forward and backward runs through Newton: worlds x steps a second, and memory, as worlds grow from 1 to 1,024.
+
+A box of 64 spheres that settles on a plane, 0.2 s. One rollout with its gradient is timed, captured and warm; the
+backward run simulates each chunk of steps once more, which is in it. *bytes a step*: what one step of one world keeps
+until its gradient has been taken. *per chunk*: the same for all worlds and all steps of a chunk.
+
+    python benchmarks/gradient_throughput.py --out runs/gradient_throughput.jsonl                  # on a CPU
+    python benchmarks/gradient_throughput.py --out runs/gradient_throughput.jsonl --device cuda:0  # appended
+    python benchmarks/gradient_throughput.py --out runs/gradient_throughput.jsonl --report         # page, in docs
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from gradient_scenes import record, starting_model
+from measurements import Measurements
+from pages import machine, machine_line, table, write_page
+
+from concent_warp.fit.horizon import shortened
+from concent_warp.fit.newton_loss import NewtonLoss
+from concent_warp.fit.newton_scene import newton_scene
+from concent_warp.fit.newton_worlds import Parameters
+from concent_warp.fit.target import whole
+
+NAME = "gradient_throughput"
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    out: Path = Path("runs") / f"{NAME}.jsonl"
+    worlds: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
+    device: str = "cpu"
+    repeats: int = 3
+    limit: float = 60.0
+    """No more worlds are tried once a measurement has taken so long [s]."""
+    seconds: float | None = None
+    """No measurement is begun after so long."""
+    report: bool = False
+
+
+def measure(worlds: int, device: str, repeats: int) -> dict[str, Any]:
+    """Time rollouts with gradients of so many worlds."""
+    import warp as wp
+
+    recording = record("settle", 0)
+    model = starting_model("settle", recording, 0)
+    assert model.geometry is not None
+    segment = whole(model.scene, recording["demo_0"], model.geometry.bodies)
+    scene = newton_scene(model, [shortened(model.scene.model, segment, 0.2)])
+    loss = NewtonLoss(scene, worlds, device=device)
+    parameters = Parameters(np.repeat(model.geometry.position[None], worlds, axis=0))
+    begun = time.perf_counter()
+    loss(parameters)
+    wp.synchronize()
+    first = time.perf_counter() - begun
+    times, forward = [], []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        loss(parameters)
+        wp.synchronize()
+        times.append(time.perf_counter() - begun)
+        begun = time.perf_counter()
+        loss.losses(parameters)
+        wp.synchronize()
+        forward.append(time.perf_counter() - begun)
+    return {
+        "worlds": worlds,
+        "steps": scene.steps,
+        "pairs": len(scene.pairs),
+        "chunk": loss.worlds.chunk,
+        "first": first,
+        "seconds": float(np.median(times)),
+        "forward_seconds": float(np.median(forward)),
+        "bytes": loss.worlds.memory / worlds,
+        "machine": machine(device),
+    }
+
+
+def main(args: Args) -> None:
+    """Measure what is missing, or write the page."""
+    kept = Measurements(args.out, seconds=args.seconds)
+    if args.report:
+        report(kept.rows)
+        return
+    for worlds in args.worlds:
+        key = f"{args.device} {worlds}"
+        if kept.wanted(key):
+            begun = time.perf_counter()
+            kept.add(key, measure(worlds, args.device, args.repeats))
+            if time.perf_counter() - begun > args.limit:
+                break
+    kept.close()
+
+
+def report(rows: dict[str, dict[str, Any]]) -> None:
+    """Write the page."""
+    assert __doc__ is not None
+    text = ["# Throughput of gradients through Newton", "", "\n".join(__doc__.split("\n")[2:5]), ""]
+    text += ["`python benchmarks/gradient_throughput.py`.", ""]
+    head = [
+        "worlds", "steps", "pairs", "forward and backward, world steps/s", "forward alone", "bytes a step",
+        "per chunk [MB]", "first call [s]",
+    ]  # fmt: skip
+    for device in sorted({key.split(" ")[0] for key in rows}):
+        mine = sorted((r for key, r in rows.items() if key.startswith(f"{device} ")), key=lambda r: r["worlds"])
+        lines = []
+        for r in mine:
+            work = r["worlds"] * r["steps"]
+            lines.append(
+                [
+                    f"{r['worlds']:,}", f"{r['steps']:,}", str(r["pairs"]), f"{work / r['seconds']:,.0f}",
+                    f"{work / r['forward_seconds']:,.0f}", f"{r['bytes']:,.0f}",
+                    f"{r['bytes'] * r['worlds'] * r['chunk'] / 1e6:,.0f}", f"{r['first']:.1f}",
+                ]
+            )  # fmt: skip
+        text += [machine_line(mine[0]["machine"]), "", table(head, lines)]
+    write_page(NAME, "\n".join(text))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
