@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import mujoco
 import numpy as np
 
-from concent_warp.errors import ConcentError
+from concent_warp.errors import RenderError
 from concent_warp.scene.contact_geometry import GROUP
 
 if TYPE_CHECKING:
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 
 SHOWN, HIDDEN = 0, 5
 """Groups that geoms are put in for a camera that shows or leaves out some."""
-
-
-class RenderError(ConcentError):
-    """Images that cannot be rendered, or networks and data sets of images that cannot be made or used."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,11 @@ class Stage:
         with wp.ScopedDevice(self.device):
             drawn = bare(model)
             data = mjw.make_data(drawn, nworld=worlds, nconmax=1, njmax=1)
-            self.simulator: tuple[Any, Any] = mjw.put_model(drawn), data
+            try:
+                self.simulator: tuple[Any, Any] = mjw.put_model(drawn), data
+            except NotImplementedError as error:
+                found = " ".join(str(error).split())
+                raise RenderError("MuJoCo-Warp, which traces the images, cannot hold this scene", found=found) from None
             self.qpos = wp.to_torch(data.qpos)
             """Positions, shape (W, nq)."""
             self.mocap = (wp.to_torch(data.mocap_pos), wp.to_torch(data.mocap_quat)) if model.nmocap else None

@@ -27,9 +27,11 @@ COMMANDS = {
     "play": "show a trained policy at work, live in the browser",
     "export": "write a trained policy as ONNX or TorchScript",
     "splat-fit": "fit Gaussian splats, the looks of an object, to posed images",
+    "render": "render episodes of a policy, or a recording, as photorealistic images in a data set",
+    "render-train": "train networks that paint robot and background as a real camera sees them",
     "add": "add a physical effect to a model, and fit it to a recording",
 }
-"""Names of the commands, each a module of this package, with what they do."""
+"""Names of the commands, each a module of this package, "-" as "_", with what they do."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 PATIENCE = 10.0
 """How long other processes wait for the first one to say what is wrong [s]."""
@@ -37,7 +39,7 @@ PATIENCE = 10.0
 
 def usage() -> str:
     """Return the text of ``concent --help``."""
-    lines = [f"  {name:<10}{text}" for name, text in COMMANDS.items()]
+    lines = [f"  {name:<13}{text}" for name, text in COMMANDS.items()]
     return "\n".join(
         [
             "usage: concent [-h] [--version] COMMAND ...",

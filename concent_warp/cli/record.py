@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from concent_warp.cli.run_folder import claim_file, make_folder
-from concent_warp.cli.terminal import progress_bar, say, say_written
+from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
@@ -47,6 +47,8 @@ class Arguments:
 def run(arguments: Arguments) -> Recording:
     """Record and write the file."""
     claim_file(arguments.out, overwrite=arguments.overwrite)
+    if arguments.reality.sensing.images or arguments.reality.footage.cameras:
+        quiet_warp()
     with progress_bar("recording") as progress:
         recording, _ = record(arguments.reality_with_robot(), list(arguments.seeds), progress=progress)
     make_folder(arguments.out.parent)

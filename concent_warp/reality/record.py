@@ -10,6 +10,7 @@ import numpy as np
 
 from concent_warp.reality.camera import CAMERA, film
 from concent_warp.reality.expert import ExpertCfg, plan
+from concent_warp.reality.footage import FootageCfg, footage
 from concent_warp.reality.inverse_kinematics import solve_path
 from concent_warp.reality.run import Log, settle, simulate
 from concent_warp.reality.sensing import SensingCfg, measure, sampled
@@ -29,6 +30,7 @@ class RealityCfg:
     expert: ExpertCfg = field(default_factory=ExpertCfg)
     world: WorldCfg = field(default_factory=WorldCfg)
     sensing: SensingCfg = field(default_factory=SensingCfg)
+    footage: FootageCfg = field(default_factory=FootageCfg)
     place_spread: float = 0.02
     """Half width of the square in which the block is placed [m]."""
     yaw_spread: float = 0.15
@@ -136,6 +138,9 @@ def perform(
         rows = sampled(truth.time, cfg.sensing.image_rate)
         # A source of its own, so that all else is the same with and without images.
         image[CAMERA] = film(cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
+    if cfg.footage.cameras:
+        rows = sampled(truth.time, cfg.footage.rate)
+        image |= footage(cfg.footage, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
     for effect in effects:
         if effect.measure is not None:
             for channel, stream in measured.items():

@@ -107,6 +107,8 @@ def write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) 
         store(group, "depth", stream.depth)
         group.attrs["intrinsics"] = np.asarray(stream.intrinsics, dtype=float)
         group.attrs["pose"] = np.asarray(stream.pose, dtype=float)
+        if stream.body is not None:
+            group.attrs["body"] = text(stream.body)
         return
     store(group, "value", np.asarray(stream.value, dtype=float))
     if isinstance(stream, PointTrack):
@@ -240,6 +242,7 @@ class Reader(SafeFile):
             self.array(group, "depth", np.float32),
             np.asarray(matrices["intrinsics"]),
             np.asarray(matrices["pose"]),
+            self.text_attribute(group, "body"),
         )
 
 

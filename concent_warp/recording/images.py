@@ -41,6 +41,9 @@ def check_image(stream: ImageStream, model: mujoco.MjModel, place: Place) -> Non
     check_lengths(middle[middle > 0], model, place)
     check_intrinsics(stream.intrinsics, shape[2], shape[1], place)
     check_pose(stream.pose, model, place)
+    names = [model.body(i).name for i in range(model.nbody)]
+    if stream.body is not None and stream.body not in names:
+        raise place.error("the camera is on a body that the scene lacks", expected=f"one of {names}", found=stream.body)
 
 
 def worst(frame: np.ndarray) -> float:

@@ -42,7 +42,7 @@ class PointTrack:
 
 @dataclass(frozen=True)
 class ImageStream:
-    """RGB-D frames of one fixed camera."""
+    """RGB-D frames of one camera, fixed in the world or to a body."""
 
     time: np.ndarray
     """Clock readings [s], shape (T,)."""
@@ -54,6 +54,8 @@ class ImageStream:
     """Pinhole matrix [px], shape (3, 3)."""
     pose: np.ndarray
     """Camera-to-world transform, shape (4, 4); camera axes x right, y down, z forward."""
+    body: str | None = None
+    """Body that carries the camera, which `pose` is then relative to; None for a camera fixed in the world."""
 
 
 @dataclass(frozen=True)

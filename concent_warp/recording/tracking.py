@@ -224,4 +224,8 @@ def chosen_stream(demonstration: Demonstration, camera: str | None, where: str) 
     name = names[0] if camera is None else camera
     if name not in names:
         raise RecordingError("no such RGB-D stream", where=where, expected=f"one of {names}", found=repr(name))
+    if demonstration.image[name].body is not None:
+        raise RecordingError(
+            "points are tracked from a camera that stands still", where=where, found=f"{name!r} on a body that moves"
+        )
     return demonstration.image[name]

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from concent_warp.render.raw import RenderError
+
+from concent_warp.errors import RenderError
 
 STAGING = ".staging"
 """Folder of the episodes that are not packed yet."""
@@ -42,6 +43,9 @@ class EpisodeLayout:
         height, width = self.size
         if self.rate < 1 or self.rate != int(self.rate):
             raise RenderError("the rate of frames is not right", expected="a whole number of frames/s", found=self.rate)
+        if not (self.cameras and self.state and self.action):
+            found = f"{len(self.cameras)} cameras, {len(self.state)} numbers of state and {len(self.action)} of action"
+            raise RenderError("a data set wants images, a state and an action", found=found)
         if height % 2 or width % 2 or height < 16 or width < 16:
             raise RenderError("images of this size make no video", expected="even, at least 16 x 16", found=self.size)
 

@@ -27,6 +27,8 @@ CHUNK = 1000
 """Files of a folder."""
 DATA_MB, VIDEO_MB = 100, 200
 """Sizes at which files are full [MB]."""
+SAMPLED = 128
+"""Rows and columns of an image that its statistics are taken from, about."""
 BYTES = 1_000_000
 """Of a megabyte."""
 INDICES = ("frame_index", "episode_index", "index", "task_index")
@@ -242,7 +244,8 @@ class LeRobotEpisode:
             camera: VideoWriter(self._folder / f"{camera}.mp4", layout.rate, layout.size, writer.codec)
             for camera in layout.cameras
         }
-        self._seen = {camera: ImageHistogram() for camera in layout.cameras}
+        every = max(1, min(layout.size) // SAMPLED)
+        self._seen = {camera: ImageHistogram(every) for camera in layout.cameras}
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []
 

@@ -22,7 +22,7 @@ def of_values(values: np.ndarray) -> Statistics:
 class ImageHistogram:
     """Counts of the 256 levels of each colour, from which all statistics of an episode's images follow exactly."""
 
-    def __init__(self, every: int = 4) -> None:
+    def __init__(self, every: int = 1) -> None:
         """Look at every so many rows and columns."""
         self._counts, self._frames, self._every = np.zeros((3, 256), dtype=np.int64), 0, every
 

@@ -13,8 +13,9 @@ from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
 from concent_warp.render.dataset.statistics import ImageHistogram, merged, of_values
 from concent_warp.render.dataset.video import read_frames
-from concent_warp.render.raw import RenderError
 from small_dataset import LAYOUT, frame, length, write
+
+from concent_warp.errors import RenderError
 
 
 def episodes(folder: Path) -> list[dict]:
@@ -70,6 +71,18 @@ def test_lerobot_files_are_as_the_format_has_them(tmp_path):
     assert np.allclose(stats["observation.state"]["std"], states.std(0))
     assert np.shape(stats["observation.images.base"]["mean"]) == (3, 1, 1)
     assert stats["observation.images.base"]["max"][0][0][0] == pytest.approx((20 + 60 + 40) / 255)
+
+
+def test_lerobot_reads_every_frame(tmp_path):
+    reason = "lerobot is not installed: it wants older versions; benchmarks/dataset_lerobot.py uses one elsewhere"
+    module: Any = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason=reason)
+    writer = LeRobotWriter(tmp_path, LAYOUT)
+    write(writer, range(3))
+    writer.finish()
+    data = module.LeRobotDataset("local/small", root=tmp_path, video_backend="pyav")
+    assert len(data) == sum(map(length, range(3)))
+    assert data[5]["observation.state"].tolist() == [1.0, 2.0]
+    assert tuple(data[5]["observation.images.base"].shape) == (3, *LAYOUT.size)
 
 
 @pytest.mark.parametrize("last", [1, 3, 4, 5, 6, 8, 11])

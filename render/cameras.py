@@ -1,0 +1,99 @@
+"""Cameras by their calibration: those of a recording, of the scene that renders for it, and beside trained networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import RenderError
+from concent_warp.recording.recording import ImageStream
+from concent_warp.scene.scene import Scene
+
+CENTRED = 0.02
+"""How far the principal point may be from the middle, as a share of the image."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera without distortion, its principal point in the middle."""
+
+    name: str
+    body: str | None
+    """Body that carries it; None where it is fixed in the world."""
+    position: tuple[float, float, float]
+    """Place [m] in the body's frame or the world's."""
+    quaternion: tuple[float, float, float, float]
+    """Orientation wxyz there, looking along -z with y up, as MuJoCo has it."""
+    fovy: float
+    """Vertical field of view [degrees]."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether a body carries it."""
+        return self.body is not None
+
+    @staticmethod
+    def of(name: str, stream: ImageStream) -> Camera:
+        """Return the camera that took a stream.
+
+        Raises:
+            RenderError: Its principal point is not in the middle, or its pixels are not square.
+        """
+        height, width = stream.rgb.shape[1:3]
+        matrix = np.asarray(stream.intrinsics, float)
+        off = np.abs(matrix[:2, 2] - [(width - 1) / 2, (height - 1) / 2]) / [width, height]
+        if off.max() > CENTRED or abs(matrix[0, 0] / matrix[1, 1] - 1) > CENTRED:
+            raise RenderError(
+                "images of this camera cannot be rendered",
+                where=name,
+                expected="square pixels and the principal point in the middle of the image",
+                found=matrix.round(1).tolist(),
+                fix="crop and rectify the images",
+            )
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, (np.asarray(stream.pose)[:3, :3] @ np.diag([1.0, -1.0, -1.0])).ravel())
+        x, y, z = (float(v) for v in np.asarray(stream.pose)[:3, 3])
+        w, i, j, k = (float(v) for v in quaternion)
+        return Camera(
+            name, stream.body, (x, y, z), (w, i, j, k), float(2 * np.degrees(np.arctan(height / 2 / matrix[1, 1])))
+        )
+
+    @staticmethod
+    def in_scene(scene: Scene, name: str) -> Camera:
+        """Return a camera of a scene.
+
+        Raises:
+            RenderError: It has none of the name.
+        """
+        m = scene.model
+        row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_CAMERA, name)
+        if row < 0:
+            found = [m.camera(i).name for i in range(m.ncam)]
+            raise RenderError(
+                "the scene has no such camera", where=scene.source, expected=f"one of {found}", found=name
+            )
+        body = None if m.cam_bodyid[row] == 0 else m.body(m.cam_bodyid[row]).name
+        x, y, z = (float(v) for v in m.cam_pos[row])
+        w, i, j, k = (float(v) for v in m.cam_quat[row])
+        return Camera(name, body, (x, y, z), (w, i, j, k), float(m.cam_fovy[row]))
+
+
+def place_cameras(spec: mujoco.MjSpec, cameras: Sequence[Camera]) -> None:
+    """Put cameras into a spec, in place of those of their names.
+
+    Raises:
+        RenderError: A camera's body is not there.
+    """
+    for camera in cameras:
+        for there in list(spec.cameras):
+            if there.name == camera.name:
+                spec.delete(there)
+        body = spec.worldbody if camera.body is None else spec.body(camera.body)
+        if body is None:
+            raise RenderError(
+                "the body that carries a camera is not in the scene", where=camera.name, found=camera.body
+            )
+        body.add_camera(name=camera.name, pos=list(camera.position), quat=list(camera.quaternion), fovy=camera.fovy)

@@ -1,0 +1,87 @@
+"""Everything that can be set about the networks that paint robot and background, and their training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class FlowNetworkCfg:
+    """Sizes of the U-Net."""
+
+    size: int = 64
+    """Edge of the images [px], a multiple of 2 for each level but the first."""
+    width: int = 64
+    """Channels of the first level."""
+    factors: tuple[int, ...] = (1, 2, 4)
+    """Channels of each level, relative to the first; each level halves the resolution of the one before."""
+    blocks: int = 1
+    """Residual blocks of a level, on the way down; one more on the way up."""
+    posed: bool = False
+    """Whether the end-effector's pose is a condition, as for a camera on the wrist."""
+
+
+@dataclass(frozen=True)
+class SuperResolutionCfg:
+    """Sizes of the network."""
+
+    width: int = 64
+    """Channels."""
+    blocks: int = 8
+    """Residual blocks."""
+    scale: float = 0.1
+    """Factor on what a block adds, which keeps deep networks stable."""
+
+
+@dataclass(frozen=True)
+class NetworkTrainCfg:
+    """Training of one network."""
+
+    steps: int = 20_000
+    """Steps of the optimiser."""
+    batch: int = 32
+    """Images of a step."""
+    learning_rate: float = 3e-4
+    """Learning rate after the warm-up; it falls to a tenth along a cosine."""
+    warm_up: int = 200
+    """Steps in which the learning rate rises."""
+    ema: float = 0.999
+    """Share of the running mean of the weights that a step keeps (Polyak and Juditsky 1992)."""
+
+
+@dataclass(frozen=True)
+class AugmentCfg:
+    """What is done to the conditions, so that errors of what was drawn before do not grow (paper: autoregressive)."""
+
+    back: int = 5
+    """How many frames older than it is the previous image may be, at most; 1 for the very frame before. A network that
+    has seen such ones looks at the simulation for where the robot is."""
+    blank: float = 0.3
+    """Share of the previous images that are replaced by the mean image, with which drawing begins."""
+    noise: float = 0.06
+    """Largest deviation of noise on the previous image, of colours in -1..1."""
+    colour: float = 0.1
+    """Largest change of brightness, contrast and saturation of the previous image."""
+    blur: float = 0.3
+    """Share of the previous images that are blurred."""
+
+
+@dataclass(frozen=True)
+class RenderTrainCfg:
+    """Training of all networks."""
+
+    seed: int = 0
+    """Seed of everything drawn at random."""
+    flow: NetworkTrainCfg = field(default_factory=NetworkTrainCfg)
+    enlarge: NetworkTrainCfg = field(default_factory=lambda: NetworkTrainCfg(batch=16))
+    """Training of the super-resolution."""
+    network: FlowNetworkCfg = field(default_factory=FlowNetworkCfg)
+    """Sizes of the flow's U-Net; the pose is a condition where the camera moves."""
+    super_resolution: SuperResolutionCfg = field(default_factory=SuperResolutionCfg)
+    augment: AugmentCfg = field(default_factory=AugmentCfg)
+    crop: int = 24
+    """Edge of the pieces that the super-resolution learns from, in its input [px]."""
+    checkpoint: float = 60.0
+    """Time between checkpoints [s]."""
+    half: bool = False
+    """Multiply in bfloat16, which is quicker."""

@@ -1,0 +1,105 @@
+"""Episodes of many worlds on their way to a data set: rendered frame by frame, kept or dropped when they end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from concent_warp.render.composite import HybridCamera
+from concent_warp.render.dataset.layout import DatasetWriter, EpisodeWriter
+from concent_warp.render.dataset.video import VideoWriter
+from concent_warp.render.figure import Album
+from concent_warp.render.pairs import to_bytes
+
+FILMS = "films"
+"""Folder of the videos to look at, in that of the data set."""
+
+
+class Filming:
+    """What W worlds do, as images in a data set."""
+
+    def __init__(
+        self,
+        camera: HybridCamera,
+        writer: DatasetWriter,
+        task: str,
+        *,
+        films: Path | None = None,
+        first_films: int = 0,
+        rate: int = 20,
+    ) -> None:
+        """Take up filming.
+
+        Args:
+            camera: Renders the worlds.
+            writer: The data set.
+            task: What is being done, in words.
+            films: Folder for videos of the cameras side by side, besides the data set.
+            first_films: How many episodes to make such videos of: those with the lowest numbers.
+            rate: Frames a second.
+        """
+        self.camera, self.writer, self.task = camera, writer, task
+        self.album = Album()
+        """Frames of the first episode that is kept or dropped."""
+        self._films, self._first, self._rate = films, first_films, rate
+        self._open: dict[int, tuple[int, EpisodeWriter, VideoWriter | None]] = {}
+        self._images = np.zeros(0, dtype=np.uint8)
+        self._watched: int | None = None
+        self.kept = self.dropped = 0
+
+    def begin(self, keys: Sequence[int | None]) -> None:
+        """Begin an episode in each of the W worlds, by its number in the data set; None for a world that idles."""
+        self.camera.begin()
+        for world, key in enumerate(keys):
+            if key is None:
+                continue
+            film = None
+            if self._films is not None and key < self._first:
+                self._films.mkdir(parents=True, exist_ok=True)
+                height, width = self.camera.size
+                size = (height, width * len(self.camera.cameras))
+                film = VideoWriter(self._films / f".partial-{key:06d}.mp4", self._rate, size)
+            self._open[world] = (key, self.writer.begin(key, self.task), film)
+            if self._watched is None:
+                self._watched = world
+
+    @property
+    def running(self) -> list[int]:
+        """Worlds whose episode has not ended."""
+        return list(self._open)
+
+    def shoot(self, qpos: torch.Tensor | np.ndarray, mocap: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
+        """Render all worlds as they are, qpos (W, nq) and mocap as for `HybridCamera.shoot`."""
+        layers = self.camera.shoot(qpos, mocap)
+        self._images = to_bytes(layers.image).cpu().numpy()
+        if self._watched is not None and self._watched in self._open:
+            self.album.add(layers, self._watched)
+
+    def add(self, world: int, state: np.ndarray, action: np.ndarray) -> None:
+        """Add the frame of a world, with its state and the action taken in it."""
+        _, episode, film = self._open[world]
+        images = dict(zip(self.camera.cameras, self._images[world], strict=True))
+        episode.add(images, state, action)
+        if film is not None:
+            film.add(np.concatenate(list(images.values()), axis=1))
+
+    def end(self, world: int, *, keep: bool) -> None:
+        """End the episode of a world."""
+        key, episode, film = self._open.pop(world)
+        if film is not None and self._films is not None:
+            film.close()
+            (self._films / f".partial-{key:06d}.mp4").replace(self._films / f"episode_{key:06d}.mp4")
+        if keep:
+            episode.save()
+            self.kept += 1
+        else:
+            episode.drop()
+            self.dropped += 1
+
+    def leave(self) -> None:
+        """Forget the episodes that have not ended."""
+        for _, episode, _ in self._open.values():
+            episode.discard()
+        self._open.clear()
