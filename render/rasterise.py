@@ -52,7 +52,7 @@ class Rasteriser:
         worlds: W.
         cameras: C, cameras in a world.
         capacity: pairs of Gaussian and 8 or 16 pixel tile that an image has room for on average; all images share them.
-            None takes twice what the first images need. See `overflow`.
+            None takes twice what the first images need, and makes room when `render` needs more. See `overflow`.
         device: where to render, "cpu" or "cuda:0".
         tile: edge of a tile [px], by default what is quickest on the device.
         antialias: take back the opacity that Gaussians smaller than a pixel gain where they are blurred to its width.
@@ -124,7 +124,7 @@ class Rasteriser:
             light=None if ground is None else wp.from_torch(self.light, dtype=wp.vec3),
             ground=ground or 0.0,
         )
-        self._measured = capacity is not None
+        self._measured = self._limited = capacity is not None
         self._make(worlds * cameras * (4 * len(self.splats) if capacity is None else capacity))
         self.launches = 0
 
@@ -173,6 +173,10 @@ class Rasteriser:
         """
         self._set(object_poses, camera_poses, intrinsics, depth)
         self.launch()
+        # Where a camera comes near, a Gaussian covers many tiles.
+        if not self._limited and int(self.overflow.sum()):
+            self._make(int(HEADROOM * int(self.pairs.sum())))
+            self.launch()
         return self.layer()
 
     def launch(self) -> None:

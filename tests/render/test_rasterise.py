@@ -91,6 +91,15 @@ def test_room_is_measured_at_first_and_want_of_it_is_said():
     measuring.check_room()
 
 
+def test_room_is_made_when_a_camera_comes_near():
+    objects = poses((0.0, 0, 0))[None]
+    growing, ample = (Rasteriser([ball([1.0, 0, 0])], 64, 64, capacity=room) for room in (None, 100_000))
+    for height in (0.8, 0.06):
+        found = [r.render(objects, poses((0.0, 0, height)), intrinsics_of(30.0, 64, 64)) for r in (growing, ample)]
+        growing.check_room()
+        assert torch.equal(found[0].rgb, found[1].rgb)
+
+
 def test_recorded_launch_follows_the_buffers(pair):
     rasteriser, objects, cameras, intrinsics = pair
     rasteriser.render(objects, cameras, intrinsics)
