@@ -87,8 +87,7 @@ class Stage:
         import torch
 
         rows = camera_ids(self.model, cameras)
-        quaternion = torch.as_tensor(matrix_quaternions(self._camera_matrix[:, rows].cpu().numpy()))
-        return torch.cat([self.camera_position[:, rows], quaternion.to(self.camera_position)], dim=-1)
+        return torch.cat([self.camera_position[:, rows], matrix_quaternions(self._camera_matrix[:, rows])], dim=-1)
 
     def _pose(self) -> None:
         """Launch what poses follow from the positions."""
@@ -185,14 +184,15 @@ class Launches:
 
         stream = wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(self._device)))
         with wp.ScopedDevice(self._device), wp.ScopedStream(stream):
-            if self._graph is None:
-                self._launches()
-                wp.synchronize_device(self._device)
-                with wp.ScopedCapture() as captured:
-                    self._launches()
-                self._graph = captured.graph
-            else:
+            if self._graph is not None:
                 wp.capture_launch(self._graph, stream=stream)
+                return
+            self._launches()
+            wp.synchronize_device(self._device)
+        # On a stream of Warp's own: torch's may be the one that cannot be captured.
+        with wp.ScopedDevice(self._device), wp.ScopedCapture() as captured:
+            self._launches()
+        self._graph = captured.graph
 
 
 def bare(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -261,9 +261,24 @@ def intrinsics(model: mujoco.MjModel, cameras: Sequence[str], size: tuple[int, i
     return found
 
 
-def matrix_quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Return unit quaternions wxyz (..., 4) of rotation matrices (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
+def matrix_quaternions(matrices: torch.Tensor) -> torch.Tensor:
+    """Return unit quaternions wxyz (..., 4) of rotation matrices (..., 3, 3).
 
-    flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
-    return flat[:, [3, 0, 1, 2]].reshape(*matrices.shape[:-2], 4)
+    Of the four rows of q q^T, each 4 q_i q, that of the largest number is taken (Shepperd, J. Guid. Control 1, 1978).
+    """
+    import torch
+
+    m = matrices
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    rows = [
+        torch.stack([1 + xx + yy + zz, wx, wy, wz], dim=-1),
+        torch.stack([wx, 1 + xx - yy - zz, xy, xz], dim=-1),
+        torch.stack([wy, xy, 1 - xx + yy - zz, yz], dim=-1),
+        torch.stack([wz, xz, yz, 1 - xx - yy + zz], dim=-1),
+    ]
+    largest = torch.stack([row[..., i] for i, row in enumerate(rows)], dim=-1).argmax(dim=-1)
+    choice = largest[..., None, None].expand(*largest.shape, 1, 4)
+    chosen = torch.stack(rows, dim=-2).gather(-2, choice).squeeze(-2)
+    return chosen / chosen.norm(dim=-1, keepdim=True)

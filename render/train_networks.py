@@ -202,6 +202,8 @@ class RenderTraining:
             "generator": self.generator.get_state(),
             "random": torch.get_rng_state(),
         }
+        if self.device.type == "cuda":
+            state["random of the device"] = torch.cuda.get_rng_state(self.device)
         partial = self.folder / f".{CHECKPOINT}.partial"
         torch.save(state, partial)
         partial.replace(self.folder / CHECKPOINT)
@@ -228,6 +230,8 @@ class RenderTraining:
             training.restore(state["trainings"][name])
         self.generator.set_state(state["generator"].cpu())
         torch.set_rng_state(state["random"].cpu())
+        if self.device.type == "cuda" and "random of the device" in state:
+            torch.cuda.set_rng_state(state["random of the device"].cpu(), self.device)
 
 
 ENLARGE = "super-resolution"

@@ -103,3 +103,17 @@ def test_figure_has_a_row_for_each_sample_and_camera(tmp_path):
     assert picture is not None
     assert picture.shape[1] / picture.shape[0] == pytest.approx(5 / 4, rel=0.1)
     assert len(camera_ids(Scene(XML).model, camera.cameras)) == 2
+
+
+@pytest.mark.gpu
+def test_hybrid_images_of_a_gpu_are_those_of_the_cpu():
+    found = []
+    for device in ("cpu", "cuda:0"):
+        camera = HybridCamera(
+            Scene(XML).model, ["base", "wrist"], SIZE, 2, objects=["ball"], splats={"ball": ball().to(device)},
+            shadows=ShadowCfg(), device=device,
+        )  # fmt: skip
+        for t in range(3):
+            layers = camera.shoot(states(t, 2))
+        found.append(layers.image.cpu())
+    assert (found[0] - found[1]).abs().mean() < 0.003

@@ -175,3 +175,18 @@ def test_columns_are_those_of_the_rotation():
 
 def test_frame_before_the_first_is_none():
     assert frames_before([3, 2]).tolist() == [-1, 0, 1, -1, 3]
+
+
+@pytest.mark.gpu
+def test_training_on_a_gpu_goes_on_and_paints(tmp_path):
+    cfg = replace(CFG, half=True)
+    training = RenderTraining([pairs("wrist", "hand")], cfg, tmp_path, device="cuda:0")
+    training.learn()
+    again = RenderTraining([pairs("wrist", "hand")], cfg, tmp_path, device="cuda:0")
+    again.resume()
+    assert again.trainings["wrist"].done == cfg.flow.steps
+    painter = Painter.load(tmp_path, device="cuda:0", half=True)
+    painter.begin(2)
+    painted = painter.paint(["wrist"], torch.rand(2, 1, 64, 64, 3, device="cuda:0"), [torch.zeros(2, 9)])
+    assert painted.shape == (2, 1, 64, 64, 3)
+    assert painted.device.type == "cuda"

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from concent_warp.render.raw import RawCamera, Stage, camera_ids
+from concent_warp.render.raw import RawCamera, Stage, camera_ids, matrix_quaternions
 
 from concent_warp.errors import RenderError, SceneError
 from concent_warp.scene.cameras import BASE, WRIST, with_cameras
@@ -132,3 +132,34 @@ def test_camera_that_is_not_there_is_said_in_one_sentence(sorter):
         RawCamera(Stage(sorter[0], 1), ["side"], SIZE)
     with pytest.raises(SceneError, match="no such camera"):
         with_cameras(Scene(XML), ["wrist"])
+
+
+def test_quaternions_are_those_of_the_matrices_whatever_the_rotation():
+    rng = np.random.default_rng(0)
+    given = rng.normal(size=(200, 4))
+    given[:3] = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]  # half turns
+    given /= np.linalg.norm(given, axis=1, keepdims=True)
+    matrices = np.zeros((200, 9))
+    for matrix, quaternion in zip(matrices, given, strict=True):
+        mujoco.mju_quat2Mat(matrix, quaternion)
+    found = matrix_quaternions(torch.tensor(matrices).view(10, 20, 3, 3)).view(200, 4).numpy()
+    assert np.allclose(np.abs((found * given).sum(axis=1)), 1, atol=1e-9)
+
+
+@pytest.mark.gpu
+def test_images_of_a_gpu_are_those_of_the_cpu(sorter):
+    model, qpos = sorter
+    states = np.tile(qpos, (4, 1))
+    states[:, 0] += np.linspace(0, 0.3, 4)
+    found = []
+    for device in ("cpu", "cuda:0"):
+        stage = Stage(model, 4, device=device)
+        camera = RawCamera(stage, [BASE, WRIST], (64, 64))
+        for _ in range(3):  # the third one is a replay of what the first recorded
+            stage.place(states)
+            images = camera.render()
+        found.append([t.cpu() for t in (images.rgb, images.depth, images.segmentation)])
+    same = found[0][2] == found[1][2]
+    assert same.float().mean() > 0.99
+    assert (found[0][1] - found[1][1])[same].abs().max() < 1e-3
+    assert (found[0][0] - found[1][0])[same].abs().max() < 0.02
