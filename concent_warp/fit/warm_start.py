@@ -17,7 +17,7 @@ import numpy as np
 from concent_warp.errors import EngineError, ModelError
 from concent_warp.fit.gradient import Descent, Metric, chosen_iterates, descend, identity, start_descent
 from concent_warp.fit.horizon import gradient_segments
-from concent_warp.fit.newton_loss import NewtonLoss
+from concent_warp.fit.newton_loss import NewtonLoss, mujoco_loss
 from concent_warp.fit.newton_scene import newton_scene
 from concent_warp.fit.perturbation import Perturbation
 from concent_warp.recording.recording import Demonstration
@@ -98,10 +98,12 @@ class Warming:
 
             self.descend(state, loss, keep)
         best, after = self.judged(state)
+        if best is None:
+            return self.without_help("gradients do not help here: Newton tells of another motion", state.losses)
         text = (
             f"best iterate {1e3 * self.metres(after):.2f} mm in MuJoCo, start {1e3 * self.metres(self.before):.2f} mm"
         )
-        if best is None or after > (1 - cfg.gain) * self.before:
+        if after > (1 - cfg.gain) * self.before:
             return self.without_help(f"gradients do not help here ({text})", state.losses)
         search.seconds += time.perf_counter() - self.begun
         return WarmStart(True, best, self.before, after, f"gradients helped: {text}", state.losses)
@@ -118,6 +120,8 @@ class Warming:
         while not state.finished:
             descend(state, loss, self.base, metric, cfg, self.bounded)
             count = len(state.losses)
+            if count == 1 and state.losses[0][0] > cfg.disagreement * mujoco_loss(loss.objective, loss.scene):
+                state.kept, state.kept_start, state.finished = [], [], True
             if count == cfg.probe and not state.finished:
                 state.finished = self.judged(state)[1] >= self.before
             keep((time.perf_counter() - begun) / (count - before) * (cfg.iterations - count))

@@ -53,6 +53,16 @@ def test_the_resolved_settings_are_beside_the_results(run):
     assert {"concent-warp", "mujoco", "python"} <= set(document["versions"])
 
 
+def test_gradients_are_tried_and_it_is_said_whether_they_helped(bench, tmp_path, capsys):
+    more = ("--method", "gradient+es", "--fit.gradient.starts", "2", "--fit.gradient.iterations", "3")
+    assert fit(bench, tmp_path / "run", *more, "--fit.generations", "1") == 0
+    found = json.loads((tmp_path / "run" / "history.json").read_text())
+    assert found["gradients"]["remark"][:40] in capsys.readouterr().out
+    assert ("gradients helped" in found["gradients"]["remark"]) == found["gradients"]["helped"]
+    assert found["generations"][-1]["generation"] == 1
+    assert (tmp_path / "run" / "checkpoint.descent.npz").is_file()
+
+
 def test_a_run_is_not_overwritten_unasked(bench, run, capsys):
     before = (run / "model.toml").stat().st_mtime_ns
     assert fit(bench, run) == 2

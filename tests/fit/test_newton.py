@@ -137,6 +137,13 @@ def test_without_help_from_gradients_the_strategy_goes_on_alone(pushed, thick):
     assert found.history[-1]["simulations"] > alone.history[-1]["simulations"]
 
 
+def test_another_motion_in_newton_ends_the_descent_at_once(pushed, thick):
+    cfg = FitCfg(gradient=replace(SMALL, disagreement=0.1), generations=1)
+    found = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco")
+    assert "another motion" in found.gradients.remark
+    assert len(found.gradients.losses) == 1
+
+
 def test_what_newton_cannot_do_is_left_to_the_strategy(drop, swollen):
     cfg = FitCfg(gradient=replace(SMALL, newton=NewtonCfg(shortest_step=1e-3)), generations=1)
     found = fit_geometry(swollen, drop, cfg, method="gradient+es", engine="mujoco")
