@@ -275,7 +275,11 @@ class Search:
         if evolution.generation == 0 and not (self.gradients and self.gradients.helped):
             survey = self.flattened(survey, [*segments, *self.held_out])
         if evolution.generation == 0:
-            evolution.scale_to(np.sqrt(survey.loss) if cfg.squared else survey.loss)
+            loss = survey.loss
+            if self.gradients and self.gradients.helped:
+                # At the same distance the strategy itself would still take larger steps: it comes from farther away.
+                loss = float(np.sqrt(self.gradients.before * self.gradients.after))
+            evolution.scale_to(np.sqrt(loss) if cfg.squared else loss)
         self.note(survey)
         mask = survey.mask
         values = evolution.ask(mask, self.rng)

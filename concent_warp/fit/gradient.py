@@ -32,17 +32,17 @@ from concent_warp.scene.contact_geometry import ContactGeometry
 class GradientCfg:
     """Settings of the descent."""
 
-    starts: int = 3
-    """Geometries to start from, all at once: the model's, and disturbed ones."""
-    iterations: int = 24
+    starts: int = 2
+    """Geometries to start from, all at once: the model's, then disturbed ones."""
+    iterations: int = 16
     """Steps of each start at most."""
     step: float | None = None
     """Length of the first step of the sphere that moves farthest [m]. None takes a third of the starting distance, at
     most `largest_step`."""
     largest_step: float = 1.5e-3
     """Longest first step that is chosen by itself [m]."""
-    patience: int = 5
-    """Steps in which no start got better by a hundredth, after which the descent ends."""
+    patience: int = 4
+    """Steps in which no start got better by 3 %, after which the descent ends."""
     smallest_step: float = 2e-5
     """A start whose steps are shorter is finished [m]."""
     prior: float = 5.0
@@ -227,7 +227,7 @@ def descend(
     state.now = bounded(state.best + state.step[:, None, None] * state.direction)
     goes_on = (state.step > cfg.smallest_step) & np.isfinite(state.lowest)
     state.lows.append(float(state.lowest.min()))
-    stale = len(state.lows) > cfg.patience and state.lows[-1] > 0.99 * state.lows[-1 - cfg.patience]
+    stale = len(state.lows) > cfg.patience and state.lows[-1] > 0.97 * state.lows[-1 - cfg.patience]
     state.finished = len(state.losses) >= cfg.iterations or stale or not goes_on.any()
 
 
