@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from concent_warp.errors import RecordingError
+from concent_warp.reality.footage import FootageCfg, developed, footage
+from concent_warp.reality.record import RealityCfg
+from concent_warp.recording.hdf5 import read_hdf5, write_hdf5
+from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.recording.tracking import chosen_stream
+from concent_warp.scene.cameras import add_cameras
+from concent_warp.scene.shape_sorter import home
+
+CFG = FootageCfg(cameras=("base", "wrist"), size=(64, 64), noise=0.0, samples=1)
+
+
+@pytest.fixture(scope="module")
+def streams():
+    """Return footage of two postures, with the objects and without."""
+    cfg = RealityCfg()
+    scene = cfg.task.build()
+    world = cfg.world.build(scene)
+    qpos = np.tile(home(world.compile()), (2, 1))
+    qpos[1, 0] += 0.3
+    rng = np.random.default_rng(0)
+    return [
+        footage(replace(CFG, objects=there), world, scene.objects(), np.array([0.0, 0.1]), qpos, rng)
+        for there in (True, False)
+    ], scene, qpos  # fmt: skip
+
+
+def test_objects_are_left_out_of_the_images_and_nothing_else_is(streams):
+    (there, gone), scene, _ = streams
+    before = np.abs(there["base"].rgb.astype(int) - gone["base"].rgb).max(axis=-1)[0] > 8
+    assert 5 < before.sum() < 0.1 * before.size
+    spec = scene.spec()
+    add_cameras(spec, scene.objects())
+    block = Pixel(there["base"], spec.compile()).of("block")
+    assert before[block[1] - 1 : block[1] + 2, block[0] - 1 : block[0] + 2].any()
+
+
+class Pixel:
+    """Where a body is in the images of a fixed camera, by the calibration that came with them."""
+
+    def __init__(self, stream, model: mujoco.MjModel) -> None:
+        self.stream, self.data = stream, mujoco.MjData(model)
+        self.data.qpos[:] = home(model)
+        mujoco.mj_kinematics(model, self.data)
+
+    def of(self, body: str) -> tuple[int, int]:
+        local = self.stream.pose[:3, :3].T @ (self.data.body(body).xpos - self.stream.pose[:3, 3])
+        u, v, _ = self.stream.intrinsics @ (local / local[2])
+        return round(u), round(v)
+
+
+def test_wrist_camera_is_on_the_hand_and_sees_other_things_when_the_arm_turns(streams):
+    (there, _), _, _ = streams
+    assert there["base"].body is None
+    assert there["wrist"].body == "hand"
+    still, moved = (np.abs(np.diff(there[name].rgb.astype(int), axis=0)).mean() for name in ("base", "wrist"))
+    assert moved > 2 * still > 0
+
+
+def test_camera_on_a_body_is_kept_in_the_file_and_no_points_are_tracked_from_it(streams, tmp_path):
+    (there, _), scene, qpos = streams
+    demonstration = Demonstration("demo_0", qpos=qpos[0], image=there)
+    write_hdf5(Recording(scene.xml, (demonstration,)), tmp_path / "demo.h5")
+    read = read_hdf5(tmp_path / "demo.h5")[0]
+    assert read.image["wrist"].body == "hand"
+    assert read.image["base"].body is None
+    assert np.allclose(read.image["wrist"].pose, there["wrist"].pose)
+    with pytest.raises(RecordingError, match="stands still"):
+        chosen_stream(read, "wrist", "demo")
+    nobody = replace(there["wrist"], body="elbow")
+    with pytest.raises(RecordingError, match=r"a body that the scene lacks.*elbow"):
+        write_hdf5(Recording(scene.xml, (replace(demonstration, image={"wrist": nobody}),)), tmp_path / "bad.h5")
+
+
+def test_tone_curve_keeps_black_and_order():
+    levels = developed(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1))
+    assert np.allclose(levels[0], 0)
+    assert (np.diff(levels, axis=0) >= 0).all()
