@@ -144,8 +144,8 @@ class HybridCamera:
             mocap: Places [m] (W, nmocap, 3) and orientations wxyz (W, nmocap, 4) of what is fixed where a world has it.
         """
         self.stage.place(qpos, mocap)
-        raw = self._raw.render().rgb
-        solid = self._solid.render() if self._solid is not self._raw else self._raw.render()
+        whole = self._raw.render()
+        solid = whole if self._solid is self._raw else self._solid.render()
         background = solid.rgb
         if self.painter is not None:
             empty = solid.rgb if self._empty is self._solid else self._empty.render().rgb
@@ -164,4 +164,4 @@ class HybridCamera:
             if self._shadows is not None:
                 shadow = self._shadows.render(places, eyes, self._intrinsics, solid.depth)
         image = composed(background, objects, alpha, shadow)
-        return Layers(raw, background, objects, alpha, shadow, image)
+        return Layers(whole.rgb, background, objects, alpha, shadow, image)
