@@ -169,6 +169,8 @@ def summary(rows: dict[str, dict[str, Any]], scene: str, device: str) -> list[st
     ]
     equal = [at_budget(m["curve"], f["simulations"], "fitted") for m, f in zip(mixed, final, strict=True)]
 
+    alike = [reached(e["curve"], SLACK * m["curve"][0]["fitted"], "fitted") for e, m in pairs]
+
     def text(values: list[float]) -> str:
         return f"{np.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
 
@@ -181,13 +183,14 @@ def summary(rows: dict[str, dict[str, Any]], scene: str, device: str) -> list[st
         text([r["curve"][0]["fitted"] for r in mixed]),
         text([f["fitted"] for f in final]),
         text(equal),
+        text(ratio),
         text([f["unseen"] for f in final]),
         text([r["curve"][-1]["unseen"] for r in mixed]),
         f"{np.median([f['simulations'] for f in final]):.0f}",
         f"{np.median([r['curve'][0]['simulations'] for r in mixed]):.0f}",
+        f"{np.median(alike):.0f}" if np.isfinite(np.median(alike)) else "not reached",
         f"{np.median(share):.2f}" if np.isfinite(np.median(share)) else "not reached",
         f"{sum(s <= 1 / 3 for s in share)} of {len(share)}",
-        f"{np.median(ratio):.2f}",
         f"{np.median([f['seconds'] for f in final]):.0f}",
         f"{np.median([r['curve'][0]['seconds'] for r in mixed]):.0f}",
     ]
@@ -202,17 +205,20 @@ def report(args: Args) -> None:
     assert __doc__ is not None
     text = ["# Evolution strategy, gradients, and both", "", "\n".join(__doc__.split("\n")[2:6]).strip(), ""]
     text += [
-        "`python benchmarks/es_vs_gradient.py`. Medians over seeds (range); errors in mm. *gradient*: the iterate",
-        "that gradients end with, as scored in MuJoCo; *helped*: seeds in which it beat the start by 5 %, so",
-        "that the strategy began there, else at the start. *at equal budget*: gradient+es after as many simulations as",
-        "es took in all. *share*: simulations until gradient+es is within 5 % of the final error of es, relative to",
-        "those of es; *a third*: seeds in which that is at most a third. *ratio*: error at equal budget over es.",
+        "`python benchmarks/es_vs_gradient.py`. Medians over seeds (range); errors in mm.",
+        "",
+        "- *gradient*: the iterate that gradients end with, as scored in MuJoCo. *helped*: seeds in which it beat the",
+        "  start by 5 %, so that the strategy began there, else at the start.",
+        "- *at equal budget*: gradient+es after as many simulations as es took in all; *ratio*: relative to es.",
+        "- *of es to the error of gradient*: simulations after which es is within 5 % of it.",
+        "- *share*: simulations until gradient+es is within 5 % of the final error of es, relative to those of es;",
+        "  *a third*: seeds in which that is at most a third.",
         "",
     ]
     head = [
-        "scene", "seeds", "helped", "start", "gradient", "es", "gradient+es at equal budget", "es, unseen",
-        "gradient+es, unseen", "simulations of es", "of gradient", "share", "a third", "ratio", "seconds of es",
-        "of gradient",
+        "scene", "seeds", "helped", "start", "gradient", "es", "gradient+es at equal budget", "ratio", "es, unseen",
+        "gradient+es, unseen", "simulations of es", "of gradient", "of es to the error of gradient", "share", "a third",
+        "seconds of es", "of gradient",
     ]  # fmt: skip
     for device in devices:
         facts = next(r["machine"] for key, r in rows.items() if key.endswith(device))
@@ -223,7 +229,7 @@ def report(args: Args) -> None:
     write_data(NAME, {key: {k: v for k, v in row.items() if k != "machine"} for key, row in rows.items()})
     page = FOLDER / f"{NAME}.md"
     said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
-    text += [f"## What it says{said[0]}"] if said else []
+    text += [f"## What it says{part}" for part in said]
     write_page(NAME, "\n".join(text))
 
 

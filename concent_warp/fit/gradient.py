@@ -53,8 +53,8 @@ class GradientCfg:
     """Steps after which iterates are scored in MuJoCo for the first time: where none of them is better than the start,
     the descent ends."""
     disagreement: float = 5.0
-    """How many times farther from what was observed than in MuJoCo the start may be in Newton, on the same stretches:
-    where it is more, Newton tells of another motion, as of a grasp that slips, and its gradients are not followed."""
+    """How many times farther from what was observed all starts may be in Newton than the model is in MuJoCo, on the
+    same stretches: beyond that Newton tells of another motion, as of a grasp that slips, and is not followed."""
     gain: float = 0.05
     """Share by which the best of them must lie below the start, or gradients count as of no help."""
     horizon: HorizonCfg = field(default_factory=HorizonCfg)

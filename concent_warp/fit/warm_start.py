@@ -120,7 +120,7 @@ class Warming:
         while not state.finished:
             descend(state, loss, self.base, metric, cfg, self.bounded)
             count = len(state.losses)
-            if count == 1 and state.losses[0][0] > cfg.disagreement * mujoco_loss(loss.objective, loss.scene):
+            if count == 1 and min(state.losses[0]) > cfg.disagreement * mujoco_loss(loss.objective, loss.scene):
                 state.kept, state.kept_start, state.finished = [], [], True
             if count == cfg.probe and not state.finished:
                 state.finished = self.judged(state)[1] >= self.before

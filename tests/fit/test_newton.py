@@ -185,6 +185,13 @@ def test_tumbling_is_cut_into_windows_and_pushing_is_not(pushed, thick):
     assert np.abs(np.concatenate(seen)[:, None] - held).min() > 2e-3
 
 
+@pytest.mark.gpu
+def test_gradients_on_cuda_are_those_on_the_cpu(pushed, thick):
+    here, there = (recording_gradient(thick, pushed, device=device) for device in ("cpu", "cuda:0"))
+    assert there.loss == pytest.approx(here.loss, rel=1e-3)
+    np.testing.assert_allclose(there.position, here.position, rtol=0.02, atol=0.02 * np.abs(here.position).max())
+
+
 def test_numbers_keep_the_rules_of_stability():
     body = Inertia("block", 0.08, np.diag([2.1e-5] * 3), np.zeros(3))
     corners = np.array(np.meshgrid([-0.02, 0.02], [-0.02, 0.02], [-0.02])).reshape(3, -1).T
