@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import tyro
 from gradient_scenes import SCENES, SceneName, record, starting_model
-from pages import machine, machine_line, table, write_data, write_page
+from pages import FOLDER, machine, machine_line, table, write_data, write_page
 
 from concent_warp.fit.horizon import shortened
 from concent_warp.fit.newton_loss import NewtonLoss
@@ -138,6 +138,9 @@ def main(args: Args) -> list[dict[str, Any]]:
             worst = f"{cell(float(np.median(error)))} ({cell(float(error.max()))})"
             lines.append([WORDS[scene], f"{horizon:g}", steps, worst, *factors, f"{size:.2g}"])
     text += [table(head, lines)]
+    page = FOLDER / f"{NAME}.md"
+    said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
+    text += [f"## What it says{part}" for part in said]
     write_data(NAME, {"machine": facts, "rows": [{k: as_number(v) for k, v in r.items()} for r in rows]})
     write_page(NAME, "\n".join(text))
     return rows
