@@ -54,7 +54,7 @@ class Args:
     fit: FitCfg = FIT
     engine: EngineName = "mujoco"
     device: str = "cpu"
-    """Named in the results; gradients run on CUDA where there is a device."""
+    """Where Newton runs; MuJoCo runs where `engine` does."""
     seconds: float | None = None
     """No fit is begun after so long."""
     report: bool = False
@@ -97,7 +97,7 @@ def run(args: Args, scene: SceneName, seed: int, method: MethodName) -> dict[str
     """Run one fit and judge its estimate after each generation."""
     recording = record(scene, seed)
     model = starting_model(scene, recording, seed)
-    cfg = replace(args.fit, seed=seed)
+    cfg = replace(args.fit, seed=seed, gradient=replace(args.fit.gradient, device=args.device))
     shown = [recording["demo_0"]]
     curve: list[dict[str, float]] = []
     judging = 0.0

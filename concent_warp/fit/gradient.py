@@ -57,6 +57,8 @@ class GradientCfg:
     same stretches: beyond that Newton tells of another motion, as of a grasp that slips, and is not followed."""
     gain: float = 0.05
     """Share by which the best of them must lie below the start, or gradients count as of no help."""
+    device: str | None = None
+    """Where Newton runs, "cpu" or "cuda:0"; None takes CUDA where there is a device."""
     horizon: HorizonCfg = field(default_factory=HorizonCfg)
     newton: NewtonCfg = field(default_factory=NewtonCfg)
 

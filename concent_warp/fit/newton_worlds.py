@@ -66,6 +66,7 @@ class NewtonWorlds:
         self.chunks = -(-scene.steps // self.chunk)
         with wp.ScopedDevice(self.device):
             self._model = self._build(newton)
+            self._control = self._model.control()
             self._solver = newton.solvers.SolverSemiImplicit(self._model, angular_damping=0.0)
             self._allocate(newton)
         self._graphs: dict[str, Any] = {}
@@ -228,7 +229,7 @@ class NewtonWorlds:
         from concent_warp.kernels import newton_contacts as kernels
 
         scene, pairs, fixed, position = self.scene, self._pairs, self._fixed, self.parameters["position"]
-        bodies, control = len(scene.bodies), self._model.control()
+        bodies, control = len(scene.bodies), self._control
         self._force.zero_()
         for k in range(steps):
             contacts = self._contacts[k]
@@ -353,6 +354,7 @@ class NewtonWorlds:
         """Return the rows of the simulated bodies in an array of poses, without a copy."""
         import warp as wp
 
+        # Torch's default stream and Warp's wait for one another, so that neither needs to be told.
         shape = (array.shape[0], self.worlds, len(self.scene.bodies), 7)
         return wp.to_torch(array, requires_grad=False).view(shape)[:, :, : len(self.scene.moving)]
 

@@ -86,7 +86,8 @@ class Warming:
         if not state.finished:
             model = search.model.with_geometry(search.evolution.geometry(self.start))
             try:
-                loss = NewtonLoss(newton_scene(model, segments, cfg.newton), cfg.starts, squared=search.cfg.squared)
+                scene = newton_scene(model, segments, cfg.newton)
+                loss = NewtonLoss(scene, cfg.starts, squared=search.cfg.squared, device=cfg.device)
             except (EngineError, ModelError) as error:
                 return self.without_help(f"gradients are not to be had here: {error}", [])
 
