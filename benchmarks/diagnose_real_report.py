@@ -41,11 +41,9 @@ two-sided and not corrected. Windows of one log are not independent, so that the
 """
     for part in ("tosses", "servo"):
         if part in result:
-            text += (
-                f"\n{machine_line(result[part]['machine'])} The {part} took {result[part]['seconds']:.0f} s in all.\n"
-            )
-    for said in result.get("servo", {}).get("unfinished", []):
-        text += f"\nDiagnosed, but stopped before it was judged: {said}\n"
+            spent, remark = result[part]["seconds"], result[part].get("remark", "")
+            line = f"{machine_line(result[part]['machine'])} The {part} took {spent:.0f} s in all. {remark}"
+            text += f"\n{line.rstrip()}\n"
     for study in studies:
         text += section(study)
     return text
