@@ -21,7 +21,13 @@ def served():
     """Give the address of a policy that is being shown, and end it as a user does."""
     command = [sys.executable, "-m", "concent_warp", "play", "--pretrained", "--states", "2", "--port", "8765"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+
+    def interruptible() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell that runs the tests in the background ignores it
+
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment, preexec_fn=interruptible
+    ) as process:
         assert process.stdout is not None
         line = next(text for text in process.stdout if "http" in text)
         yield line.split()[0]
