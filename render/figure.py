@@ -24,6 +24,10 @@ class Album:
         self._shares, self._every, self._count = tuple(shares), 1, 0
         self._kept: list[tuple[int, Layers]] = []
 
+    def __len__(self) -> int:
+        """Return the number of frames that it has seen."""
+        return self._count
+
     def add(self, layers: Layers, world: int = 0) -> None:
         """Show it the next frame."""
         if self._count % self._every == 0:

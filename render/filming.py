@@ -60,7 +60,7 @@ class Filming:
                 self._films.mkdir(parents=True, exist_ok=True)
                 height, width = self.camera.size
                 size = (height, width * len(self.camera.cameras))
-                film = VideoWriter(self._films / f".partial-{key:06d}.mp4", self._rate, size)
+                film = VideoWriter(self._unfinished(key), self._rate, size)
             self._open[world] = (key, self.writer.begin(key, self.task), film)
             if self._watched is None:
                 self._watched = world
@@ -85,14 +85,14 @@ class Filming:
         if film is not None:
             film.add(np.concatenate(list(images.values()), axis=1))
 
-    def end(self, world: int, *, keep: bool) -> None:
-        """End the episode of a world."""
+    def end(self, world: int, *, keep: bool, success: bool = True) -> None:
+        """End the episode of a world, and keep it or not; `success` tells whether the task was done."""
         key, episode, film = self._open.pop(world)
         if film is not None and self._films is not None:
             film.close()
-            (self._films / f".partial-{key:06d}.mp4").replace(self._films / f"episode_{key:06d}.mp4")
+            self._unfinished(key).replace(self._films / f"episode_{key:06d}.mp4")
         if keep:
-            episode.save()
+            episode.save(success=success)
             self.kept += 1
         else:
             episode.drop()
@@ -100,6 +100,14 @@ class Filming:
 
     def leave(self) -> None:
         """Forget the episodes that have not ended."""
-        for _, episode, _ in self._open.values():
+        for key, episode, film in self._open.values():
             episode.discard()
+            if film is not None:
+                film.abandon()
+                self._unfinished(key).unlink(missing_ok=True)
         self._open.clear()
+
+    def _unfinished(self, key: int) -> Path:
+        """Return the file of a video that is being made."""
+        assert self._films is not None
+        return self._films / f".partial-{key:06d}.mp4"

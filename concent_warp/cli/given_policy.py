@@ -41,7 +41,7 @@ def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
         pretrained: Name of a policy that comes with the package.
 
     Raises:
-        TrainError: Neither or both are given, or there is no such policy.
+        TrainError: Neither or both are given, or there is no such policy, folder or file.
     """
     from concent_warp.train.ppo import CHECKPOINT
     from concent_warp.train.shipped import shipped
@@ -55,4 +55,6 @@ def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
     if checkpoint is None:
         assert pretrained is not None
         return shipped(pretrained)
+    if not checkpoint.exists():
+        raise TrainError("no such training", where=checkpoint, expected="its run folder, or a checkpoint file in one")
     return checkpoint / CHECKPOINT if checkpoint.is_dir() else checkpoint

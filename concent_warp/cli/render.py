@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from concent_warp.cli.given_policy import Pretrained, given_checkpoint
-from concent_warp.cli.run_folder import claim_file, make_folder, resuming_command, run_folder, write_settings
+from concent_warp.cli.run_folder import (
+    SETTINGS,
+    claim_file,
+    make_folder,
+    resuming_command,
+    run_folder,
+    write_settings,
+)
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.errors import RenderError
 from concent_warp.render.shadow_cfg import ShadowCfg
@@ -98,32 +105,33 @@ def run(arguments: Arguments) -> int:
         raise RenderError("episodes, worlds, rate and steps of the flow are to be at least 1")
     if arguments.figure is not None:
         claim_file(arguments.figure, overwrite=arguments.overwrite)
-    with run_folder(arguments.out, overwrite=False, resume=arguments.resume or cleared(arguments)):
-        write_settings(arguments.out, replace(arguments, resume=False, overwrite=False))
+    check_replaced(arguments)
+    with run_folder(arguments.out, overwrite=False, resume=arguments.resume or arguments.overwrite):
         try:
-            writer = film_recording(arguments) if arguments.recording is not None else film_policy(arguments)
+            filming = film_recording(arguments) if arguments.recording is not None else film_policy(arguments)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"What is done is saved; go on with: {resuming_command()}") from None
-        count = writer.finish()
+        count = filming.writer.finish()
+    draw_figure(arguments, filming)
     say(f"the data set holds {count} episode{'s' * (count != 1)}")
     say_written(arguments.out)
     return count
 
 
-def cleared(arguments: Arguments) -> bool:
-    """Take an earlier data set away where that was asked, and return whether that was so."""
-    import shutil
+def check_replaced(arguments: Arguments) -> None:
+    """Check that what is to be replaced is a data set.
 
-    from concent_warp.cli.run_folder import SETTINGS
+    Raises:
+        RenderError: The folder holds another run.
+    """
+    from concent_warp.render.dataset.layout import STAGING
 
-    if not arguments.overwrite or arguments.resume or not (arguments.out / SETTINGS).is_file():
-        return False
-    for path in arguments.out.iterdir():
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    return True
+    folder = arguments.out
+    if arguments.overwrite and (folder / SETTINGS).is_file() and not (folder / STAGING).is_dir():
+        raise RenderError("the folder holds a run, but no data set", where=folder, fix="choose another folder")
 
 
-def film_policy(arguments: Arguments) -> DatasetWriter:
+def film_policy(arguments: Arguments) -> Filming:
     """Film the episodes of a policy."""
     import torch
 
@@ -163,7 +171,8 @@ def film_policy(arguments: Arguments) -> DatasetWriter:
                 for world in filming.running:
                     filming.add(world, state[world], step.command[world])
                     if step.ended[world]:
-                        filming.end(world, keep=arguments.keep == "all" or bool(step.success[world]))
+                        success = bool(step.success[world])
+                        filming.end(world, keep=arguments.keep == "all" or success, success=success)
                 progress((first + len(rows) * (k + 1) / length) / len(left))
                 if not filming.running:
                     break
@@ -171,11 +180,10 @@ def film_policy(arguments: Arguments) -> DatasetWriter:
                 state = physics.qpos.cpu().numpy()[:, joints]
     if filming.dropped:
         say(f"{filming.dropped} of {filming.dropped + filming.kept} episodes were no success and are left out")
-    draw_figure(arguments, filming)
-    return writer
+    return filming
 
 
-def film_recording(arguments: Arguments) -> DatasetWriter:
+def film_recording(arguments: Arguments) -> Filming:
     """Film the measured motion of the demonstrations of a recording, each an episode."""
     from concent_warp.diagnose.measured_motion import measured_motion
     from concent_warp.model import Model
@@ -207,8 +215,7 @@ def film_recording(arguments: Arguments) -> DatasetWriter:
                 filming.add(0, qpos[t][joints], ctrl[round(now / engine.timestep)])
                 progress((k + (t + 1) / len(time)) / len(recording.demonstrations))
             filming.end(0, keep=True)
-    draw_figure(arguments, filming)
-    return writer
+    return filming
 
 
 @contextmanager
@@ -279,7 +286,13 @@ def addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[n
 
 
 def dataset_writer(arguments: Arguments, layout: EpisodeLayout) -> DatasetWriter:
-    """Return the data set, new or to go on with."""
+    """Return the data set, new or to go on with; only here, where all that was given is right, one is replaced."""
+    import shutil
+
+    if arguments.overwrite and not arguments.resume:
+        for path in arguments.out.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    write_settings(arguments.out, replace(arguments, resume=False, overwrite=False))
     if arguments.format == "robomimic":
         from concent_warp.render.dataset.robomimic import RobomimicWriter
 
@@ -302,6 +315,9 @@ def new_filming(arguments: Arguments, camera: HybridCamera, writer: DatasetWrite
 def draw_figure(arguments: Arguments, filming: Filming) -> None:
     """Write the figure that was asked for."""
     if arguments.figure is None:
+        return
+    if not len(filming.album):
+        say("no frame was rendered anew, so that there is no figure")
         return
     from concent_warp.render.figure import decomposition
 

@@ -75,8 +75,8 @@ class EpisodeWriter(Protocol):
         """Add a frame: images (H, W, 3) uint8, state and action."""
         ...
 
-    def save(self) -> None:
-        """Make it part of the data set."""
+    def save(self, *, success: bool = True) -> None:
+        """Make it part of the data set; `success` tells whether the task was done, for formats that have rewards."""
         ...
 
     def drop(self) -> None:

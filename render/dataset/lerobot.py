@@ -258,8 +258,9 @@ class LeRobotEpisode:
         self._state.append(np.asarray(state, dtype=np.float32))
         self._action.append(np.asarray(action, dtype=np.float32))
 
-    def save(self) -> None:
-        """See `EpisodeWriter.save`."""
+    def save(self, *, success: bool = True) -> None:
+        """See `EpisodeWriter.save`; there is no place for success."""
+        del success
         if not self._state:
             self.drop()
             return

@@ -117,8 +117,8 @@ class RobomimicEpisode:
         self._state.append(np.asarray(state, dtype=np.float64))
         self._action.append(np.asarray(action, dtype=np.float64))
 
-    def save(self) -> None:
-        """See `EpisodeWriter.save`; the last frame is rewarded and ends it."""
+    def save(self, *, success: bool = True) -> None:
+        """See `EpisodeWriter.save`; the last frame ends it, and is rewarded if the task was done."""
         if not self._state:
             self.drop()
             return
@@ -126,7 +126,7 @@ class RobomimicEpisode:
         last[-1] = 1
         self._group.create_dataset("obs/state", data=np.stack(self._state))
         self._group.create_dataset("actions", data=np.stack(self._action))
-        self._group.create_dataset("rewards", data=last)
+        self._group.create_dataset("rewards", data=last * success)
         self._group.create_dataset("dones", data=last.astype(np.int64))
         self._group.attrs["num_samples"] = len(self._state)
         self._file.close()

@@ -48,6 +48,15 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         self._container.mux(self._stream.encode(frame))
 
+    def abandon(self) -> None:
+        """Close a file that nobody wants any more; it may have no frames."""
+        from av.error import FFmpegError
+
+        try:
+            self._container.close()
+        except FFmpegError:  # without frames there is no stream to end
+            return
+
     def close(self) -> None:
         """Write what is left and close the file."""
         self._container.mux(self._stream.encode(None))

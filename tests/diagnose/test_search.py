@@ -45,6 +45,17 @@ def test_a_model_that_lacks_nothing_leaves_noise_alone(lacking, complete):
     assert lacking.ratio > 2.5
 
 
+def test_a_fit_that_is_stuck_at_the_model_itself_is_led_on_without_fitting_its_initial_states_again(lacking):
+    found = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    solver = Solver(Prediction(lacking.model, (effect("joint_damping"),), lacking.windows, threads=1))
+    linear = solver.linearise(solver.p.start, lacking.fit.offsets)
+    cost = solver.cost([piece.residual for piece in linear], lacking.fit.offsets, solver.p.start)
+    assert cost == pytest.approx(lacking.fit.cost)
+    fit = replace(lacking.fit, values=solver.p.start, linear=linear)
+    polished = polish_candidate(lacking, replace(found, fit=fit))
+    assert polished.fit.values[0] == pytest.approx(DAMPING, rel=0.05)
+
+
 def test_a_look_promises_most_of_the_effect_that_is_missing(lacking):
     promised = {name: screen(lacking, effect(name)).promise for name in NAMES}
     assert max(promised, key=promised.__getitem__) == "joint_damping"

@@ -4,7 +4,7 @@ import pytest
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit import initial_states
 from concent_warp.fit.initial_states import start_step
-from concent_warp.fit.least_squares import Fit, Linear, Solver, projected
+from concent_warp.fit.least_squares import MANY, Fit, Linear, Solver, projected
 from concent_warp.fit.prediction import Prediction
 from concent_warp.fit.robust import HUBER, trust
 from tests.fit.bouncing import SPREAD, bounced
@@ -80,6 +80,28 @@ def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_eithe
     fit = solver.fit(solver.p.start, offsets, starts)
     assert fit.cost < begun
     assert solver.polish(fit).cost <= fit.cost * (1 + 1e-9)
+
+
+def test_of_many_windows_a_sample_leads_all_to_the_parameters():
+    solver = solver_for(swung(told=0.006), "joint_damping", length=0.1)
+    count = len(solver.p.windows)
+    assert count > MANY
+    values, zero = np.array([3 * DAMPING]), tuple(np.zeros(2) for _ in range(count))
+    offsets, starts = solver.refine_starts(values, zero)
+    linear = solver.linearise(values, offsets)
+    begun = Fit(
+        values, tuple(offsets), solver.cost([x.residual for x in linear], offsets, values), linear, starts, True, 0.0
+    )
+    found = solver.polish(begun)
+    assert found.values[0] == pytest.approx(DAMPING, rel=0.05)
+    assert found.cost < begun.cost
+    assert [len(x) for x in (found.offsets, found.linear, found.starts)] == [count] * 3
+
+
+def test_where_a_sample_of_windows_gains_nothing_the_fit_stays():
+    solver = solver_for(swung(), "joint_damping", length=0.1)
+    fit = solver.fit()
+    assert solver.polish(fit) is fit
 
 
 def test_the_initial_state_of_another_fit_leads_a_stuck_one_to_the_parameters_that_go_with_it():

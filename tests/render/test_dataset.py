@@ -12,7 +12,7 @@ from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
 from concent_warp.render.dataset.statistics import ImageHistogram, merged, of_values
-from concent_warp.render.dataset.video import read_frames
+from concent_warp.render.dataset.video import VideoWriter, read_frames
 from small_dataset import LAYOUT, frame, length, write
 
 from concent_warp.errors import RenderError
@@ -144,6 +144,28 @@ def test_robomimic_file_holds_every_frame_exactly(tmp_path):
                 assert np.array_equal(demo["obs/state"][t], state)
                 assert np.array_equal(demo["actions"][t], action)
             assert demo["dones"][:].tolist() == [0] * (length(key) - 1) + [1]
+
+
+def test_robomimic_rewards_no_failure(tmp_path):
+    writer = RobomimicWriter(tmp_path, LAYOUT)
+    for key, success in enumerate((True, False)):
+        episode = writer.begin(key, "task")
+        for t in range(2):
+            episode.add(*frame(key, t))
+        episode.save(success=success)
+    writer.finish()
+    with h5py.File(tmp_path / "dataset.hdf5") as file:
+        data: Any = file["data"]
+        assert [data[f"demo_{k}"]["rewards"][:].tolist() for k in (0, 1)] == [[0, 1], [0, 0]]
+        assert [data[f"demo_{k}"]["dones"][:].tolist() for k in (0, 1)] == [[0, 1], [0, 1]]
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_video_that_nobody_wants_is_closed_without_a_fuss(tmp_path, count):
+    video = VideoWriter(tmp_path / "film.mp4", 10, LAYOUT.size)
+    for t in range(count):
+        video.add(frame(0, t)[0]["base"])
+    video.abandon()
 
 
 def test_other_settings_are_refused(tmp_path):

@@ -86,13 +86,21 @@ def test_data_set_is_gone_on_with(folder, capsys):
     assert "holds 1 episode" in capsys.readouterr().out
     assert main([*command, "--rate", "5", "--resume"]) == 2
     assert "begun with other settings" in capsys.readouterr().err
+    assert main([*command, "--splats", "cup=none.ply", "--overwrite"]) == 2  # before anything is taken away
+    assert main([*command, "--resume", "--figure", str(folder / "none.png")]) == 0
+    assert "no frame was rendered anew" in capsys.readouterr().out
+    assert not (folder / "none.png").exists()
     assert main([*command, "--rate", "5", "--overwrite"]) == 0
+    assert main([*command, "--out", str(folder / "net"), "--overwrite"]) == 2
+    assert "no data set" in capsys.readouterr().err
+    assert (folder / "net").is_dir()
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ((), "one thing is to be rendered"),
+        (("--checkpoint", "nowhere"), "nowhere: no such training"),
         (("--recording", "held.h5", "--pretrained"), "one thing is to be rendered"),
         (("--recording", "held.h5", "--cameras", "side"), "no such camera"),
         (("--recording", "held.h5", "--splats", "ball"), "body=file.ply"),
