@@ -183,13 +183,9 @@ class Procedure:
         if not good:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
-        group = alike(base, good)
-        polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
-        better = settled(base, polished, self.settling, self.threads)
-        # What was accepted stays so: its gain is the evidence, even if a rough cost tells little of the value.
-        found = replace(self.finding(base, better, null, step, chosen), accepted=True, reason="")
-        findings[findings.index(group[0][1])] = found
-        group[0] = better, found
+        group = self.told_apart(base, good, lambda c: self.finding(base, c, null, step, chosen))
+        replaced = {f.name: f for _, f in group}
+        findings = [replaced.get(f.name, f) for f in findings]
         self.groups.append(tuple(f.name for _, f in group))
         self.hypotheses.append({f.name: c.model for c, f in group})
         first = group[0][1]
@@ -197,6 +193,26 @@ class Procedure:
         self.findings.append(first)
         self.findings += [replace(f, accepted=False, reason=f.reason or "another one explains more") for f in rest]
         return group[0][0], smallest
+
+    def told_apart(
+        self, base: Node, good: Sequence[tuple[Candidate, Finding]], judge: Callable[[Candidate], Finding]
+    ) -> list[tuple[Candidate, Finding]]:
+        """Return the accepted candidates that the data cannot tell apart, the likeliest first, its values polished.
+
+        Those that are nearly so have their values looked around as well: it tells how rough their costs are.
+        """
+
+        def anew(c: Candidate) -> tuple[Candidate, Finding]:
+            # What was accepted stays so: its gain is the evidence, even if a rough cost tells little of the value.
+            return c, replace(judge(c), accepted=True, reason="")
+
+        near = alike(base, good, slack=WIDER)
+        if len(near) > 1:
+            near = [anew(settled(base, c, self.settling, self.threads)) for c, _ in near[:STRONGEST]] + near[STRONGEST:]
+        group = alike(base, near)
+        polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
+        group[0] = anew(settled(base, polished, self.settling, self.threads))
+        return group
 
     def pruned(self, nodes: list[Node]) -> list[Node]:
         """Return the nodes, with one more for each effect that those added after it have made superfluous."""
@@ -244,24 +260,33 @@ class Procedure:
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
         hoped = np.maximum(hoped, [c.share(base) for c in found])
-        leader = polished_leader(base, found, ROUNDS, self.threads)
-        self.level(base, found, leader, hoped)
-        if np.argmax([c.share(base) for c in found]) != leader:
-            leader = polished_leader(base, found, 1, self.threads)
-        return self.pieced(base, found) if found[leader].ratio > self.cfg.adequate else found
+        self.level(base, found, hoped)
+        return self.pieced(base, found) if leader(base, found).ratio > self.cfg.adequate else found
 
-    def level(self, base: Node, found: list[Candidate], leader: int, hoped: np.ndarray) -> None:
-        """Take up the fits of candidates that may be the leader's equals from where it has the initial states.
+    def level(self, base: Node, found: list[Candidate], hoped: np.ndarray) -> None:
+        """Take up the best fit, and those of candidates that may be its equals, as long as that betters one; in place.
 
-        Where contacts make the cost rough, luck with the initial states would decide between them. `hoped` is the
-        gain that there may be in each.
+        Where contacts make the cost rough, luck with the initial states would decide between them: so each is tried
+        from where the best one has them too, and none gets more rounds than the others. `hoped` is the gain that
+        there may be in each.
         """
-        best = found[leader]
-        close = [k for k in range(len(found)) if k != leader and hoped[k] > CLOSE * best.share(base)]
-        tasks = [(base, found[k], best.fit) for k in close]
-        again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
-        for k, c in zip(close, again, strict=True):
-            found[k] = c
+        for _ in range(ROUNDS):
+            before, best = list(found), leader(base, found)
+            close = [k for k, c in enumerate(found) if c is not best and hoped[k] > CLOSE * best.share(base)]
+            tasks = [(base, found[k], best.fit) for k in close]
+            again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
+            for k, c in zip(close, again, strict=True):
+                found[k] = c
+            mine = found.index(best)
+            if close:
+                polished = self.parallel(polish_candidate, [(base, found[k]) for k in (mine, *close)], "polishing", 0.0)
+                for k, c in zip((mine, *close), polished, strict=True):
+                    found[k] = c
+            elif best.ratio > SETTLED:
+                found[mine] = polish_candidate(base, best, threads=self.threads)
+            if all(c.fit.cost > (1 - FINE) * old.fit.cost for c, old in zip(found, before, strict=True)):
+                break
+            hoped = np.array([c.share(base) for c in found])
 
     def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
         """Return fitted candidates, those that explain most fitted anew by way of short windows, where there are."""
@@ -409,11 +434,14 @@ HALF = 0.5
 """Share of the best gain from which on that is worth a try, where no candidate explains the data; and a second fit,
 where one does."""
 ROUNDS, FINE = 3, 0.01
-"""How often the best fit is taken up again, as long as its cost falls by the second number."""
+"""How often the best fits are taken up again, as long as the cost of one falls by the second number."""
 DOUBTFUL = 0.4
 """Gain below which it is made sure that it is not owed to better initial states alone."""
 STRONGEST = 3
-"""Rivals whose initial states are tried on the model that they beat."""
+"""Rivals whose initial states are tried on the model that they beat; and whose values are looked around to tell them
+apart."""
+WIDER = 2.0
+"""How many times the difference at which candidates are alike may turn out to be none."""
 MOST = 0.8
 """Share of the folds in which an effect must gain."""
 
@@ -427,16 +455,9 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
     return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks))
 
 
-def polished_leader(base: Node, found: list[Candidate], rounds: int, threads: int | None) -> int:
-    """Take up the best fit again as long as that betters it, in place; return which one it is."""
-    leader = int(np.argmax([c.share(base) for c in found]))
-    for _ in range(rounds):
-        rough = found[leader].ratio > SETTLED
-        better = polish_candidate(base, found[leader], threads=threads) if rough else found[leader]
-        if better.fit.cost > (1 - FINE) * found[leader].fit.cost:
-            break
-        found[leader] = better
-    return leader
+def leader(base: Node, found: Sequence[Candidate]) -> Candidate:
+    """Return the fit that takes away most of a node's error."""
+    return max(found, key=lambda c: c.share(base))
 
 
 def quiet_ratios(base: Node) -> dict[str, float]:

@@ -48,20 +48,31 @@ def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(((n, s) for n, s in shares.items() if s > 0), key=lambda pair: -pair[1]))
 
 
-def alike(base: Node, good: Sequence[tuple[Candidate, Finding]]) -> list[tuple[Candidate, Finding]]:
+def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 1.0) -> list[tuple[Candidate, Finding]]:
     """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
 
-    They are where what they leave differs by less than 2 standard errors over the blocks, or by `SAME` of it. Among
-    them those come first that leave less, need fewer parameters and smaller values of them, see `plausibility`.
+    They are where what they leave differs by less than 2 standard errors, over the blocks and by the roughness of the
+    costs, or by `SAME` of it; by `slack` times that. And where the best is so much rarer that this outweighs what the
+    other leaves more: a law that is close to the missing one may fit a little better than it, as simulations of one
+    law differ too. Among them those come first that leave less, need fewer parameters and smaller values of them, see
+    `plausibility`.
     """
-    best = max(good, key=lambda pair: pair[1].gain)
+    best = max(good, key=lambda pair: pair[1].gain)[0]
     group = []
     for c, f in good:
-        difference = c.errors - best[0].errors
-        error = np.sqrt(len(difference)) * difference.std()
-        if difference.sum() <= max(2 * error, SAME * best[0].errors.sum()):
+        difference = c.errors - best.errors
+        # A cost is half a sum of squares, an error a whole one.
+        rough = 2 * np.hypot(c.rough, best.rough) if c is not best else 0.0
+        error = np.hypot(np.sqrt(len(difference)) * difference.std(), rough)
+        rarer = best.effect.rarity - c.effect.rarity > log_errors(base, c) - log_errors(base, best)
+        if rarer or difference.sum() <= slack * max(2 * error, SAME * best.errors.sum()):
             group.append((c, f))
     return sorted(group, key=lambda pair: -plausibility(base, *pair))
+
+
+def log_errors(base: Node, c: Candidate) -> float:
+    """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, see below."""
+    return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))
 
 
 def plausibility(base: Node, c: Candidate, f: Finding) -> float:
@@ -73,8 +84,7 @@ def plausibility(base: Node, c: Candidate, f: Finding) -> float:
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    blocks = base.blocks.count
-    fit = -blocks * np.log(max(c.errors.sum(), 1e-12)) - len(scale) * np.log(blocks)
+    fit = -log_errors(base, c) - len(scale) * np.log(base.blocks.count)
     return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 

@@ -90,6 +90,8 @@ class Candidate:
     spread: np.ndarray | None = None
     """Standard deviations of the parameters in units of their scale, shape (P,), where more than the linear ones are
     known, see `concent_warp.diagnose.settle`."""
+    rough: float = 0.0
+    """By how much luck with the initial states may have moved the cost, as far as it is known, see there."""
     polished: bool = False
     """Whether it has been taken up again in vain: once more would do the same."""
 

@@ -131,14 +131,20 @@ def settled(base: Node, c: Candidate, all_of: AllOf, threads: int | None = 1) ->
         seen = looks(base, c, all_of)
         best = min(seen, key=lambda s: s.cost, default=None)
         if best is None or best.cost > c.fit.cost - WORTH:
-            return replace(c, spread=spreads(base, c, seen))
+            return told(base, c, seen)
         for _ in range(STRIDES):
             further = look(base, c, best.parameter, 2 * best.reach)
             if further.cost > best.cost:
                 break
             best = further
         c = taken_up(base, c, best, threads)
-    return replace(c, spread=spreads(base, c, looks(base, c, all_of, WIDTH_ONLY)))
+    return told(base, c, looks(base, c, all_of, WIDTH_ONLY))
+
+
+def told(base: Node, c: Candidate, seen: Sequence[Look]) -> Candidate:
+    """Return a candidate with what looks around it tell: how sharp its values are, and how rough its cost."""
+    rough = max((roughness(c, seen, s.parameter) for s in seen), default=0.0)
+    return replace(c, spread=spreads(base, c, seen), rough=rough)
 
 
 def looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[Look]:
