@@ -40,6 +40,7 @@ from concent_warp.diagnose.search import (
 from concent_warp.diagnose.settle import Look, settled
 from concent_warp.diagnose.where import where
 from concent_warp.fit.effects import check_finite
+from concent_warp.fit.least_squares import MANY
 from concent_warp.fit.observe import channel_noises, observe
 from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
@@ -199,7 +200,8 @@ class Procedure:
     ) -> list[tuple[Candidate, Finding]]:
         """Return the accepted candidates that the data cannot tell apart, the likeliest first, its values polished.
 
-        Those that are nearly so have their values looked around as well: it tells how rough their costs are.
+        Those that are nearly so have their values looked around as well, which tells how rough their costs are; over
+        many windows that shows in how their errors differ.
         """
 
         def anew(c: Candidate) -> tuple[Candidate, Finding]:
@@ -207,7 +209,7 @@ class Procedure:
             return c, replace(judge(c), accepted=True, reason="")
 
         near = alike(base, good, slack=WIDER)
-        if len(near) > 1:
+        if len(near) > 1 and len(base.windows) <= MANY:
             near = [anew(settled(base, c, self.settling, self.threads)) for c, _ in near[:STRONGEST]] + near[STRONGEST:]
         group = alike(base, near)
         polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
@@ -270,7 +272,7 @@ class Procedure:
         from where the best one has them too, and none gets more rounds than the others. `hoped` is the gain that
         there may be in each.
         """
-        for _ in range(ROUNDS):
+        for _ in range(ROUNDS if len(base.windows) <= MANY else 1):  # over many windows luck evens out
             before, best = list(found), leader(base, found)
             close = [k for k, c in enumerate(found) if c is not best and hoped[k] > CLOSE * best.share(base)]
             tasks = [(base, found[k], best.fit) for k in close]
@@ -278,9 +280,10 @@ class Procedure:
             for k, c in zip(close, again, strict=True):
                 found[k] = c
             mine = found.index(best)
-            if close:
-                polished = self.parallel(polish_candidate, [(base, found[k]) for k in (mine, *close)], "polishing", 0.0)
-                for k, c in zip((mine, *close), polished, strict=True):
+            near = [mine, *(k for k in close if found[k].share(base) > CLOSE * best.share(base))]
+            if len(near) > 1:
+                polished = self.parallel(polish_candidate, [(base, found[k]) for k in near], "polishing", 0.0)
+                for k, c in zip(near, polished, strict=True):
                     found[k] = c
             elif best.ratio > SETTLED:
                 found[mine] = polish_candidate(base, best, threads=self.threads)

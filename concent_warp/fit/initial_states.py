@@ -32,8 +32,8 @@ ROUNDS = 12
 ODD = 1.2
 """A window whose residual is this many times that of the others has probably not found its initial state: only for
 such ones more is tried than a few damped steps."""
-RESTARTS = 4
-"""How often such a window is begun anew from a drawn initial state."""
+BEGINNINGS, WIDTHS = 128, (0.5, 1.0, 2.0)
+"""Such a window is begun anew from the likeliest of so many initial states, drawn with these spreads in turn."""
 FALL = 3e-3
 """A window's initial state is found once a step lowers its cost by less than this share."""
 PROSPECT = 3.0
@@ -121,21 +121,40 @@ class StartSearch:
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
         self._settle(values, offsets, residuals, starts, windows, rounds, rng, rival or {})
-        for _ in range(RESTARTS if rounds == ROUNDS else 0):
-            size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
-            odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))]
-            if not odd:
-                break
-            begin, found = list(offsets), dict(starts)
+        size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
+        odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))] if rounds == ROUNDS else []
+        if odd and BEGINNINGS:
+            found, limit = dict(starts), huber_limit(residuals)
+            begin, there = self._drawn(values, offsets, residuals, odd, limit, rng)
+            beaten = {w: start_cost(residuals[w], offsets[w], limit) for w in odd}
+            self._settle(values, begin, there, found, odd, rounds, rng, beaten)
             for w in odd:
-                begin[w] = rng.normal(size=len(offsets[w]))
-            there = self.p.residuals(self.trials(values, begin))
-            self._settle(values, begin, there, found, odd, rounds, rng, {})
-            limit = huber_limit(residuals)
-            for w in odd:
-                if start_cost(there[w], begin[w], limit) < start_cost(residuals[w], offsets[w], limit):
+                if start_cost(there[w], begin[w], limit) < beaten[w]:
                     offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
         return offsets, starts, residuals
+
+    def _drawn(
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        residuals: Sequence[np.ndarray],
+        windows: Sequence[int],
+        limit: float,
+        rng: np.random.Generator,
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return all initial states with the likeliest of some drawn ones for some windows, and all residuals."""
+        begin, there = list(offsets), list(residuals)
+        widths = np.resize(WIDTHS, (BEGINNINGS, 1))
+        drawn = [widths * rng.normal(size=(BEGINNINGS, len(offsets[w]))) for w in windows]
+        rows = [
+            Trial(w, values, o * self.p.windows[w].spread) for w, of in zip(windows, drawn, strict=True) for o in of
+        ]
+        seen = self.p.residuals(rows)
+        for k, w in enumerate(windows):
+            mine = seen[k * BEGINNINGS : (k + 1) * BEGINNINGS]
+            best = int(np.argmin([start_cost(r, o, limit) for r, o in zip(mine, drawn[k], strict=True)]))
+            begin[w], there[w] = drawn[k][best], mine[best]
+        return begin, there
 
     def _settle(
         self,

@@ -31,8 +31,10 @@ NOISE = 1.05
 """Residual over noise at which an initial state leaves nothing to be wished for."""
 NEXT_TO_NOTHING = 3e-4
 """Share of the cost that counts as a gain where values matter."""
-LEAPS, LEAP, WORTH = 4, (1.0, 3.0), 5e-3
+LEAPS, LEAP, WORTH = 6, (1.0, 3.0), 5e-3
 """How often parameters are led on at most, over how many of their steps, and for what gain."""
+MOST = 0.5
+"""Share of what a leap promises that the windows have to bring together that are tried first."""
 MANY, SAMPLE = 16, 8
 """Number of windows beyond which a sample tells whether it is worth taking a fit up again, and the sample's size."""
 REFIT_ROUNDS = 2
@@ -153,12 +155,33 @@ class Solver:
                     led = tuple(self.follow(best, leap * move))
                     there = self.better_starts(replace(best, values=values, offsets=led), [])
                 else:
-                    there = self.better_starts(replace(best, values=values), [measured], noise)
+                    there = self._tried(best, values, self._hopeful(best, values), noise)
                 found = min(found, there, key=lambda f: f.cost)
             if found.cost > (1 - worth) * best.cost:
                 break
             best = found
         return best
+
+    def _hopeful(self, fit: Fit, values: np.ndarray) -> list[int]:
+        """Return the windows that are to bring most of what other values promise, by the fit's sensitivities."""
+        move, limit = (values - fit.values) / self.scale, huber_limit([piece.residual for piece in fit.linear])
+        pieces = projected(fit)
+        falls = [huber(q.residual, limit).sum() - huber(q.residual + q.jacobian @ move, limit).sum() for q in pieces]
+        order = np.argsort(falls)[::-1]
+        reached = np.cumsum(np.maximum(falls, 0.0)[order])
+        return order[: int(np.searchsorted(reached, MOST * reached[-1])) + 1].tolist()
+
+    def _tried(self, fit: Fit, values: np.ndarray, first: Sequence[int], noise: float) -> Fit:
+        """Return a fit at other values with its initial states fitted anew; as it was if `first` windows get worse."""
+        measured, everywhere = [np.zeros_like(o) for o in fit.offsets], set(range(len(self.p.windows)))
+        there = self.better_starts(replace(fit, values=values), [measured], noise, first)
+        limit = huber_limit([piece.residual for piece in fit.linear])
+        before, after = (
+            sum(start_cost(f.linear[w].residual, f.offsets[w], limit) for w in first) for f in (fit, there)
+        )
+        if after >= before:
+            return fit
+        return self.better_starts(there, [measured], noise, sorted(everywhere - set(first)))
 
     def _polish_by_sample(self, fit: Fit, *, thorough: bool, stuck: bool) -> Fit:
         """Polish a fit on a sample of the windows; where that helps there, go on with all of them from its values."""
@@ -176,18 +199,26 @@ class Solver:
         there = self.better_starts(replace(fit, values=found.values, offsets=led), [measured])
         return min(fit, self.fit(there.values, there.offsets, there.starts, refits=0), key=lambda f: f.cost)
 
-    def better_starts(self, fit: Fit, others: Sequence[Sequence[np.ndarray]], noise: float = NOISE) -> Fit:
+    def better_starts(
+        self,
+        fit: Fit,
+        others: Sequence[Sequence[np.ndarray]],
+        noise: float = NOISE,
+        windows: Sequence[int] | None = None,
+    ) -> Fit:
         """Return a fit at the same parameters with the best initial state of each window that is found.
 
         Args:
             fit: The fit.
             others: Errors of the initial states to set out from, besides those of the fit, in units of their spread.
             noise: Residual over noise of windows that need no others.
+            windows: Those in question; by default all.
         """
-        everywhere = range(len(self.p.windows))
-        offsets, starts, residuals = self.search.refined(fit.values, fit.offsets, everywhere, 1)
+        mine = range(len(self.p.windows)) if windows is None else windows
+        offsets, fresh, residuals = self.search.refined(fit.values, fit.offsets, mine, 1)
+        starts = dict(enumerate(fit.starts)) | fresh
         limit = huber_limit(residuals)
-        unsettled = [w for w in everywhere if np.mean(residuals[w] ** 2) > noise**2]
+        unsettled = [w for w in mine if np.mean(residuals[w] ** 2) > noise**2]
         for begin in others if unsettled else ():
             rival = {w: start_cost(residuals[w], offsets[w], limit) for w in unsettled}
             there, found, left = self.search.refined(fit.values, begin, unsettled, ROUNDS, rival)
@@ -197,7 +228,7 @@ class Solver:
         linear = self.linearise(fit.values, offsets)
         cost = self.cost([piece.residual for piece in linear], offsets, fit.values)
         return replace(
-            fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in everywhere), linear=linear, cost=cost
+            fit, offsets=tuple(offsets), starts=tuple(starts[w] for w in range(len(starts))), linear=linear, cost=cost
         )
 
     def led(self, fit: Fit, by: Fit, rounds: int = LEAPS) -> Fit:

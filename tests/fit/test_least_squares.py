@@ -171,7 +171,7 @@ def test_initial_states_far_off_are_found_across_a_bounce():
 
 def test_derivatives_alone_do_not_find_all_of_these(monkeypatch):
     monkeypatch.setattr(initial_states, "DRAWS", ())
-    monkeypatch.setattr(initial_states, "RESTARTS", 0)
+    monkeypatch.setattr(initial_states, "BEGINNINGS", 0)
     assert (bounced_ratio() < 1.2).sum() <= 9
 
 
