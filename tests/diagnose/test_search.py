@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnose.blocks import cut_blocks
+from concent_warp.diagnose.diagnosis import Finding
+from concent_warp.diagnose.evidence import alike
 from concent_warp.diagnose.search import (
     chance,
     extended,
@@ -115,3 +117,35 @@ def test_chance_makes_more_of_more_candidates_and_little_in_all(complete):
     assert (all_of_them >= one - 1e-12).all()
     assert np.quantile(all_of_them, 0.95) < 0.1
     assert np.array_equal(one, chance(complete, screened[:1], 200, 0))
+
+
+def of_two(base, rival_leaves, rough=0.0):
+    """Return the names of those that cannot be told apart: damping, and armature as if it left so much more."""
+    best = fit_candidate(base, screen(base, effect("joint_damping")))
+    best = replace(best, rough=rough)
+    other = fit_candidate(base, screen(base, effect("armature")))
+    other = replace(other, errors=rival_leaves * best.errors, rough=rough)
+    findings = [
+        Finding(c.effect.name, c.effect.target, "", (), c.share(base), 0.0, 1.0, 0.0, 0.0, True, 0, (), "")
+        for c in (best, other)
+    ]
+    return {f.name for _, f in alike(base, list(zip((best, other), findings, strict=True)))}
+
+
+def test_candidates_that_leave_nearly_the_same_are_alike_and_those_that_leave_more_are_not(lacking):
+    assert of_two(lacking, 1.01) == {"joint_damping", "armature"}
+    assert of_two(lacking, 1.3) == {"joint_damping"}
+
+
+def test_rough_costs_tell_less(lacking):
+    left = fit_candidate(lacking, screen(lacking, effect("joint_damping"))).errors.sum()
+    assert of_two(lacking, 1.3, rough=0.3 * left) == {"joint_damping", "armature"}
+
+
+def test_a_rare_effect_does_not_shut_out_a_common_one_that_leaves_hardly_more(lacking, monkeypatch):
+    count = lacking.blocks.count
+    little, much = np.exp(4.0 / count), np.exp(8.0 / count)
+    assert of_two(lacking, little) == {"joint_damping"}
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 6.0)
+    assert of_two(lacking, little) == {"joint_damping", "armature"}
+    assert of_two(lacking, much) == {"joint_damping"}

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -147,6 +149,32 @@ def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
     stacked = np.vstack([a, np.diag(root)])
     expected = -np.linalg.lstsq(stacked, np.concatenate([r, root * o]), rcond=None)[0]
     np.testing.assert_allclose(step, expected, atol=1e-10)
+
+
+def test_better_initial_states_are_looked_for_in_the_windows_in_question_only():
+    solver = solver_for(swung(told=0.006), "joint_damping", length=0.5)
+    values, zero = np.array([DAMPING]), [np.zeros(2) for _ in solver.p.windows]
+    linear = solver.linearise(values, zero)
+    cost = solver.cost([piece.residual for piece in linear], zero, values)
+    starts = tuple(np.zeros((w.count, 2)) for w in solver.p.windows)
+    fit = Fit(values, tuple(zero), cost, linear, starts, False, 0.0)
+    found = solver.better_starts(fit, [], windows=[0])
+    assert found.cost < cost
+    assert np.abs(found.offsets[0]).max() > 0
+    assert np.abs(found.starts[0]).max() > 0
+    for w in range(1, len(zero)):
+        assert not found.offsets[w].any()
+        assert not found.starts[w].any()
+
+
+def test_a_leap_that_fails_where_it_promises_most_is_not_gone_on_with():
+    solver = solver_for(swung(), "joint_damping", length=0.5)
+    right = solver.polish(solver.fit())
+    assert solver._tried(right, right.values + 0.5 * DAMPING, [0], 1.0) is right
+    off = solver.better_starts(replace(right, values=np.zeros(1)), [])
+    first = solver._hopeful(off, right.values)
+    assert 0 < len(first) < len(solver.p.windows)
+    assert solver._tried(off, right.values, first, 1.0).cost == pytest.approx(right.cost, rel=0.02)
 
 
 def bounced_ratio() -> np.ndarray:
