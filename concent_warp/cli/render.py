@@ -13,8 +13,10 @@ import numpy as np
 from concent_warp.cli.given_policy import Pretrained, given_checkpoint
 from concent_warp.cli.run_folder import (
     SETTINGS,
+    check_unchanged,
     claim_file,
     make_folder,
+    plain,
     resuming_command,
     run_folder,
     write_settings,
@@ -31,6 +33,10 @@ if TYPE_CHECKING:
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
     from concent_warp.render.filming import Filming
+
+
+FREE = ("out", "resume", "overwrite", "recording", "episodes", "worlds", "films", "figure", "device")
+"""Settings with which a data set may be gone on with that differ from those that it was begun with."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +298,10 @@ def dataset_writer(arguments: Arguments, layout: EpisodeLayout) -> DatasetWriter
     if arguments.overwrite and not arguments.resume:
         for path in arguments.out.iterdir():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-    write_settings(arguments.out, replace(arguments, resume=False, overwrite=False))
+    settings = replace(arguments, resume=False, overwrite=False)
+    if arguments.resume:
+        check_unchanged(arguments.out / SETTINGS, plain(settings), FREE)
+    write_settings(arguments.out, settings)
     if arguments.format == "robomimic":
         from concent_warp.render.dataset.robomimic import RobomimicWriter
 

@@ -6,7 +6,7 @@ import shlex
 import shutil
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, is_dataclass
@@ -107,14 +107,14 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
     return document
 
 
-def check_unchanged(path: Path, settings: Mapping[str, Any]) -> None:
-    """Refuse settings that differ from those in a settings file in what decides the result."""
+def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE) -> None:
+    """Refuse settings that differ from those in a settings file in what decides the result, all that is not `free`."""
     try:
         stored = tomllib.loads(path.read_text())
     except (OSError, ValueError):
         return
     before, now = flat(stored.get("settings", {})), flat(settings)
-    differing = [n for n in sorted(before | now) if n.split(".")[0] not in FREE and before.get(n) != now.get(n)]
+    differing = [n for n in sorted(before | now) if n.split(".")[0] not in free and before.get(n) != now.get(n)]
     if differing:
         raise ConcentError(
             "this run was begun with other settings",

@@ -86,6 +86,8 @@ def test_data_set_is_gone_on_with(folder, capsys):
     assert "holds 1 episode" in capsys.readouterr().out
     assert main([*command, "--rate", "5", "--resume"]) == 2
     assert "begun with other settings" in capsys.readouterr().err
+    assert main([*command, "--seed", "3", "--resume"]) == 2
+    assert "seed 3" in capsys.readouterr().err
     assert main([*command, "--splats", "cup=none.ply", "--overwrite"]) == 2  # before anything is taken away
     assert main([*command, "--resume", "--figure", str(folder / "none.png")]) == 0
     assert "no frame was rendered anew" in capsys.readouterr().out
