@@ -45,8 +45,8 @@ class Arguments:
     """Factor from the unit of the points to metres."""
     longest: int = 800
     """Larger images are made smaller, so that their longer edge has so many pixels."""
-    device: str = "auto"
-    """Where to compute: "cpu", "cuda:0", or "auto" for CUDA where there is a device."""
+    device: str | None = None
+    """Where to compute, "cpu" or "cuda:0"; the first CUDA device by default where there is one."""
     resume: bool = False
     """Go on with an interrupted fit, to the same result."""
     overwrite: bool = False
@@ -81,14 +81,12 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
     from concent_warp.render.splat_fit import SplatFit
 
     cfg = arguments.fit
-    device = arguments.device
-    if device == "auto":
-        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    device = arguments.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         raise RenderError(
-            "no such device", expected='"cpu", "cuda:0" or "auto"', found=f"{device!r} ({str(error).splitlines()[0]})"
+            "no such device", expected='"cpu" or "cuda:0"', found=f"{device!r} ({str(error).splitlines()[0]})"
         ) from None
     fit = SplatFit(views, start(arguments, views, np.random.default_rng(cfg.seed)), cfg, device=device)
     if arguments.resume and checkpoint.exists():
