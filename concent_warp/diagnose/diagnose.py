@@ -18,7 +18,7 @@ from concent_warp.diagnose.blocks import bootstrap_interval, cut_blocks, sign_fl
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verdict
-from concent_warp.diagnose.evidence import alike, detectable_size, fitted_parameters, removed
+from concent_warp.diagnose.evidence import SAME, alike, detectable_size, fitted_parameters, removed
 from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.flexible import unknown_force
 from concent_warp.diagnose.noise import UNDERESTIMATE
@@ -200,7 +200,7 @@ class Procedure:
     ) -> list[tuple[Candidate, Finding]]:
         """Return the accepted candidates that the data cannot tell apart, the likeliest first, its values polished.
 
-        Those that are nearly so have their values looked around as well, which tells how rough their costs are; over
+        Where some are nearly so, values are looked around, which betters them and tells how rough the costs are; over
         many windows that shows in how their errors differ.
         """
 
@@ -209,7 +209,7 @@ class Procedure:
             return c, replace(judge(c), accepted=True, reason="")
 
         near = alike(base, good, slack=WIDER)
-        if len(near) > 1 and len(base.windows) <= MANY:
+        if len(near) > len(alike(base, good)) and len(base.windows) <= MANY:
             near = [anew(settled(base, c, self.settling, self.threads)) for c, _ in near[:STRONGEST]] + near[STRONGEST:]
         group = alike(base, near)
         polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
@@ -280,12 +280,13 @@ class Procedure:
             for k, c in zip(close, again, strict=True):
                 found[k] = c
             mine = found.index(best)
-            near = [mine, *(k for k in close if found[k].share(base) > CLOSE * best.share(base))]
-            if len(near) > 1:
+            near = [k for k in close if found[k].share(base) > CLOSE * best.share(base)]
+            if any(found[k].errors.sum() > (1 + SAME) * best.errors.sum() for k in near):
+                near.append(mine)
                 polished = self.parallel(polish_candidate, [(base, found[k]) for k in near], "polishing", 0.0)
                 for k, c in zip(near, polished, strict=True):
                     found[k] = c
-            elif best.ratio > SETTLED:
+            elif best.ratio > SETTLED:  # those near are its equals already
                 found[mine] = polish_candidate(base, best, threads=self.threads)
             if all(c.fit.cost > (1 - FINE) * old.fit.cost for c, old in zip(found, before, strict=True)):
                 break
@@ -443,7 +444,7 @@ DOUBTFUL = 0.4
 STRONGEST = 3
 """Rivals whose initial states are tried on the model that they beat; and whose values are looked around to tell them
 apart."""
-WIDER = 2.0
+WIDER = 1.25
 """How many times the difference at which candidates are alike may turn out to be none."""
 MOST = 0.8
 """Share of the folds in which an effect must gain."""
