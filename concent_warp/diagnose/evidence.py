@@ -71,7 +71,7 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 
 
 
 def log_errors(base: Node, c: Candidate) -> float:
-    """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, see below."""
+    """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, blocks of time."""
     return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))
 
 

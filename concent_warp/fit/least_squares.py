@@ -173,7 +173,7 @@ class Solver:
 
     def _tried(self, fit: Fit, values: np.ndarray, first: Sequence[int], noise: float) -> Fit:
         """Return a fit at other values with its initial states fitted anew; as it was if `first` windows get worse."""
-        measured, everywhere = [np.zeros_like(o) for o in fit.offsets], set(range(len(self.p.windows)))
+        measured = [np.zeros_like(o) for o in fit.offsets]
         there = self.better_starts(replace(fit, values=values), [measured], noise, first)
         limit = huber_limit([piece.residual for piece in fit.linear])
         before, after = (
@@ -181,7 +181,8 @@ class Solver:
         )
         if after >= before:
             return fit
-        return self.better_starts(there, [measured], noise, sorted(everywhere - set(first)))
+        rest = sorted(set(range(len(measured))) - set(first))
+        return self.better_starts(there, [measured], noise, rest) if rest else there
 
     def _polish_by_sample(self, fit: Fit, *, thorough: bool, stuck: bool) -> Fit:
         """Polish a fit on a sample of the windows; where that helps there, go on with all of them from its values."""

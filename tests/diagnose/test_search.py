@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnose.blocks import cut_blocks
+from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.diagnose.diagnosis import Finding
 from concent_warp.diagnose.evidence import alike
 from concent_warp.diagnose.search import (
@@ -149,3 +150,43 @@ def test_a_rare_effect_does_not_shut_out_a_common_one_that_leaves_hardly_more(la
     monkeypatch.setattr(effect_class("joint_damping"), "rarity", 6.0)
     assert of_two(lacking, little) == {"joint_damping", "armature"}
     assert of_two(lacking, much) == {"joint_damping"}
+
+
+def test_a_rival_gets_on_from_the_leaders_initial_states_and_goes_on_as_long_as_it_gains(lacking):
+    right = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    solver = Solver(Prediction(lacking.model, (right.effect,), lacking.windows))
+    astray = tuple(o + 3.0 for o in right.fit.offsets)
+    values = 0.5 * right.fit.values
+    linear = solver.linearise(values, astray)
+    cost = solver.cost([piece.residual for piece in linear], astray, values)
+    stuck = replace(right, fit=replace(right.fit, values=values, offsets=astray, cost=cost, linear=linear))
+    stuck = replace(stuck, errors=1.5 * right.errors)
+    found = [right, stuck]
+    procedure = Procedure(lacking.model, swung(), DiagnosisCfg(jobs=1), silent)
+    procedure.level(lacking, found, np.array([right.share(lacking)] * 2))
+    assert found[0].fit.cost <= right.fit.cost
+    assert found[1].fit.cost < 1.01 * right.fit.cost
+    assert found[1].fit.values[0] == pytest.approx(DAMPING, rel=0.05)
+
+
+def test_what_is_nearly_alike_is_looked_around_and_what_comes_first_is_polished(lacking):
+    best = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    other = replace(fit_candidate(lacking, screen(lacking, effect("armature"))), errors=1.022 * best.errors)
+    procedure = Procedure(lacking.model, swung(), DiagnosisCfg(jobs=1), silent)
+    looked = []
+    settling = procedure.settling
+
+    def judge(c):
+        return Finding(c.effect.name, c.effect.target, "", (), c.share(lacking), 0.0, 1.0, 0.0, 0.0, False, 0, (), "")
+
+    def seen(work, tasks):
+        looked.extend(c.effect.name for _, c, *_ in tasks)
+        return settling(work, tasks)
+
+    procedure.settling = seen
+    group = procedure.told_apart(lacking, [(c, replace(judge(c), accepted=True)) for c in (best, other)], judge)
+    assert set(looked) == {"joint_damping", "armature"}
+    first, finding = group[0]
+    assert finding.accepted
+    assert finding.name == "joint_damping"
+    assert first.spread is not None
