@@ -248,16 +248,22 @@ class Procedure:
         while left:
             found += self.parallel(fit_candidate, [(base, s) for s in left[:FIRST]], "fitting", 0.15 / FIRST)
             left = left[FIRST:]
-            if min(c.ratio for c in found) < EXPLAINED:
+            if (least := min(c.ratio for c in found)) < EXPLAINED:
                 best = max(c.share(base) for c in found)
-                left = [s for s in left if s.promise > DISTANT * best]
+                left = [s for s in left if s.promise > (HALF if least < SETTLED else DISTANT) * best]
         if not found:
             return found
         hoped = np.array([max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)])
-        # A fit that is stuck gains too little: where another is done, rivals far behind are worth a second one.
-        near = HALF if min(c.ratio for c in found) < EXPLAINED else NEAR
-        best = max(c.share(base) for c in found)
-        rough = [k for k, c in enumerate(found) if hoped[k] > near * best and c.ratio > SETTLED]
+        best = leader(base, found)
+        if best.ratio < EXPLAINED:
+            # A fit that is stuck gains too little: where another is done, it can lead rivals far behind out of that.
+            most = best.share(base)
+            far = [k for k in range(len(found)) if HALF * most < hoped[k] <= NEAR * most]
+            tasks = [(base, found[k], best.fit, True) for k in far]
+            for k, c in zip(far, self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0), strict=True):
+                found[k] = c
+                hoped[k] = max(hoped[k], c.share(base))
+        rough = [k for k, c in enumerate(found) if hoped[k] > NEAR * best.share(base) and c.ratio > SETTLED]
         polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
@@ -423,9 +429,9 @@ FIRST = 3
 EXPLAINED = 1.1
 """Residual over noise at which a candidate has left little to others."""
 DISTANT = 0.3
-"""Share of the best gain below which a promise is not worth a fit any more."""
+"""Share of the best gain below which a promise is not worth a fit any more where that has left little."""
 NEAR = 0.7
-"""Share of the best gain from which on a candidate is worth a second fit, where none has left but noise."""
+"""Share of the best gain from which on a candidate is worth a second fit."""
 CLOSE = 0.85
 """Share of the best gain from which on a candidate may be its equal."""
 SETTLED = 1.03
@@ -435,8 +441,8 @@ QUIET = 0.25
 PIECE = 0.4
 """Length of the short windows by way of which fits are led out of a local minimum [s]."""
 HALF = 0.5
-"""Share of the best gain from which on that is worth a try, where no candidate explains the data; and a second fit,
-where one does."""
+"""Share of the best gain from which on that is worth a try, where no candidate explains the data; and initial states
+of the best, where it does; and a fit at all, where it has left nothing."""
 ROUNDS, FINE = 3, 0.01
 """How often the best fits are taken up again, as long as the cost of one falls by the second number."""
 DOUBTFUL = 0.4

@@ -244,15 +244,17 @@ def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False
     return found if found.fit.cost < candidate.fit.cost else replace(candidate, polished=True)
 
 
-def restarted_candidate(base: Node, candidate: Candidate, leader: Fit) -> Candidate:
+def restarted_candidate(base: Node, candidate: Candidate, leader: Fit, quick: bool = False) -> Candidate:
     """Take up the fit of a candidate from the leader's initial states; the worse of the two is dropped.
 
     Either window by window, where they serve its parameters better, or all of them, with the parameters that go with
-    them: those of a fit that is stuck do not.
+    them: those of a fit that is stuck do not. A `quick` one tries the latter alone.
     """
     solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1))
-    some = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
-    fresh = min(some, solver.led(candidate.fit, leader), key=lambda f: f.cost)
+    fresh = solver.led(candidate.fit, leader)
+    if not quick:
+        some = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
+        fresh = min(some, fresh, key=lambda f: f.cost)
     if fresh.cost > (1 - BETTER) * candidate.fit.cost:
         return candidate
     found = judged(base, candidate.effect, solver, solver.fit(fresh.values, fresh.offsets, fresh.starts))
