@@ -41,7 +41,7 @@ layout:
 	@ln -s $(addprefix $(CURDIR)/,$(filter-out %/__pycache__,$(wildcard concent_warp/*)) kernels train render) $(LAYOUT)
 
 system:
-	@if [ -n "$(foreach name,$(BROWSERS),$(shell command -v $(name)))" ]; then :; \
+	@if [ -n "$(strip $(foreach name,$(BROWSERS),$(shell command -v $(name))))" ]; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		{ timeout 60 apt-get update -qq && DEBIAN_FRONTEND=noninteractive timeout 120 \
 			apt-get install -qq --no-install-recommends chromium; } </dev/null >/dev/null 2>&1 \

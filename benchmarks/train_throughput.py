@@ -102,41 +102,44 @@ class Alternative:
 
     environment: dict[str, Any] = field(default_factory=dict)
     """Changed settings of the environment."""
-    options: dict[str, Any] = field(default_factory=dict)
-    """Changed options of the simulator."""
     threads: int | None = None
     """Changed threads of a world's virtual collisions."""
+    points: int | None = None
+    """Changed number of points of each object's surface in those."""
     touching: bool = False
     """Of the robot, leave in the physics what takes part in a contact event alone, as of the objects."""
 
 
 TIGHT = {"nconmax": 64, "njmax": 256}
-QUICK = {**TIGHT, "solver_iterations": 6, "jacobian": "sparse"}
+PYRAMIDS = {"cone": "pyramidal"}
+COARSE = {**PYRAMIDS, "stride": 2}
 ALTERNATIVES = {
     "as it is": Alternative(),
+    "pyramidal cones": Alternative(PYRAMIDS),
+    "steps twice as long": Alternative({"stride": 2}),
+    "pyramidal cones, steps twice as long": Alternative(COARSE),
+    "pyramidal cones, 6 iterations": Alternative({**PYRAMIDS, "solver_iterations": 6}),
+    "pyramidal cones, steps twice as long, 6 iterations": Alternative({**COARSE, "solver_iterations": 6}),
+    "pyramidal cones, steps twice as long, sparse": Alternative({**COARSE, "jacobian": "sparse"}),
+    "without points": Alternative(points=0),
     "sparse": Alternative({"jacobian": "sparse"}),
-    "6 iterations": Alternative({"solver_iterations": 6}),
-    "64 contacts, 256 rows": Alternative(TIGHT),
-    "sparse, 6 iterations, 64 contacts, 256 rows": Alternative(QUICK),
-    "the same, touching links alone": Alternative(QUICK, touching=True),
-    "the same, touching links alone, fused, 32 threads": Alternative(
-        {**QUICK, "fuse": True}, threads=32, touching=True
-    ),
-    "6 iterations, 64 contacts, 256 rows": Alternative({**TIGHT, "solver_iterations": 6}),
-    "6 iterations, 20 of the line search": Alternative({"solver_iterations": 6, "ls_iterations": 20}),
     "4 iterations": Alternative({"solver_iterations": 4}),
+    "6 iterations": Alternative({"solver_iterations": 6}),
+    "6 iterations, 20 of the line search": Alternative({"solver_iterations": 6, "ls_iterations": 20}),
+    "64 contacts, 256 rows": Alternative(TIGHT),
+    "6 iterations, 64 contacts, 256 rows": Alternative({**TIGHT, "solver_iterations": 6}),
+    "touching links alone": Alternative(touching=True),
     "32 threads": Alternative(threads=32),
     "64 threads": Alternative(threads=64),
     "fused": Alternative({"fuse": True}),
-    "touching links alone": Alternative(touching=True),
-    "pyramidal cones": Alternative(options={"cone": 0, "impratio": 1.0}),
-    "5 steps of 10 ms": Alternative({"decimation": 5}, {"timestep": 0.01}),
     "torch outside of graphs": Alternative({"capture": "physics"}),
 }
 PPO_ALTERNATIVES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "as it is": ({}, {}),
-    "sparse, 6 iterations, 64 contacts, 256 rows": (QUICK, {}),
-    "the same, fused": ({**QUICK, "fuse": True}, {}),
+    "pyramidal cones": (PYRAMIDS, {}),
+    "pyramidal cones, steps twice as long": (COARSE, {}),
+    "pyramidal cones, steps twice as long, fused": ({**COARSE, "fuse": True}, {}),
+    "pyramidal cones, steps twice as long, 2 epochs": (COARSE, {"epochs": 2}),
     "products in float32": ({}, {"tf32": False}),
     "2 batches": ({}, {"batches": 2}),
 }
@@ -197,8 +200,8 @@ class Bench:
             parts = profile(environment, actions, args.steps)
             used = memory_used(args.device) - before
             tape = record_states(environment, actions, args.steps)
-            bare, solver = bare_on_states(environment, tape, cfg.decimation)
-            held = bare_rounds(environment, cfg.decimation, args.steps, 2)
+            bare, solver = bare_on_states(environment, tape, cfg.simulation_steps)
+            held = bare_rounds(environment, cfg.simulation_steps, args.steps, 2)
         return {
             **facts(task, cfg),
             "nconmax": warp_physics(environment).nconmax,
@@ -274,6 +277,7 @@ def facts(task: Task, cfg: EnvironmentCfg) -> Row:
         "spheres": int(task.collidable.sum()),
         "worlds": cfg.worlds,
         "decimation": cfg.decimation,
+        "stride": cfg.stride,
     }
 
 
@@ -283,21 +287,22 @@ def random_actions(environment: Environment) -> torch.Tensor:
 
 
 def altered(task: Task, other: Alternative) -> Task:
-    """Return a task with other options of the simulator, or with less of the robot in it."""
+    """Return a task, with less of the robot in its physics if asked for."""
+    if not other.touching:
+        return task
     compiled = copy.copy(task.compiled)
-    for name, value in other.options.items():
-        setattr(compiled.opt, name, value)
-    if other.touching:
-        touching = {compiled.body(entity.body).id for entity in task.events.entities}
-        idle = ~np.isin(compiled.geom_bodyid, sorted({0, *task.objects, *touching}))
-        compiled.geom_contype[idle] = compiled.geom_conaffinity[idle] = 0
+    touching = {compiled.body(entity.body).id for entity in task.events.entities}
+    idle = ~np.isin(compiled.geom_bodyid, sorted({0, *task.objects, *touching}))
+    compiled.geom_contype[idle] = compiled.geom_conaffinity[idle] = 0
     return replace(task, compiled=compiled)
 
 
 def settings(cfg: EnvironmentCfg, other: Alternative) -> EnvironmentCfg:
     """Return the settings of an alternative."""
-    threads = cfg.virtual.threads if other.threads is None else other.threads
-    return replace(cfg, **other.environment, virtual=replace(cfg.virtual, threads=threads))
+    virtual = cfg.virtual
+    virtual = virtual if other.threads is None else replace(virtual, threads=other.threads)
+    virtual = virtual if other.points is None else replace(virtual, points=other.points)
+    return replace(cfg, **other.environment, virtual=virtual)
 
 
 def attempt(kept: Measurements, key: str, expected: float, measure: Callable[[], Row], device: str) -> None:

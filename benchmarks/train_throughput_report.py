@@ -180,8 +180,9 @@ def picture(rows: list[Row]) -> bool:
 
 def section(result: dict[str, Any], tables: list[str]) -> list[str]:
     """Return the part of a page of one machine, nothing where nothing was measured."""
-    facts = result["machine"]
-    return [f"## {facts.get('device', facts['processor'])}", machine_line(facts), *tables] if tables else []
+    facts, remark = result["machine"], [result["remark"]] if "remark" in result else []
+    title = result.get("title", facts.get("device", facts["processor"]))
+    return [f"## {title}", machine_line(facts), *remark, *tables] if tables else []
 
 
 def taken(paths: list[Path]) -> dict[str, Any]:

@@ -106,11 +106,11 @@ class RewardCfg:
     haste."""
     disturb_position: float = 2.0
     """Penalty of moving an object between steps [1/m]: in the hand where the stage holds it, else in the world."""
-    disturb_rotation: float = 0.2
+    disturb_rotation: float = 1.0
     """The same for turning it [1/rad]."""
     failure: float = 5.0
     """Fixed penalty of an episode that ends in failure."""
-    lenience: float = 1.0
+    lenience: float = 0.0
     """Share of the penalties of virtual collisions and failure that counts while no episode succeeds; it rises to 1
     with the square of the share of those that do. Large penalties that count from the start keep a policy away from its
     target."""
@@ -133,9 +133,9 @@ class CollisionCfg:
     depth: float = 50.0
     """Penalty of a penetration [1/m], summed over the spheres. Too little, and the policy learns to go through what the
     physics leaves out."""
-    points: int = 0
-    """Points on the surface of each object that are to keep out of the other objects as well: what is learnt with them
-    holds up better where edges are sharp, but few worlds or steps may not get there."""
+    points: int = 512
+    """Points on the surface of each object that are to keep out of the other objects as well: spheres round off edges,
+    and what is learnt with these points holds up where edges are sharp."""
     band: float = 0.01
     """Penalty of a sphere in touch, falling to 0 at the margin."""
     threads: int = 128
@@ -158,8 +158,9 @@ class ResetCfg:
     """Largest upward displacement of what is held [m]."""
     turn: float = 0.15
     """Half width of the rotation about the vertical [rad]."""
-    held: float = 0.0
-    """Half width of the rotation of a held object in the hand, about the axis along which it is held [rad]."""
+    held: float = 0.15
+    """Half width of the rotation of a held object in the hand, about the axis along which it is held [rad]: an edge
+    that catches turns it there, and a policy is to know what to do then."""
     solver: Literal["auto", "newton", "posture"] = "auto"
     """Inverse kinematics: all states at once by Newton, from several seeds, or one after the other from the
     demonstrated posture; "auto" takes Newton on a GPU (on a CPU its kernels take a minute to compile)."""
@@ -227,7 +228,10 @@ class EnvironmentCfg:
     collision: Literal["vcp", "full"] = "vcp"
     """Spheres in the physics: those of the contact event sequence alone, or all."""
     decimation: int = 10
-    """Simulation steps of one action."""
+    """Time steps of the model in one action."""
+    stride: int = 1
+    """How many of those a simulation step takes at once: coarser physics, in less time. Contacts want steps of half
+    their time constant at most."""
     episode: float | None = None
     """Length of an episode [s]; by default 3 s, where stages are chained 12 s."""
     dropped: float = 0.02
@@ -248,6 +252,9 @@ class EnvironmentCfg:
     """Most iterations of the solver in a simulation step; by default the model's."""
     ls_iterations: int | None = None
     """Most iterations of its line search; by default the model's."""
+    cone: Literal["auto", "elliptic", "pyramidal"] = "auto"
+    """Friction cones; "auto" as the model has them. Pyramids are quicker; friction is weaker between their axes than
+    along them, and what is held slips more."""
     jacobian: Literal["auto", "dense", "sparse"] = "auto"
     """How the solver keeps the constraints' derivatives: the same results, at other speeds; "auto" as MuJoCo does."""
     action: ActionCfg = field(default_factory=ActionCfg)
@@ -259,6 +266,11 @@ class EnvironmentCfg:
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
     randomise_effects: bool = True
     """Draw the parameters of the model's effects for each world from their fitted 95 % intervals."""
+
+    @property
+    def simulation_steps(self) -> int:
+        """Simulation steps of one action."""
+        return self.decimation // self.stride
 
     @property
     def seconds(self) -> float:
@@ -328,6 +340,7 @@ class TrainCfg:
         for name, value in {
             "worlds": e.worlds,
             "decimation": e.decimation,
+            "stride": e.stride,
             "slots": e.observation.slots,
             "states": e.reset.states,
             "iterations": p.iterations,
@@ -336,6 +349,12 @@ class TrainCfg:
         }.items():
             if value < 1:
                 raise TrainError(f"{name} is not right", expected="at least 1", found=value)
+        if e.decimation % e.stride:
+            raise TrainError(
+                "an action is no whole number of simulation steps",
+                expected=f"a divisor of the decimation, {e.decimation}",
+                found=f"stride {e.stride}",
+            )
         if e.worlds * p.steps < p.batches:
             raise TrainError(
                 "a round holds fewer steps than batches", expected=f"at least {p.batches}", found=e.worlds * p.steps

@@ -22,6 +22,10 @@ JACOBIANS = {
     "dense": mujoco.mjtJacobian.mjJAC_DENSE,
     "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
 }
+CONES = {
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+}
 
 
 def make_environment(
@@ -47,12 +51,12 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     fields = drawn_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
     following = Following.of([*effects.late, drawn_following(task, cfg.worlds, cfg.randomisation, seed)])
     if plain:
-        return MujocoPhysics(m, cfg.worlds, cfg.decimation, effects.laws, fields=fields, following=following)
+        return MujocoPhysics(m, cfg.worlds, cfg.simulation_steps, effects.laws, fields=fields, following=following)
     contacts, constraints = buffers(task, cfg)
     return WarpPhysics(
         m,
         cfg.worlds,
-        cfg.decimation,
+        cfg.simulation_steps,
         effects.laws,
         device=device,
         nconmax=contacts,
@@ -64,8 +68,13 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
 
 
 def solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
-    """Return a model with the solver that the settings ask for."""
+    """Return a model with the solver, friction cones and time step that the settings ask for."""
     limited = copy.copy(m)
+    limited.opt.timestep *= cfg.stride
+    if cfg.cone != "auto":
+        limited.opt.cone = CONES[cfg.cone]
+    if cfg.cone == "pyramidal":
+        limited.opt.impratio = 1.0  # an edge of a pyramid is normal and tangential at once
     limited.opt.jacobian = m.opt.jacobian if cfg.jacobian == "auto" else JACOBIANS[cfg.jacobian]
     limited.opt.iterations = m.opt.iterations if cfg.solver_iterations is None else cfg.solver_iterations
     limited.opt.ls_iterations = m.opt.ls_iterations if cfg.ls_iterations is None else cfg.ls_iterations

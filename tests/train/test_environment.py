@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from concent_warp.train.cfg import TrainCfg, TrainError
 from concent_warp.train.environment import TERMS, Environment
 from concent_warp.train.physics import WarpPhysics
 from concent_warp.train.randomisation import drawn_fields
@@ -38,7 +39,9 @@ def test_episode_that_runs_its_time_is_a_time_out_and_no_failure(environment):
     assert (environment.episode_length_buf == 0).all()
 
 
-def test_letting_go_is_a_failure_and_no_time_out(environment):
+def test_letting_go_is_a_failure_and_no_time_out(task, states):
+    strict = replace(SETTINGS, reward=replace(SETTINGS.reward, lenience=1.0))
+    environment = make_environment(task, strict, states, device="cpu")
     start(environment)
     opening = still(environment)
     opening[:, -1] = 1.0
@@ -49,9 +52,9 @@ def test_letting_go_is_a_failure_and_no_time_out(environment):
         assert not extras["time_outs"].any()
         fallen = environment.failure[:, 0]
         assert (done >= fallen).all()
-        expected = -environment.cfg["reward"]["failure"] * done.float()
+        expected = -strict.reward.failure * done.float()
         torch.testing.assert_close(environment.terms[:, TERMS.index("failure")], expected)
-        torch.testing.assert_close(reward, environment.cfg["reward"]["scale"] * environment.terms.sum(dim=1))
+        torch.testing.assert_close(reward, strict.reward.scale * environment.terms.sum(dim=1))
         ended |= fallen
         environment.physics.ctrl[:, -1] = 0.03
     # Blocks low in the hole have nowhere to fall.
@@ -260,3 +263,26 @@ def test_fused_step_is_that_of_single_operations(task, states):
         torch.testing.assert_close(fused["policy"], seen["policy"], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(fused_reward, reward, atol=1e-4, rtol=1e-4)
         assert (fused_done == done).all()
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_longer_steps_and_pyramids_keep_the_control_period_and_follow_the_same_commands(task, states, engine):
+    fine = replace(SETTINGS, worlds=4, engine=engine)
+    coarse = replace(fine, stride=2, cone="pyramidal")
+    found = []
+    for cfg in (fine, coarse):
+        environment = make_environment(task, cfg, states, device="cpu")
+        assert environment.control_step == pytest.approx(0.05)
+        start(environment)
+        torch.manual_seed(1)
+        for _ in range(4):
+            environment.step(0.3 * torch.randn(environment.num_envs, environment.num_actions))
+        found.append(environment.physics.qpos[:, task.robot.qpos].clone())
+    # Drives answer a little otherwise in longer steps.
+    torch.testing.assert_close(found[0], found[1], atol=1e-3, rtol=0)
+    assert not torch.equal(found[0], found[1])
+
+
+def test_stride_that_leaves_part_of_an_action_is_refused():
+    with pytest.raises(TrainError, match="expected a divisor of the decimation, 10, found stride 4"):
+        TrainCfg(environment=replace(SETTINGS, stride=4))
