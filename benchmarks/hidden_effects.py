@@ -32,7 +32,7 @@ from concent_warp.errors import ConcentError
 from concent_warp.model import Model, write_text
 
 OUT = Path("runs/hidden_effects")
-SHIFT = 3000
+SHIFT = 4000
 """Of the seeds of the page."""
 
 
