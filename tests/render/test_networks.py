@@ -24,6 +24,15 @@ CFG = RenderTrainCfg(
 )
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Threads that wait for one another take minutes for these small networks where other work is on the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def pairs(name="base", body=None, count=12) -> Pairs:
     """Return frames of a bright square that moves; the simulation shows it dark."""
     camera = Camera(name, body, (0, 0, 1), (1, 0, 0, 0), 45.0)
