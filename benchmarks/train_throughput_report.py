@@ -171,6 +171,7 @@ def picture(rows: list[Row]) -> bool:
         axes.plot([r["worlds"] for r in bad], [at(r, "environment_ms") for r in bad], "x", ms=14, c=line.get_color())
     axes.set(xscale="log", yscale="log", xlabel="worlds", ylabel="environment steps/s")
     axes.set_xticks(sorted(counts), [f"{n:,}" for n in sorted(counts)])
+    axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
     axes.set_title("x: contacts were dropped")
     axes.legend()
     figure.savefig(FOLDER / PICTURE, dpi=150)
