@@ -215,7 +215,8 @@ class Trainer:
                 spent = {"collecting": this.collecting, "updating": this.updating}
                 rate = self.steps_of_round / sum(spent.values())
                 point = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds}
-                write({**point, **this.log, **spent, "steps_per_second": rate})
+                # The environment's log counts the steps of this round alone: those so far go last.
+                write({**point, **this.log, **spent, "steps_per_second": rate, **point})
 
             yield write_round
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.curve import CURVE, read_curve
 from concent_warp.train.environment import Environment
 from concent_warp.train.evaluate import evaluate, wilson
 from concent_warp.train.export import export
@@ -57,9 +58,14 @@ def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, tmp_path
     train(made, tmp_path / "whole", device="cpu")
     half = replace(made, cfg=replace(made.cfg, ppo=replace(SHORT, iterations=2)))
     train(half, tmp_path / "parts", device="cpu")
+    with (tmp_path / "parts" / CURVE).open("a") as file:  # a round after the checkpoint, which is done again
+        file.write(json.dumps({"iteration": 3, "steps": 48, "seconds": 0.1}) + "\n")
     _, last = train(made, tmp_path / "parts", device="cpu", resume=True)
     assert last is not None
     assert (last.iteration, last.steps) == (4, 64)
+    for folder in ("whole", "parts"):
+        rounds = read_curve(tmp_path / folder)
+        assert [(row["iteration"], row["steps"]) for row in rounds] == [(1, 16), (2, 32), (3, 48), (4, 64)]
     whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
     for name, value in whole.items():
         torch.testing.assert_close(parts[name], value, rtol=0, atol=0)
