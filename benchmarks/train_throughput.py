@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.warp_engine import preferred_device
 
+T = TypeVar("T")
 Collision = Literal["vcp", "full"]
 What = Literal["rate", "kernels", "ppo", "alternatives"]
 COUNTS = (256, 1024, 4096, 8192, 16384, 32768)
@@ -77,6 +78,8 @@ class Args:
     """Rounds, of which the median counts."""
     seconds: float | None = None
     """Time after which no measurement is begun [s]."""
+    settings: tuple[str, ...] = ()
+    """Of the other settings, those that have one of these words in their names; by default all."""
     spheres: int = 512
     """Spheres of both objects together."""
     states: int = 512
@@ -140,6 +143,7 @@ PPO_ALTERNATIVES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "pyramidal cones, steps twice as long": (COARSE, {}),
     "pyramidal cones, steps twice as long, fused": ({**COARSE, "fuse": True}, {}),
     "pyramidal cones, steps twice as long, 2 epochs": (COARSE, {"epochs": 2}),
+    "pyramidal cones, steps twice as long, 2 batches": (COARSE, {"batches": 2}),
     "products in float32": ({}, {"tf32": False}),
     "2 batches": ({}, {"batches": 2}),
 }
@@ -305,6 +309,11 @@ def settings(cfg: EnvironmentCfg, other: Alternative) -> EnvironmentCfg:
     return replace(cfg, **other.environment, virtual=virtual)
 
 
+def chosen(among: Mapping[str, T], words: Sequence[str]) -> list[tuple[str, T]]:
+    """Return the settings, with their names, that have one of some words in their names; all for no words."""
+    return [(name, given) for name, given in among.items() if not words or any(word in name for word in words)]
+
+
 def attempt(kept: Measurements, key: str, expected: float, measure: Callable[[], Row], device: str) -> None:
     """Measure, unless it is measured or there is no time; keep an error in place of a result."""
     if not kept.wanted(key, expected):
@@ -353,9 +362,9 @@ def measure_one(bench: Bench, kept: Measurements, what: What, cfg: EnvironmentCf
     elif what == "ppo":
         one(name, 30, lambda: bench.ppo(cfg, task, states, PpoCfg()))
     else:
-        for title, other in ALTERNATIVES.items():
+        for title, other in chosen(ALTERNATIVES, bench.args.settings):
             one(f"{name}: {title}", 30, partial(bench.rate, settings(cfg, other), altered(task, other), states))
-        for title, (environment, ppo) in PPO_ALTERNATIVES.items():
+        for title, (environment, ppo) in chosen(PPO_ALTERNATIVES, bench.args.settings):
             changed = replace(cfg, **environment), task, states, replace(PpoCfg(), **ppo)
             one(f"{name}, PPO: {title}", 30, partial(bench.ppo, *changed))
 

@@ -1,16 +1,18 @@
 """The pages of the throughput of training and of the virtual collision penalty, from what was measured.
 
 python benchmarks/train_throughput_report.py F...   # files of benchmarks/train_throughput.py, taken into docs
+python benchmarks/train_throughput_report.py F --section "other settings" --remark "..."    # under a heading of its own
 python benchmarks/train_throughput_report.py        # the pages anew
 """
 
 from __future__ import annotations
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from measurements import Measurements, Row
 from pages import FOLDER, machine_line, read_data, table, write_data, write_page
 
@@ -40,6 +42,18 @@ small until no step of no world dropped anything. Dropped are the world's steps 
 worlds whose state was not finite or beyond all bounds, of the episodes that ended. Memory is what the environment took,
 its graphs included, beyond one of 16 worlds.
 """
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Measurements to take in; all are of one machine."""
+    section: str = ""
+    """Heading under which they stand, besides the device; by default with those of that kind of device."""
+    remark: str = ""
+    """What is to be said of them."""
 
 
 def memory(r: Row) -> str:
@@ -186,21 +200,26 @@ def section(result: dict[str, Any], tables: list[str]) -> list[str]:
     return [f"## {title}", machine_line(facts), *remark, *tables] if tables else []
 
 
-def taken(paths: list[Path]) -> dict[str, Any]:
+def taken(args: Args) -> dict[str, Any]:
     """Return the stored data with the measurements of files taken in."""
     data = read_data(NAME)
-    for path in paths:
+    for path in args.files:
         for key, row in Measurements(path).rows.items():
-            kind = "cuda" if "device" in row["machine"] and row["machine"]["device"] != "cpu" else "cpu"
-            part = data.setdefault(kind, {"machine": row["machine"], "rows": {}})
-            part["machine"] = row["machine"]
+            facts = row["machine"]
+            cuda = "device" in facts and facts["device"] != "cpu"
+            part = data.setdefault(f"{'cuda' if cuda else 'cpu'} {args.section}".strip(), {"rows": {}})
+            part["machine"] = facts
+            if args.section:
+                part["title"] = f"{facts['device' if cuda else 'processor']}, {args.section}"
+            if args.remark:
+                part["remark"] = args.remark
             part["rows"][key] = {name: value for name, value in row.items() if name != "machine"}
     return data
 
 
 def main() -> None:
     """Take measurements in and write the pages."""
-    data = taken([Path(name) for name in sys.argv[1:]])
+    data = taken(tyro.cli(Args, description=__doc__))
     write_data(NAME, data)
     written = f"Written by `benchmarks/{NAME}_report.py`; do not edit."
     pages = {NAME: ["# Throughput of training", written, ABOUT], "train_vcp": ["# VCP against FULL", written, VCP]}
