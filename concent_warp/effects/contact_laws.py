@@ -129,47 +129,58 @@ class Pull(Law):
             points = self.point[mine].astype(float)
             reach = float(np.linalg.norm(points, axis=1).max()) + radius + self.gap
             body = m.geom_bodyid[g]
-            pose = d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3)
-            parts.append((*pose, points, radius, reach, d.xipos[body], d.xfrc_applied[body]))
+            pose = d.geom_xpos[g], d.geom_xmat[g]
+            parts.append((*pose, points, points.tolist(), radius, reach, d.xipos[body], d.xfrc_applied[body]))
         flat = [int(g) for g in self.still if m.geom_type[g] == GEOM.mjGEOM_PLANE]
         boxes = [
             (d.geom_xpos[g], d.geom_xmat[g].reshape(3, 3), m.geom_size[g].copy())
             for g in self.still
             if m.geom_type[g] != GEOM.mjGEOM_PLANE
         ]
-        planes: list[tuple[np.ndarray, float, float, float, float]] = []
+        planes: list[tuple[float, float, float, float]] = []
 
         def act() -> None:
             if not d.time:
                 return
             if len(planes) < len(flat):  # poses of what stands still are known from the first step on
                 for g in flat:
-                    normal = d.geom_xmat[g].reshape(3, 3)[:, 2].copy()
-                    planes.append((normal, float(d.geom_xpos[g] @ normal), *(-strength * normal).tolist()))
-            for centre, turn, points, radius, reach, middle, applied in parts:
-                for normal, level, fx, fy, fz in planes:
-                    height = float(centre @ normal) - level
+                    normal = d.geom_xmat[g].reshape(3, 3)[:, 2]
+                    planes.append((*normal.tolist(), float(d.geom_xpos[g] @ normal)))
+            for centre, turn, points, listed, radius, reach, middle, applied in parts:
+                # A handful of points: plain numbers are several times faster than arrays of them.
+                cx, cy, cz = centre.tolist()
+                xx, xy, xz, yx, yy, yz, zx, zy, zz = turn.tolist()
+                for nx, ny, nz, level in planes:
+                    height = cx * nx + cy * ny + cz * nz - level
                     if height > reach:
                         continue
-                    near = points @ (normal @ turn) < self.gap + radius - height
-                    count = np.count_nonzero(near)
+                    ax, ay, az = nx * xx + ny * yx + nz * zx, nx * xy + ny * yy + nz * zy, nx * xz + ny * yz + nz * zz
+                    below, count, sx, sy, sz = self.gap + radius - height, 0, 0.0, 0.0, 0.0
+                    for px, py, pz in listed:
+                        if px * ax + py * ay + pz * az < below:
+                            count, sx, sy, sz = count + 1, sx + px, sy + py, sz + pz
                     if count:
                         # All pull alike, so that their forces act as one at the sum of their arms.
-                        x, y, z = (turn @ (near @ points) + count * (centre - radius * normal - middle)).tolist()
-                        n = float(count)
-                        applied += (n * fx, n * fy, n * fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
+                        mx, my, mz = middle.tolist()
+                        x = xx * sx + xy * sy + xz * sz + count * (cx - radius * nx - mx)
+                        y = yx * sx + yy * sy + yz * sz + count * (cy - radius * ny - my)
+                        z = zx * sx + zy * sy + zz * sz + count * (cz - radius * nz - mz)
+                        fx, fy, fz = -strength * nx, -strength * ny, -strength * nz
+                        twist = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx
+                        applied += (count * fx, count * fy, count * fz, *twist)
                 for origin, axes, half in boxes:
                     away = (centre - origin) @ axes
                     if (np.abs(away) > half + reach).any():
                         continue
-                    local = points @ (turn.T @ axes) + away
+                    about = turn.reshape(3, 3)
+                    local = points @ (about.T @ axes) + away
                     beyond = np.abs(local) - half
                     face = beyond.argmax(axis=1)
                     row = np.arange(len(local))
                     over = (beyond > 0).sum(axis=1) <= 1
                     for i in np.flatnonzero(over & (beyond[row, face] - radius < self.gap)):
                         normal = np.sign(local[i, face[i]]) * axes[:, face[i]]
-                        x, y, z = centre + turn @ points[i] - radius * normal - middle
+                        x, y, z = centre + about @ points[i] - radius * normal - middle
                         fx, fy, fz = -strength * normal
                         applied += (fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
 
