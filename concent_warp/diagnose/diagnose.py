@@ -46,6 +46,7 @@ from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
+from concent_warp.simulate.threads import at_most
 
 T = TypeVar("T")
 
@@ -124,6 +125,10 @@ class Procedure:
 
     def run(self) -> Diagnosis:
         """Go through the procedure."""
+        with at_most(self.cfg.jobs if self.cfg.jobs > 0 else None):
+            return self._run()
+
+    def _run(self) -> Diagnosis:
         issues = check_data(self.recording)
         self.progress(0.0, "cutting windows")
         base = self.baseline()
@@ -163,7 +168,7 @@ class Procedure:
         windows = observe(self.model, self.recording, length=cfg.window, noise=noise, engine=cfg.engine, seed=cfg.seed)
         self.progress(0.03, "fitting the model as it is")
         check_finite(Prediction(self.model, (), windows, engine=cfg.engine), self.model.scene.source)
-        return node(self.model, windows, cut_blocks(windows), cfg.engine, None, rough=rough)
+        return node(self.model, windows, cut_blocks(windows), cfg.engine, rough=rough)
 
     def addition(self, base: Node, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
         """Look for one effect that the node's model lacks; return it, and what could have been seen."""
@@ -210,10 +215,10 @@ class Procedure:
 
         near = alike(base, good, slack=WIDER)
         if len(near) > len(alike(base, good)) and len(base.windows) <= MANY:
-            near = [anew(settled(base, c, self.settling, self.threads)) for c, _ in near[:STRONGEST]] + near[STRONGEST:]
+            near = [anew(settled(base, c, self.settling)) for c, _ in near[:STRONGEST]] + near[STRONGEST:]
         group = alike(base, near)
-        polished = polish_candidate(base, group[0][0], thorough=True, threads=self.threads)
-        group[0] = anew(settled(base, polished, self.settling, self.threads))
+        polished = polish_candidate(base, group[0][0], thorough=True)
+        group[0] = anew(settled(base, polished, self.settling))
         return group
 
     def pruned(self, nodes: list[Node]) -> list[Node]:
@@ -263,7 +268,10 @@ class Procedure:
             for k, c in zip(far, self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0), strict=True):
                 found[k] = c
                 hoped[k] = max(hoped[k], c.share(base))
-        rough = [k for k, c in enumerate(found) if hoped[k] > NEAR * best.share(base) and c.ratio > SETTLED]
+        most = best.share(base)
+        # Those beside a fit that leaves nothing are led on from its initial states first, see `level`.
+        later = [best.ratio < SETTLED and c.share(base) > CLOSE * most for c in found]
+        rough = [k for k, c in enumerate(found) if hoped[k] > NEAR * most and c.ratio > SETTLED and not later[k]]
         polished = self.parallel(polish_candidate, [(base, found[k]) for k in rough], "polishing", 0.0)
         for k, c in zip(rough, polished, strict=True):
             found[k] = c
@@ -293,7 +301,7 @@ class Procedure:
                 for k, c in zip(near, polished, strict=True):
                     found[k] = c
             elif best.ratio > SETTLED:  # those near are its equals already
-                found[mine] = polish_candidate(base, best, threads=self.threads)
+                found[mine] = polish_candidate(base, best)
             if all(c.fit.cost > (1 - FINE) * old.fit.cost for c, old in zip(found, before, strict=True)):
                 break
             hoped = np.array([c.share(base) for c in found])
@@ -357,11 +365,6 @@ class Procedure:
             self.progress(self._done + span * (i + 1) / max(len(tasks), 1), f"{text}, {i + 1} of {len(tasks)}")
         self._done += span
         return results
-
-    @property
-    def threads(self) -> int | None:
-        """Simulations at a time in work that is not in pieces, None for one a CPU."""
-        return self.cfg.jobs if self.cfg.jobs > 0 else None
 
     def settling(self, work: Callable[..., Look], tasks: Sequence[tuple[Any, ...]]) -> list[Look]:
         """Do the looks around a fit, see `settled`."""
@@ -457,12 +460,23 @@ MOST = 0.8
 
 
 def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
-    """Yield the results of independent pieces of work in order, by joblib where several may run at a time."""
+    """Yield the results of independent pieces of work in order, by joblib where several may run at a time.
+
+    Where there are fewer pieces than processes, each piece runs several simulations at a time.
+    """
     if jobs == 1 or len(tasks) < 2:
         return (work(*task) for task in tasks)
-    from joblib import Parallel, delayed
+    from joblib import Parallel, delayed, effective_n_jobs
 
-    return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(delayed(work)(*task) for task in tasks))
+    threads = effective_n_jobs(jobs) // len(tasks)
+    calls = (delayed(limited)(threads, work, *task) for task in tasks)
+    return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(calls))
+
+
+def limited(threads: int, work: Callable[..., T], *task: Any) -> T:
+    """Do a piece of work with so many simulations at a time, one at least."""
+    with at_most(threads):
+        return work(*task)
 
 
 def leader(base: Node, found: Sequence[Candidate]) -> Candidate:

@@ -252,7 +252,7 @@ def spread_out(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def visited(base: Node, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the states that the node's model goes through, positions (T, nq) and velocities (T, nv)."""
-    engine = MujocoEngine(base.model, threads=1)
+    engine = MujocoEngine(base.model)
     qpos, qvel = [np.zeros((0, m.nq))], [np.zeros((0, m.nv))]
     for w, offset in zip(base.windows, base.fit.offsets, strict=True):
         steps = max(int(np.ceil((w.end - w.start) / engine.timestep - 1e-9)), 1)

@@ -93,7 +93,7 @@ class Candidate:
     rough: float = 0.0
     """By how much luck with the initial states may have moved the cost, as far as it is known, see there."""
     polished: bool = False
-    """Whether it has been taken up again in vain: once more would do the same."""
+    """Whether it has been taken up again for next to nothing: once more would do the same."""
 
     def gain(self, base: Node) -> np.ndarray:
         """Return by how much the held-out error of each block falls against a node, shape (B,)."""
@@ -115,12 +115,11 @@ def node(
     windows: Sequence[Window],
     blocks: Blocks,
     engine: EngineName,
-    threads: int | None,
     *,
     rough: bool = False,
 ) -> Node:
     """Fit a model's own parameters and the initial states; `rough`ly where all that counts is the calmest part."""
-    solver = Solver(Prediction(model, (), windows, engine=engine, threads=threads))
+    solver = Solver(Prediction(model, (), windows, engine=engine))
     measured = [np.zeros(len(w.spread)) for w in windows]
     fit = solver.fit(None, *solver.refine_starts(solver.p.start, measured, ROUGH if rough else ROUNDS))
     if len(fit.values) and not rough:
@@ -132,7 +131,7 @@ def node(
 def without(last: Node, effect: int) -> Node:
     """Return the node of a model less one of its effects, all that is left fitted again."""
     model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
-    solver = Solver(Prediction(model, (), last.windows, engine=last.engine, threads=1))
+    solver = Solver(Prediction(model, (), last.windows, engine=last.engine))
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
     return assessed(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
 
@@ -162,7 +161,7 @@ def screen(base: Node, effect: Effect) -> Screened:
     Sensitivities are taken at the node's initial states, and at the measured ones where those are far off: initial
     states that make up for a missing effect lead to where its sensitivities mean little.
     """
-    solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine, threads=1))
+    solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))
     values = solver.p.start.copy()
     at = sensitive_start(solver, values)
     # What matters is the residual of the node itself; at a start off the null value it is another.
@@ -229,19 +228,23 @@ def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
 
 def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> Candidate:
     """Fit a candidate together with the model's own parameters and the initial states."""
-    solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine, threads=1), cfg)
+    solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine), cfg)
     return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
 
 
-def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False, threads: int | None = 1) -> Candidate:
-    """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped."""
+def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False) -> Candidate:
+    """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped.
+
+    Where that brings next to nothing, it is not done again.
+    """
     if candidate.polished and not thorough:
         return candidate
-    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=threads))
+    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine))
     # To the last bit: a fit that no step has helped is the node's own at the value at which the effect does nothing.
     stuck = candidate.fit.cost == base.fit.cost
     found = judged(base, candidate.effect, solver, solver.polish(candidate.fit, thorough=thorough, stuck=stuck))
-    return found if found.fit.cost < candidate.fit.cost else replace(candidate, polished=True)
+    best = found if found.fit.cost < candidate.fit.cost else candidate
+    return replace(best, polished=found.fit.cost > (1 - BETTER) * candidate.fit.cost)
 
 
 def restarted_candidate(base: Node, candidate: Candidate, leader: Fit, quick: bool = False) -> Candidate:
@@ -250,7 +253,7 @@ def restarted_candidate(base: Node, candidate: Candidate, leader: Fit, quick: bo
     Either window by window, where they serve its parameters better, or all of them, with the parameters that go with
     them: those of a fit that is stuck do not. A `quick` one tries the latter alone.
     """
-    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine, threads=1))
+    solver = Solver(Prediction(base.model, (candidate.effect,), base.windows, engine=base.engine))
     fresh = solver.led(candidate.fit, leader)
     if not quick:
         some = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
@@ -269,7 +272,7 @@ def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Windo
     """
 
     def solver(windows: Sequence[Window]) -> Solver:
-        return Solver(Prediction(base.model, (candidate.effect,), windows, engine=base.engine, threads=1))
+        return Solver(Prediction(base.model, (candidate.effect,), windows, engine=base.engine))
 
     values = solver(pieces).fit(candidate.fit.values).values
     long = solver(base.windows)

@@ -65,9 +65,9 @@ AllOf = Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look
 """Does independent pieces of work, and returns their results in order."""
 
 
-def solver_of(base: Node, c: Candidate, threads: int | None = 1) -> Solver:
-    """Return what fits a candidate, with so many simulations at a time."""
-    return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine, threads=threads))
+def solver_of(base: Node, c: Candidate) -> Solver:
+    """Return what fits a candidate."""
+    return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine))
 
 
 def ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int, float]]:
@@ -111,21 +111,20 @@ def look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
     return Look(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
 
 
-def taken_up(base: Node, c: Candidate, seen: Look, threads: int | None) -> Candidate:
+def taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
     """Fit a candidate from where a look has found a lower cost; what is not better in the end is dropped."""
-    solver = solver_of(base, c, threads)
+    solver = solver_of(base, c)
     found = judged(base, c.effect, solver, solver.fit(seen.values, seen.offsets, seen.starts))
     return found if found.fit.cost < c.fit.cost else c
 
 
-def settled(base: Node, c: Candidate, all_of: AllOf, threads: int | None = 1) -> Candidate:
+def settled(base: Node, c: Candidate, all_of: AllOf) -> Candidate:
     """Return a candidate with values that no look around betters, and with how sharply the data tell them.
 
     Args:
         base: What it was added to.
         c: The candidate.
         all_of: Does independent pieces of work.
-        threads: Simulations at a time in work that is not in pieces.
     """
     for _ in range(HOPS):
         seen = looks(base, c, all_of)
@@ -137,7 +136,7 @@ def settled(base: Node, c: Candidate, all_of: AllOf, threads: int | None = 1) ->
             if further.cost > best.cost:
                 break
             best = further
-        c = taken_up(base, c, best, threads)
+        c = taken_up(base, c, best)
     return told(base, c, looks(base, c, all_of, WIDTH_ONLY))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import queue
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants, with_laws
+from concent_warp.simulate.threads import simulations_at_a_time
 
 if TYPE_CHECKING:
     from concent_warp.effects.law import Law
@@ -46,13 +46,14 @@ class MujocoEngine:
         Args:
             model: What to simulate.
             collidable: Spheres that take part in the physics, shape (S,) bool; None for all.
-            threads: Variants simulated at a time; by default one for each CPU this process may use.
+            threads: Variants simulated at a time; by default one for each CPU this process may use, see
+                `concent_warp.simulate.threads`.
             memory: Arena of one simulation [bytes], which holds contacts and constraints; by default what MuJoCo takes.
                 It grows when it overflows.
             max_memory: How far the arena may grow [bytes].
         """
         self.model = model
-        self.threads = len(os.sched_getaffinity(0)) if threads is None else max(int(threads), 1)
+        self.threads = simulations_at_a_time() if threads is None else max(int(threads), 1)
         self.max_memory = int(max_memory)
         self._collidable = None if collidable is None else np.array(collidable)
         self._memory = memory
@@ -102,9 +103,11 @@ class MujocoEngine:
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
         self.repeats = 0
+        # Laws are written in Python, of which one thread runs at a time: several would only get in each other's way.
+        most = 1 if variants.laws else self.threads
         with quiet_warnings():
             while pending:
-                with ThreadPoolExecutor(min(self.threads, len(pending))) as pool:
+                with ThreadPoolExecutor(min(most, len(pending))) as pool:
                     for n, result in zip(pending, pool.map(lambda n: self._simulate(run, n), pending), strict=True):
                         results[n] = result
                 if pending := [n for n in pending if results[n] is None]:

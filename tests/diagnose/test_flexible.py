@@ -64,7 +64,7 @@ def nodes_of(recording, *effects):
     """Return the model as drawn, fitted, and with effects added in turn."""
     model = Model(Scene(recording.scene))
     windows = observe(model, recording)
-    nodes = [node(model, windows, cut_blocks(windows), "mujoco", 1)]
+    nodes = [node(model, windows, cut_blocks(windows), "mujoco")]
     for name in effects:
         nodes.append(extended(nodes[-1], fit_candidate(nodes[-1], screen(nodes[-1], effect_class(name)("rail")))))
     return nodes

@@ -13,7 +13,7 @@ def nodes():
     """A swing damped by viscous friction that dry friction was blamed for first."""
     recording = swung()
     windows = windows_of(recording)
-    found = [node(drawing(recording), windows, cut_blocks(windows), "mujoco", 1)]
+    found = [node(drawing(recording), windows, cut_blocks(windows), "mujoco")]
     for name in ("joint_friction", "joint_damping"):
         base = found[-1]
         chosen = fit_candidate(base, screen(base, effect_class(name)("hinge")))

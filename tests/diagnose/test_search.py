@@ -26,7 +26,7 @@ NAMES = ("joint_damping", "joint_friction", "armature")
 
 def base_of(recording):
     windows = windows_of(recording)
-    return node(drawing(recording), windows, cut_blocks(windows), "mujoco", 1)
+    return node(drawing(recording), windows, cut_blocks(windows), "mujoco")
 
 
 def effect(name):

@@ -29,7 +29,7 @@ from tests.fit.swinging import DAMPING, drawing, swung, windows_of
 def base():
     recording = swung()
     windows = windows_of(recording)
-    return node(drawing(recording), windows, cut_blocks(windows), "mujoco", 1)
+    return node(drawing(recording), windows, cut_blocks(windows), "mujoco")
 
 
 @pytest.fixture(scope="module")
