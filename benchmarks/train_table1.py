@@ -41,7 +41,8 @@ Policies trained in simulation alone, then run without exploration in the stand-
 place of spheres, elliptic cones, finer steps. A seed is a demonstration of its own with all that follows from it:
 geometry, contact events, policy. All cases of a seed start from the same initial states, displaced along the
 demonstration, block in the hand; none was trained from. An episode succeeds where the block ends within 3 mm of its
-place at the bottom of the hole. Pooled over the seeds, with Wilson's 95 % interval.
+place at the bottom of the hole. Pooled over the seeds, with Wilson's 95 % interval; it is that of these policies, and
+says nothing of how much trainings differ, which the column *seeds* does.
 
 - *ours*: contact geometry fitted to the demonstration, contact-event reward.
 - *without contact geometry optimisation*: the paper's starting geometry, spheres centred on the surface. With it the
