@@ -193,6 +193,8 @@ def page(rows: Sequence[Row], stage: str) -> str:
     parts.append(table(head, lines))
     order = " > ".join(sorted(pooled, key=lambda title: -pooled[title]))
     parts.append(f"In the order found: {order}.")
+    if absent := [case.title for case in CASES.values() if case.title not in pooled]:
+        parts.append(f"Not tried yet: {'; '.join(absent)}.")
     parts.append("How the episodes ended, and what the policies were trained for:")
     parts.append(table(["case, seed", "outcomes", "stage", "steps", "seconds"], [ended(row) for row in rows]))
     if rows:

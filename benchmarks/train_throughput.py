@@ -331,6 +331,9 @@ def attempt(kept: Measurements, key: str, expected: float, measure: Callable[[],
 def main() -> None:
     """Measure."""
     args = tyro.cli(Args, description=__doc__)
+    names = {*ALTERNATIVES, *PPO_ALTERNATIVES}
+    if strange := [word for word in args.settings if not any(word in name for name in names)]:
+        raise SystemExit(f"--settings: {strange[0]!r} is in no name of {', '.join(sorted(names))}")
     quiet_warp()
     kept = Measurements(args.out, seconds=args.seconds)
     bench = Bench(args, make_run(args.spheres))

@@ -203,6 +203,8 @@ def section(result: dict[str, Any], tables: list[str]) -> list[str]:
 def taken(args: Args) -> dict[str, Any]:
     """Return the stored data with the measurements of files taken in."""
     data = read_data(NAME)
+    if missing := [path for path in args.files if not path.is_file()]:
+        raise SystemExit(f"{missing[0]}: no such file of measurements; benchmarks/train_throughput.py --out writes one")
     for path in args.files:
         for key, row in Measurements(path).rows.items():
             facts = row["machine"]
