@@ -54,6 +54,8 @@ class Args:
     """Processes."""
     host: str = "2 cores"
     """Under which heading the figures stand."""
+    remark: str = ""
+    """What is to be said of them; kept until another takes its place."""
     table: bool = False
     """Write the page from the figures that there are."""
 
@@ -64,6 +66,10 @@ def main(args: Args) -> None:
         for part in args.parts:
             for row in {"scenes": scenes, "candidates": by_candidates, "length": by_length}[part](args):
                 keep(args.host, part, row)
+    if args.remark:
+        data = read_data(NAME)
+        data[args.host]["remark"] = args.remark
+        write_data(NAME, data)
     write_report(read_data(NAME))
 
 
@@ -157,6 +163,7 @@ def write_report(data: dict[str, Any]) -> None:
     ]
     for host, found in data.items():
         lines += ["", f"## {host}", "", machine_line(found["machine"]), ""]
+        lines += [found["remark"], ""] if "remark" in found else []
         if "scenes" in found:
             rows = [
                 [

@@ -3,6 +3,7 @@
 python benchmarks/hidden_effects.py                          # every data set that is not done yet, then the page
 python benchmarks/hidden_effects.py --kinds null --rigs drop # some of them
 python benchmarks/hidden_effects.py --report                 # the page from what is done
+python benchmarks/hidden_effects.py --out D --shift 6000 && python benchmarks/hidden_effects.py --out D --report --again
 
 Each data set is diagnosed in a process of its own, as many at a time as `--jobs`. What is done is kept in `--out`, one
 file a data set, and pieces of those under way, so that the command may be stopped and called again. The data are those
@@ -23,7 +24,7 @@ from typing import Any
 
 import tyro
 from hidden_effects_data import DataSet, Kind, cases, make
-from hidden_effects_report import write_report
+from hidden_effects_report import write_again, write_report
 from pages import machine, machine_line
 
 from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
@@ -58,6 +59,8 @@ class Args:
     """Where the results lie."""
     report: bool = False
     """Write the page from what is done, and diagnose nothing."""
+    again: bool = False
+    """With --report: take what is done for a run on other seeds, which the page shows besides."""
     host: str = ""
     """Where the results come from, in words, if not from this machine."""
 
@@ -78,7 +81,8 @@ def main(args: Args) -> None:
                 print(f"{k + 1:3d}/{len(todo)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
     rows = [json.loads(path(args.out, c).read_text()) for c in chosen if path(args.out, c).is_file()]
     if args.report or not (args.rigs or args.effects or args.names or args.shift != SHIFT or len(args.kinds) < 4):
-        write_report(rows, len(cases()), args.host or machine_line(machine()))
+        write = write_again if args.again else write_report
+        write(rows, len(cases()), args.host or machine_line(machine()))
 
 
 def wanted(case: DataSet, args: Args) -> bool:

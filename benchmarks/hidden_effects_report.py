@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from hidden_effects_data import BEST
-from pages import FOLDER, data_path, table
+from pages import FOLDER, data_path, read_data, table
 from scipy.stats import norm
 
 from concent_warp.model import write_text
@@ -19,15 +20,44 @@ Row = dict[str, Any]
 
 
 def write_report(rows: Sequence[Row], total: int, host: str) -> None:
-    """Write data, picture and page."""
-    import json
-
-    data_path(NAME).parent.mkdir(parents=True, exist_ok=True)
+    """Write data, picture and page of the whole benchmark."""
     limits = detection_limits(rows)
     kept = {"host": host, "rows": [slim(row) for row in rows], "detection_limits": limits}
+    write_kept({**kept, "again": (read_data(NAME) or {}).get("again")}, total)
+
+
+def write_again(rows: Sequence[Row], total: int, host: str) -> None:
+    """Write the page with a run on other seeds, in place of an older one."""
+    write_kept({**read_data(NAME), "again": {"host": host, "rows": [slim(row) for row in rows]}}, total)
+
+
+def write_kept(kept: dict[str, Any], total: int) -> None:
+    """Write what is kept, picture and page."""
+    data_path(NAME).parent.mkdir(parents=True, exist_ok=True)
     write_text(data_path(NAME), json.dumps(kept, indent=1))
-    confusion(rows)
-    write_text(FOLDER / f"{NAME}.md", page(rows, total, host, limits))
+    confusion(kept["rows"])
+    text = page(kept["rows"], total, kept["host"], kept["detection_limits"])
+    if again := kept.get("again"):
+        text += other_seeds(again["rows"], total, again["host"])
+    write_text(FOLDER / f"{NAME}.md", text)
+
+
+def other_seeds(rows: Sequence[Row], total: int, host: str) -> str:
+    """Return what another run found."""
+    wrong = [
+        [f"`{r['name']}`", r.get("verdict", "error"), told(r)]
+        for r in sorted(rows, key=lambda r: r["name"])
+        if r["kind"] == "single" and not first_right(r)
+    ]
+    return f"""
+## Again, on other seeds
+
+{host} {len(rows)} of {total} data sets.
+
+{table(["", "bar", "share", "95 % interval", "data sets"], all_shares(rows))}
+Where another effect was named first:
+
+{table(["data", "verdict", "named"], wrong)}"""
 
 
 def slim(row: Row) -> Row:
@@ -142,8 +172,8 @@ def figure(title: str, bar: str, hits: Sequence[bool]) -> list[str]:
     return [title, bar, f"{100 * share:.0f} %", f"{100 * low:.0f}-{100 * high:.0f} %", str(len(hits))]
 
 
-def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, Any]]) -> str:
-    """Return the page."""
+def all_shares(rows: Sequence[Row]) -> list[list[str]]:
+    """Return the table of shares."""
     single = [r for r in rows if r["kind"] == "single"]
     null = [r for r in rows if r["kind"] == "null"]
     outside = [r for r in rows if r["kind"] == "outside"]
@@ -153,7 +183,7 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
     def over(of: Sequence[Row], hit: Callable[[Row], bool]) -> list[bool]:
         return [hit(r) for r in of]
 
-    shares = [
+    return [
         figure("right effect named first", ">= 90 %", over(single, first_right)),
         figure("right effect in the group named first", ">= 97 %", over(single, in_group)),
         figure("false alarm, nothing hidden", "<= 5 %", over(null, alarm)),
@@ -162,6 +192,11 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
         figure(f"error within {FLOOR} x noise after adding the right effect", "", over(right, at_floor)),
         figure("true parameter within its 95 % interval", "90-99 %", coverage(single)),
     ]
+
+
+def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, Any]]) -> str:
+    """Return the page."""
+    single = [r for r in rows if r["kind"] == "single"]
     seconds = np.array([r["seconds"] for r in rows]) if rows else np.zeros(1)
     by_rig = []
     for rig in dict.fromkeys(r["rig"] for r in rows):
@@ -207,7 +242,7 @@ python benchmarks/hidden_effects.py --report   # this page
 {host} {len(rows)} of {total} data sets done, {len(failed)} ended in an error;
 {seconds.sum() / 3600:.1f} hours of one core in all.
 
-{table(["", "bar", "share", "95 % interval", "data sets"], shares)}
+{table(["", "bar", "share", "95 % interval", "data sets"], all_shares(rows))}
 Intervals are Wilson's. Data with two magnitudes: the middle one leaves a residual of about four standard deviations of
 the noise, the large one two to three times that.
 

@@ -54,6 +54,9 @@ class Arguments:
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     additions: int = 3
     """Most effects that are added."""
+    gradient: bool = False
+    """Let fits of friction, mass and contact stiffness start from where gradients through Newton lead, where that is
+    better; needs contact geometry and observed objects."""
     engine: EngineName = "mujoco"
     """Engine."""
     jobs: int = -1
@@ -133,6 +136,7 @@ def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagn
         effects=arguments.effects,
         window=arguments.window,
         additions=arguments.additions,
+        gradient=arguments.gradient,
         engine=arguments.engine,
         jobs=arguments.jobs,
         seed=arguments.seed,

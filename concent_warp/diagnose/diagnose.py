@@ -21,6 +21,7 @@ from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verd
 from concent_warp.diagnose.evidence import SAME, alike, detectable_size, fitted_parameters, removed
 from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.flexible import unknown_force
+from concent_warp.diagnose.gradient_start import GradientStarts
 from concent_warp.diagnose.noise import UNDERESTIMATE
 from concent_warp.diagnose.search import (
     Candidate,
@@ -80,6 +81,8 @@ class DiagnosisCfg:
     """Seed of all that is drawn."""
     explain: bool = True
     """Whether to say where the model fails and which experiment would tell more; it takes a while."""
+    gradient: bool = False
+    """Whether fits of friction, mass and contact stiffness may start from where gradients through Newton lead."""
 
 
 Progress = Callable[[float, str], None]
@@ -119,6 +122,7 @@ class Procedure:
         self.findings: list[Finding] = []
         self.groups: list[tuple[str, ...]] = []
         self.hypotheses: list[dict[str, Model]] = []
+        self.gradient = GradientStarts(model, recording) if cfg.gradient else None
         self.noise: dict[str, float] = {}
         self._done = 0.0
         self._began = time.monotonic()
@@ -175,6 +179,7 @@ class Procedure:
         chosen = candidates(base.model, self.channels, self.cfg.effects)
         span = 0.85 / self.cfg.additions
         screened = self.parallel(screen, [(base, e) for e in chosen], "screening", 0.5 * span)
+        screened = self.gradient.led(base, screened, self.parallel) if self.gradient else screened
         null = chance(base, screened, self.cfg.draws, self.cfg.seed)
         critical = float(np.quantile(null, 1 - self.cfg.level))
         needed = max(critical, self.cfg.least_gain)

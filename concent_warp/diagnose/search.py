@@ -65,6 +65,8 @@ class Screened:
     pieces: tuple[Linear, ...]
     """Sensitivities at the null value, initial states eliminated."""
     simulated: float
+    measured: bool = False
+    """Whether the fit is to start from the initial states as measured, and not from the node's."""
 
     @property
     def promise(self) -> float:
@@ -209,16 +211,28 @@ def scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndar
         return best, start
     before = total(base, [piece.residual for piece in base.pieces])
     for moved in trials:
-        residuals = solver.p.residuals(solver.trials(moved, base.fit.offsets))
-        rest = []
-        for r, a, o in zip(residuals, base.fit.starts, base.fit.offsets, strict=True):
-            near = trust(o)
-            inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
-            rest.append(r - a @ inner)
-        gain = (before - total(base, rest)) / max(before, 1e-12)
+        gain = (before - total(base, remainders(solver, base, moved, base.fit.offsets))) / max(before, 1e-12)
         if gain > best:
             best, start = gain, moved
     return best, start
+
+
+def remainders(solver: Solver, base: Node, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the residuals at some values, with what a change of the initial states takes up, to first order, left out.
+
+    Args:
+        solver: Solver of the candidate.
+        base: The node; the dependence on the initial states is its own.
+        values: Parameters, shape (P,).
+        offsets: Errors of the initial states in units of their spread, one (2 nv,) a window.
+    """
+    residuals = solver.p.residuals(solver.trials(values, offsets))
+    rest = []
+    for r, a, o in zip(residuals, base.fit.starts, offsets, strict=True):
+        near = trust(o)
+        inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
+        rest.append(r - a @ inner)
+    return rest
 
 
 def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
@@ -229,6 +243,8 @@ def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
 def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> Candidate:
     """Fit a candidate together with the model's own parameters and the initial states."""
     solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine), cfg)
+    if screened.measured:
+        return judged(base, screened.effect, solver, solver.fit(screened.start))
     return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
 
 

@@ -88,8 +88,16 @@ class NewtonScene:
         return len(self.replayed) - 1
 
 
-def newton_scene(model: Model, segments: Sequence[Segment], cfg: NewtonCfg | None = None) -> NewtonScene:
+def newton_scene(
+    model: Model, segments: Sequence[Segment], cfg: NewtonCfg | None = None, *, lightest: float = 1.0
+) -> NewtonScene:
     """Prepare a model for gradients of segments of recordings.
+
+    Args:
+        model: Model with contact geometry.
+        segments: What is simulated.
+        cfg: How contacts are simulated.
+        lightest: Smallest factor on mass and inertia with which it must be stable, 1 at most.
 
     Raises:
         ModelError: The model has no contact geometry on a free body, or a shape that Newton's contacts lack comes near.
@@ -111,7 +119,7 @@ def newton_scene(model: Model, segments: Sequence[Segment], cfg: NewtonCfg | Non
     ids, pairs = near_pairs(model, moving, looked_at(m, segments, rollout), cfg.reach)
     inertias = tuple(inertia_of(m, b) for b in ids[: len(moving)])
     friction = np.concatenate([pairs.friction, model.geometry.friction])
-    strengths = [strength(m, model, b, body, rollout) for b, body in zip(ids, inertias, strict=False)]
+    strengths = [strength(m, model, b, body, rollout) / lightest for b, body in zip(ids, inertias, strict=False)]
     gravity = m.opt.gravity.copy()
     physics = choose_physics(
         cfg, m.opt.timestep, inertias, strengths, float(friction.max()), float(np.linalg.norm(gravity))

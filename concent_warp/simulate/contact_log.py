@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from concent_warp.simulate.engine import ContactLog
@@ -27,3 +29,13 @@ def sorted_log(variant: np.ndarray, step: np.ndarray, rows: np.ndarray) -> Conta
         distance=rows[:, 8],
         force=rows[:, 9:12],
     )
+
+
+def collect(logs: Sequence[Sequence[tuple[int, np.ndarray]]]) -> ContactLog:
+    """Join the contacts of all variants, ordered by variant, step, geom pair, distance and position."""
+    parts = [(n, step, rows) for n, log in enumerate(logs) for step, rows in log]
+    rows = np.concatenate([np.zeros((0, 12)), *(r for _, _, r in parts)])
+    sizes = [len(r) for _, _, r in parts]
+    variant = np.repeat(np.array([n for n, _, _ in parts], dtype=int), sizes)
+    step = np.repeat(np.array([s for _, s, _ in parts], dtype=int), sizes)
+    return sorted_log(variant, step, rows)

@@ -8,16 +8,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
 from concent_warp.errors import EngineError
-from concent_warp.simulate.contact_log import sorted_log
-from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
+from concent_warp.simulate.contact_log import collect
+from concent_warp.simulate.engine import Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants, with_laws
+from concent_warp.simulate.processes import WORTH, in_processes
 from concent_warp.simulate.threads import simulations_at_a_time
 
 if TYPE_CHECKING:
@@ -103,13 +104,10 @@ class MujocoEngine:
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
         self.repeats = 0
-        # Laws are written in Python, of which one thread runs at a time: several would only get in each other's way.
-        most = 1 if variants.laws else self.threads
         with quiet_warnings():
             while pending:
-                with ThreadPoolExecutor(min(most, len(pending))) as pool:
-                    for n, result in zip(pending, pool.map(lambda n: self._simulate(run, n), pending), strict=True):
-                        results[n] = result
+                for n, result in zip(pending, self._simulated(run, pending), strict=True):
+                    results[n] = result
                 if pending := [n for n in pending if results[n] is None]:
                     self._grow(len(pending))
         done = [result for result in results if result is not None]
@@ -126,6 +124,29 @@ class MujocoEngine:
             contacts=collect([r.contacts for r in done]) if contacts == "all" else None,
             diverged=np.array([r.diverged for r in done]),
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs."""
+        return {name: value for name, value in vars(self).items() if name != "_workshops"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """Go on in another process."""
+        vars(self).update(state)
+        self._workshops = queue.SimpleQueue()
+
+    def _simulated(self, run: Run, rows: Sequence[int]) -> list[VariantResult | None]:
+        """Simulate some variants, as many at a time as may be."""
+        count = min(self.threads, len(rows))
+        if run.variants.laws and count > 1 and len(rows) * run.steps >= WORTH:
+            return in_processes(self._in_turn, run, rows, self.threads)
+        # Laws are written in Python, of which one thread runs at a time: several would only get in each other's way.
+        with ThreadPoolExecutor(1 if run.variants.laws else count) as pool:
+            return list(pool.map(lambda n: self._simulate(run, n), rows))
+
+    def _in_turn(self, run: Run) -> list[VariantResult | None]:
+        """Simulate all variants one after the other, in another process."""
+        with quiet_warnings():
+            return [self._simulate(run, n) for n in range(run.variants.count)]
 
     def _simulate(self, run: Run, n: int) -> VariantResult | None:
         """Simulate variant n; None if its contacts or constraints did not fit the arena."""
@@ -461,16 +482,6 @@ def contact_rows(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.
         [np.sort(geom, axis=1), contact.pos[active], sign * frame[:, 0], contact.dist[active, None], sign * force],
         axis=1,
     )
-
-
-def collect(logs: Sequence[Sequence[tuple[int, np.ndarray]]]) -> ContactLog:
-    """Join the contacts of all variants, ordered by variant, step, geom pair, distance and position."""
-    parts = [(n, step, rows) for n, log in enumerate(logs) for step, rows in log]
-    rows = np.concatenate([np.zeros((0, 12)), *(r for _, _, r in parts)])
-    sizes = [len(r) for _, _, r in parts]
-    variant = np.repeat(np.array([n for n, _, _ in parts], dtype=int), sizes)
-    step = np.repeat(np.array([s for _, s, _ in parts], dtype=int), sizes)
-    return sorted_log(variant, step, rows)
 
 
 @contextmanager

@@ -177,6 +177,7 @@ def test_a_model_that_diverges_is_an_error(swing, tmp_path, capsys):
         (["--jobs", "0"], "no processes"),
         (["--window", "0"], "window"),
         (["--additions", "0"], "additions"),
+        (["--gradient"], "build it with `concent geometry`; or diagnose without --gradient."),
     ],
 )
 def test_settings_that_make_no_sense_are_an_error_of_one_line(arguments, words, swing, capsys):

@@ -1,0 +1,46 @@
+"""Simulations in processes of their own: where each step calls Python, threads would wait for one another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, TypeVar, cast
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from concent_warp.simulate.engine import Variants
+    from concent_warp.simulate.inputs import Run
+
+T = TypeVar("T")
+WORTH = 20_000
+"""Steps, of all simulations together, from which on it pays to hand them over: they take a second in one thread."""
+
+
+def in_processes(work: Callable[[Run], list[T]], run: Run, rows: Sequence[int], count: int) -> list[T]:
+    """Return what `work` finds for some variants of a run, in their order, shared among `count` processes.
+
+    The processes stay for a while, for the next time.
+    """
+    from joblib import Parallel, delayed
+
+    parts = np.array_split(np.asarray(rows), min(count, len(rows)))
+    found = Parallel(n_jobs=count, backend="loky")(delayed(work)(part_of(run, part)) for part in parts)
+    return [result for part in cast("list[list[T]]", found) for result in part]
+
+
+def part_of(run: Run, rows: np.ndarray) -> Run:
+    """Return a run of some of its variants."""
+    return replace(run, variants=some(run.variants, rows), ctrl=run.ctrl[rows % len(run.ctrl)])
+
+
+def some(variants: Variants, rows: np.ndarray) -> Variants:
+    """Return some of the variants."""
+    arrays = {f.name: getattr(variants, f.name) for f in fields(variants) if f.name not in ("count", "fields", "laws")}
+    return replace(
+        variants,
+        count=len(rows),
+        fields={name: value[rows] for name, value in variants.fields.items()},
+        laws=None if variants.laws is None else tuple((law, values[rows]) for law, values in variants.laws),
+        **{name: None if value is None else value[rows] for name, value in arrays.items()},
+    )

@@ -1,0 +1,59 @@
+"""Laws in Python, in processes of their own."""
+
+import numpy as np
+import pytest
+
+from concent_warp.effects.registry import effect_class
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate import mujoco_engine
+from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+
+PENDULUM = """<mujoco><option timestep=".002"/><worldbody>
+<body name="link" pos="0 0 .3"><joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".5"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator>
+<sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
+COUNT, STEPS = 6, 300
+
+
+def run(threads: int):
+    model = Model(Scene(PENDULUM))
+    effect = effect_class("load_friction")("hinge")
+    engine = MujocoEngine(model.add(effect), threads=threads)
+    law = effect.law(engine.compiled)
+    assert law is not None
+    values = np.linspace(0.0, 0.4, COUNT)[:, None] * np.ones(len(effect.parameters(engine.compiled)))
+    mass = np.stack([engine.compiled.body_mass * scale for scale in np.linspace(1.0, 2.0, COUNT)])
+    ctrl = 0.2 * np.sin(np.arange(STEPS) * 0.02)[None, :, None] * np.array([1.0, 2.0])[:, None, None]
+    variants = Variants(
+        COUNT, qpos=np.linspace(0, 1, COUNT)[:, None], fields={"body_mass": mass}, laws=((law, values),)
+    )
+    return engine.run(variants, ctrl, bodies=[])
+
+
+def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
+    alone = run(1)
+    monkeypatch.setattr(mujoco_engine, "WORTH", 1)
+    with monkeypatch.context() as here:
+        here.setattr(MujocoEngine, "_simulate", None)  # in this process alone
+        shared = run(2)
+    for name in ("qpos", "qvel", "sensordata", "diverged"):
+        np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
+    assert np.ptp(alone.qpos[:, -1]) > 0.1
+
+
+def test_few_steps_stay_where_they_are(monkeypatch):
+    monkeypatch.setattr(MujocoEngine, "_in_turn", None)
+    assert not run(2).diverged.any()
+
+
+def test_an_error_in_another_process_is_told_as_here(monkeypatch):
+    monkeypatch.setattr(mujoco_engine, "WORTH", 1)
+    effect = effect_class("load_friction")("hinge")
+    engine = MujocoEngine(Model(Scene(PENDULUM)), threads=2)
+    law = effect.law(engine.compiled)
+    assert law is not None
+    with pytest.raises(ValueError):  # a law without its parameters
+        engine.run(Variants(2, laws=((law, np.zeros((2, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])
