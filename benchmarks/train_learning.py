@@ -21,6 +21,7 @@ import sys
 import tarfile
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -37,6 +38,16 @@ from concent_warp.model import write_text
 RESULT, POLICY, LOG = "result.json", "policy", "log.txt"
 PACKED = 14 * 2**20
 """Largest packed file [byte]."""
+OF_A_CASE = (
+    "seed",
+    "checkpoint",
+    "ppo.iterations",
+    "environment.worlds",
+    "environment.stage",
+    "environment.reward.kind",
+    "environment.reset.before",
+)
+"""Settings that tell cases and lengths of a training apart, and not how it is done."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +130,25 @@ def settings(args: Args, case: Case, seed: int) -> TrainCfg:
     environment = args.train.environment
     environment = replace(environment, stage=args.stage, reward=replace(environment.reward, kind=case.reward))
     return replace(args.train, seed=seed, environment=environment)
+
+
+def changed(settings: Mapping[str, Any]) -> str:
+    """Return the settings of a training that are not the default, as options, but for those that belong to a case."""
+    mine, default = flat(settings), flat(json.loads(json.dumps(asdict(TrainCfg()))))
+    parts = []
+    for name, value in mine.items():
+        if name in default and value != default[name] and name not in OF_A_CASE:
+            values = value if isinstance(value, list) else [value]
+            parts.append(f"--{name.replace('_', '-')} {' '.join(map(str, values))}")
+    return " ".join(parts)
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by their full names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
 
 
 def with_stage(run: Run, stage: str) -> Run:

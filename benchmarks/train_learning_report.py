@@ -15,7 +15,7 @@ import numpy as np
 from concent_warp.train.curve import read_curve
 from pages import FOLDER, machine_line, read_data, table, write_data, write_page
 from train_cases import CASES
-from train_learning import RESULT
+from train_learning import RESULT, changed
 
 NAME = "train_learning"
 KEPT = ("steps", "seconds", "success", "chain success", "return")
@@ -43,7 +43,7 @@ def taken(folder: Path, stage: str) -> dict[str, Any]:
         result["first"] = {str(bar): first(ordered, bar) for bar in BARS}
         result["curve"] = {name: [row[name] for row in thinned] for name in KEPT if name in ordered[0]}
         result["rate"] = ordered[-1]["steps"] / ordered[-1]["seconds"]
-        found[f"{path.parent.name}"] = result
+        found[f"{path.parent.name} {changed(result['settings'])}".strip()] = result
     return found
 
 
@@ -61,11 +61,14 @@ def page(data: dict[str, Any]) -> str:
     """Return the page."""
     parts = ["# How policies learn", "Written by `benchmarks/train_learning_report.py`; do not edit.", ABOUT]
     for stage, title in (("insert", "Insertion"), ("all", "All stages chained, objects anywhere")):
-        runs = {name: run for name, run in data.items() if f"_{stage}_" in name}
-        if runs:
-            draw(runs, FOLDER / f"{NAME}_{stage}.png")
-            parts += [f"## {title}", machine_line(next(iter(runs.values()))["machine"]), summary(runs)]
-            parts += [f"![Curves]({NAME}_{stage}.png)", "Each training:", each(runs)]
+        staged = {name: run for name, run in data.items() if f"_{stage}_" in name}
+        for k, how in enumerate(sorted({changed(run["settings"]) for run in staged.values()})):
+            runs = {name: run for name, run in staged.items() if changed(run["settings"]) == how}
+            picture = f"{NAME}_{stage}{k or ''}.png"
+            draw(runs, FOLDER / picture)
+            parts += [f"## {title}", f"With `{how}`." if how else "With the default settings."]
+            parts += [machine_line(next(iter(runs.values()))["machine"]), summary(runs)]
+            parts += [f"![Curves]({picture})", "Each training:", each(runs)]
     return "\n\n".join(parts)
 
 

@@ -27,7 +27,7 @@ from joblib import Parallel, delayed
 from measurements import Measurements, Row
 from pages import machine, machine_line, read_data, table, write_data, write_page
 from train_cases import CASES, HIDDEN, Case
-from train_learning import POLICY, RESULT
+from train_learning import POLICY, RESULT, changed
 
 from concent_warp.cli.evaluate import Arguments, real_environment
 from concent_warp.cli.terminal import quiet_warp
@@ -96,6 +96,12 @@ def policy_folder(args: Args, case: str, seed: int) -> Path:
     return args.out / "runs" / f"{case}_{args.stage}_{seed}" / POLICY
 
 
+def key(args: Args, case: str, seed: int) -> str:
+    """Return the name under which the trial of a policy is kept."""
+    settings = json.loads((policy_folder(args, case, seed).parent / RESULT).read_text())["settings"]
+    return f"{case} {args.stage} {seed} {changed(settings)}".strip()
+
+
 def reference(case: Case) -> str:
     """Return the case whose model gives initial states and target events to all cases of a world."""
     return "ours" if case.world == "plain" else "unaware"
@@ -130,7 +136,7 @@ def trial(args: Args, name: str, seed: int) -> Row:
         "case": name, "seed": seed, "episodes": args.episodes, "successes": int(found.success.sum()),
         "outcomes": found.counts(), "stages": stages, "met": met, "hidden": list(hide),
         "simulation": result["simulation"], "trained": {k: result[k] for k in ("stage", "steps", "seconds", "worlds")},
-        "machine": machine(), "trained_on": result["machine"],
+        "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]),
     }  # fmt: skip
 
 
@@ -174,6 +180,15 @@ def page(rows: Sequence[Row], stage: str) -> str:
     """Return the page."""
     title = "# Table 1 in the stand-in world" + (": all stages chained" if stage == "all" else "")
     parts = [title, "Written by `benchmarks/train_table1.py`; do not edit.", ABOUT]
+    for how in sorted({row.get("settings", "") for row in rows}):
+        parts.append(f"## Trained with `{how}`" if how else "## Trained with the default settings")
+        parts += section([row for row in rows if row.get("settings", "") == how])
+    return "\n\n".join(parts)
+
+
+def section(rows: Sequence[Row]) -> list[str]:
+    """Return what there is to say of policies that were trained in one way."""
+    rows = sorted(rows, key=lambda row: (list(CASES).index(row["case"]), row["seed"]))
     lines = []
     pooled: dict[str, float] = {}
     for name, case in CASES.items():
@@ -190,7 +205,7 @@ def page(rows: Sequence[Row], stage: str) -> str:
                 each, PAPER.get(name, ""), f"{met:.0%}", f"{simulation:.1%}",
             ])  # fmt: skip
     head = ["case", "succeed", "95 % interval", "episodes", "seeds", "paper", "targets met", "in simulation"]
-    parts.append(table(head, lines))
+    parts = [table(head, lines)]
     order = " > ".join(sorted(pooled, key=lambda title: -pooled[title]))
     parts.append(f"In the order found: {order}.")
     if absent := [case.title for case in CASES.values() if case.title not in pooled]:
@@ -200,7 +215,7 @@ def page(rows: Sequence[Row], stage: str) -> str:
     if rows:
         parts.append(machine_line(rows[0]["machine"]))
         parts.append("The policies: " + machine_line(rows[0]["trained_on"]))
-    return "\n\n".join(parts)
+    return parts
 
 
 def ended(row: Row) -> list[str]:
@@ -222,12 +237,12 @@ def main() -> None:
             needed = [policy_folder(args, one, seed) for one in (case, reference(CASES[case]))]
             if missing := [folder for folder in needed if not folder.is_dir()]:
                 print(f"not trained yet: {missing[0]}", flush=True)
-            elif kept.wanted(f"{case} {args.stage} {seed}"):
+            elif kept.wanted(key(args, case, seed)):
                 jobs.append((case, seed))
     found = Parallel(n_jobs=args.processes, return_as="generator")(delayed(trial)(args, *job) for job in jobs)
     for (case, seed), row in zip(jobs, found, strict=True):
         if row is not None:
-            kept.add(f"{case} {args.stage} {seed}", row)
+            kept.add(key(args, case, seed), row)
     data = read_data(name) | kept.rows
     write_data(name, data)
     write_page(name, page(list(data.values()), args.stage))

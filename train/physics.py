@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -362,12 +363,27 @@ class Graph:
                 wp.capture_launch(self._graph, stream=stream)
 
 
+def fused(part: Callable[[], None]) -> Callable[[], None]:
+    """Do torch operations on fixed buffers; return them compiled into few kernels, or as they are where that fails."""
+    from torch._dynamo.exc import TorchDynamoException
+
+    compiled = torch.compile(part, fullgraph=True, dynamic=False)
+    try:
+        with torch.no_grad():
+            compiled()
+    except TorchDynamoException as error:
+        said = str(error).strip().splitlines()
+        warnings.warn(f"operations are not fused: {said[0] if said else type(error).__name__}", stacklevel=2)
+        return part
+    return compiled
+
+
 def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
     """Return torch operations on fixed buffers as a CUDA graph, of few fused kernels if wanted, or as they are."""
     if not capture:
         return part
     if fuse:
-        part = torch.compile(part, fullgraph=True, dynamic=False)
+        part = fused(part)
     with torch.no_grad():
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
