@@ -6,6 +6,9 @@ no simulations. A rollout in MuJoCo counts as one simulation, one in Newton with
 
     python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl            # resumable; --seconds 200 ends early
     python benchmarks/es_vs_gradient.py --out runs/es_vs_gradient.jsonl --report   # page and figure, in docs
+
+Several processes may share the work by --seeds and --scenes, each with an --out of its own; --parts names the others to
+the report. The page keeps what other machines have measured, in docs/benchmarks/data.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import numpy as np
 import tyro
 from gradient_scenes import SCENES, SceneName, record, starting_model
 from measurements import Measurements
-from pages import FOLDER, machine, machine_line, table, write_data, write_page
+from pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, Search, cut
@@ -59,6 +62,8 @@ class Args:
     """No fit is begun after so long."""
     report: bool = False
     """Write the page from what was measured."""
+    parts: tuple[Path, ...] = ()
+    """More files of results that the report takes in."""
 
 
 def judge(model: Model, recording: Recording) -> list[float]:
@@ -132,11 +137,16 @@ def run(args: Args, scene: SceneName, seed: int, method: MethodName) -> dict[str
 def measure(args: Args) -> None:
     """Run what is missing."""
     kept = Measurements(args.out, seconds=args.seconds)
+    short = replace(args.fit, generations=1, gradient=replace(args.fit.gradient, iterations=1))
+    warm = False
     for seed in args.seeds:
         for scene in args.scenes:
             for method in args.methods:
                 key = f"{scene} {seed} {method} {args.device}"
                 if kept.wanted(key, 20.0):
+                    if not warm:  # kernels are compiled at their first use, which is not to be timed
+                        run(replace(args, fit=short), "settle", 0, "gradient+es")
+                        warm = True
                     kept.add(key, run(args, scene, seed, method))
     kept.close()
 
@@ -198,9 +208,11 @@ def summary(rows: dict[str, dict[str, Any]], scene: str, device: str) -> list[st
 
 def report(args: Args) -> None:
     """Write the page."""
-    rows = Measurements(args.out).rows
-    if not rows:
+    fresh = {key: row for path in (args.out, *args.parts) for key, row in Measurements(path).rows.items()}
+    if not fresh:
         raise SystemExit(f"{args.out}: no results; run without --report first")
+    known = read_data(NAME)
+    rows = known.get("rows", {}) | fresh
     devices = sorted({key.rsplit(" ", 1)[1] for key in rows})
     assert __doc__ is not None
     text = ["# Evolution strategy, gradients, and both", "", "\n".join(__doc__.split("\n")[2:6]).strip(), ""]
@@ -220,13 +232,14 @@ def report(args: Args) -> None:
         "gradient+es, unseen", "simulations of es", "of gradient", "of es to the error of gradient", "share", "a third",
         "seconds of es", "of gradient",
     ]  # fmt: skip
+    machines = known.get("machines", {}) | {key.rsplit(" ", 1)[1]: row["machine"] for key, row in fresh.items()}
     for device in devices:
-        facts = next(r["machine"] for key, r in rows.items() if key.endswith(device))
         found = [s for scene in SCENES if (s := summary(rows, scene, device)) is not None]
-        text += [machine_line(facts), "", table(head, found)]
+        text += [machine_line(machines[device]), "", table(head, found)]
         draw(rows, device, FOLDER / f"{NAME}_{device.split(':')[0]}.png")
         text += [f"![Error against simulations and time]({NAME}_{device.split(':')[0]}.png)", ""]
-    write_data(NAME, {key: {k: v for k, v in row.items() if k != "machine"} for key, row in rows.items()})
+    plain = {key: {k: v for k, v in row.items() if k != "machine"} for key, row in rows.items()}
+    write_data(NAME, {"machines": machines, "rows": plain})
     page = FOLDER / f"{NAME}.md"
     said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
     text += [f"## What it says{part}" for part in said]

@@ -1,17 +1,20 @@
-"""Frames a second of the hybrid rendering, layer by layer and as a whole, and what painting at 64 x 64 saves.
+r"""Frames a second of the hybrid rendering, layer by layer and as a whole, and what painting at 64 x 64 saves.
 
     python benchmarks/render_speed.py --out render_speed.jsonl                     # a CPU, few worlds
-    python benchmarks/render_speed.py --device cuda:0 --worlds 64 256 1024 --width 64 --blocks 8 --seconds 500
+    python benchmarks/render_speed.py --device cuda:0 --worlds 64 256 1024 --width 64 --enlarge-width 64 --blocks 8 \
+        --seconds 500
 
 Networks are not trained: what they take does not depend on their weights. A line of JSON for each measurement is
-appended to --out; one that is there is not made again.
+appended to --out; one that is there is not made again, and one for which the memory did not suffice says so. *Memory*
+is what the device has in use then, by torch, which keeps what it had, and Warp.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,7 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 CAMERAS = ("base", "wrist")
 STEPS = 4
 """Steps of the flow."""
+KINDS = {"layers": ("raw", "hybrid without networks", "hybrid"), "painting": ("64 and enlarged", "256 at once")}
 SPLATS = 8000
 """Splats of each object."""
 
@@ -82,8 +86,8 @@ def speckled() -> Splats:
     return Splats(*(torch.tensor(value, dtype=torch.float32) for value in values))
 
 
-def layers(worlds: int, arguments: argparse.Namespace) -> dict[str, float]:
-    """Return the time of a frame of all worlds and both cameras [s], by what is rendered."""
+def layers(worlds: int, arguments: argparse.Namespace) -> Iterator[tuple[str, float]]:
+    """Yield the time of a frame of all worlds and both cameras [s], by what is rendered."""
     device = arguments.device
     where = str(wp.device_to_torch(wp.get_device(device)))
     scene = with_cameras(ShapeSorterCfg().build(), CAMERAS)
@@ -92,7 +96,8 @@ def layers(worlds: int, arguments: argparse.Namespace) -> dict[str, float]:
     stage = Stage(model, worlds, device=device)
     stage.place(qpos)
     raw = RawCamera(stage, CAMERAS, (256, 256))
-    found = {"raw": timed(raw.render, device, arguments.least)}
+    yield "raw", timed(raw.render, device, arguments.least)
+    del raw, stage
     looks = {name: speckled().to(where) for name in ("block", "box")}
     made = painter(arguments, where)
     for name, options in {
@@ -100,27 +105,33 @@ def layers(worlds: int, arguments: argparse.Namespace) -> dict[str, float]:
         "hybrid": {"splats": looks, "shadows": ShadowCfg(), "painter": made},
     }.items():
         camera = HybridCamera(model, CAMERAS, (256, 256), worlds, objects=("block", "box"), device=device, **options)
-        found[name] = timed(lambda camera=camera: camera.shoot(qpos), device, arguments.least)
-    return found
+        yield name, timed(lambda camera=camera: camera.shoot(qpos), device, arguments.least)
+        del camera
 
 
-def painting(worlds: int, arguments: argparse.Namespace) -> dict[str, float]:
-    """Return the time of painting one camera of all worlds [s]: at 64 x 64 and enlarged, and at 256 x 256 at once."""
+def painting(worlds: int, arguments: argparse.Namespace) -> Iterator[tuple[str, float]]:
+    """Yield the time of painting one camera of all worlds [s]: at 64 x 64 and enlarged, and at 256 x 256 at once."""
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
     made = painter(arguments, where)
     seen = torch.rand(worlds, 1, 256, 256, 3, device=where)
     pose = [torch.zeros(worlds, 9, device=where)]
     made.begin(worlds)
-    found = {"64 and enlarged": timed(lambda: made.paint(["base"], seen, pose), arguments.device, arguments.least)}
+    yield "64 and enlarged", timed(lambda: made.paint(["base"], seen, pose), arguments.device, arguments.least)
     whole = FlowNetwork(FlowNetworkCfg(size=256, width=arguments.width)).to(where).eval()
     image = torch.rand(worlds, 3, 256, 256, device=where)
 
     def at_once() -> None:
         with torch.autocast(image.device.type, torch.bfloat16, enabled=made.half):
-            draw(whole, image, image, None, steps=STEPS)
+            for part in image.split(arguments.together):
+                draw(whole, part, part, None, steps=STEPS)
 
-    found["256 at once"] = timed(at_once, arguments.device, arguments.least)
-    return found
+    yield "256 at once", timed(at_once, arguments.device, arguments.least)
+
+
+def in_use(device: str) -> float:
+    """Return the memory of a CUDA device that is in use [GB]."""
+    free, total = torch.cuda.mem_get_info(device)
+    return (total - free) / 1e9
 
 
 def main() -> None:
@@ -131,20 +142,27 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=16, help="channels of the flow's first level")
     parser.add_argument("--enlarge-width", type=int, default=32)
     parser.add_argument("--blocks", type=int, default=4, help="blocks of the super-resolution")
+    parser.add_argument("--together", type=int, default=64, help="images of 256 x 256 that are painted at once")
     parser.add_argument("--least", type=float, default=1.0, help="time of each measurement [s]")
     parser.add_argument("--seconds", type=float, help="time after which no measurement is begun [s]")
     arguments = parser.parse_args()
     kept = Measurements(arguments.out, seconds=arguments.seconds)
     for worlds in arguments.worlds:
-        for name, measure in (("layers", layers), ("painting", painting)):
-            key = f"{arguments.device} {worlds} worlds, width {arguments.width}: {name}"
-            if not kept.wanted(key):
+        for kind, measure in (("layers", layers), ("painting", painting)):
+            group = f"{arguments.device} {worlds} worlds, width {arguments.width}: {kind}"
+            if all(f"{group}, {name}" in kept.rows for name in KINDS[kind]) or not kept.wanted(group):
                 continue
-            row: dict[str, Any] = {"seconds": measure(worlds, arguments), "worlds": worlds}
+            row: dict[str, Any] = {"worlds": worlds, "machine": machine(arguments.device)}
+            try:
+                for name, seconds in measure(worlds, arguments):
+                    if arguments.device != "cpu":
+                        row["memory"] = in_use(arguments.device)
+                    kept.add(f"{group}, {name}", {"seconds": seconds, "name": name, **row})
+            except (RuntimeError, MemoryError) as error:
+                kept.add(group, {**row, "error": " ".join(str(error).split())[:300]})
             if arguments.device != "cpu":
-                row["peak memory"] = torch.cuda.max_memory_allocated() / 1e9
-                torch.cuda.reset_peak_memory_stats()
-            kept.add(key, row | {"machine": machine(arguments.device)})
+                gc.collect()
+                torch.cuda.empty_cache()
     kept.close()
 
 

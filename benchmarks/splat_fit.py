@@ -1,14 +1,16 @@
 """Splats fitted to photographs of the stand-in's objects, judged by photographs that were not fitted.
 
     python benchmarks/splat_fit.py                         measure on the CPU; writes the data, the page and the picture
-    python benchmarks/splat_fit.py --device cuda:0         the same on a GPU
+    python benchmarks/splat_fit.py --photographs runs/photos --make      only make the photographs of all cases
+    python benchmarks/splat_fit.py --device cuda:0 --photographs runs/photos --out F.jsonl    the same on a GPU
     python benchmarks/splat_fit.py --table                 the page from the stored data, without runs
 
 Block and box of the shape sorter as the stand-in's camera sees them, with their printed pattern, are photographed from
 all sides without anything around them, three by three rays a pixel; every eighth photograph is held out. `concent
 splat-fit` does the same with a folder of photographs. *Before black* is the peak signal-to-noise ratio of whole images,
 most of which is empty; *object* is that over the pixels that mask or splats cover. With noise, each colour of each
-photograph, also of those held out, is off by 2/255 at random: there 42 dB is the most that could be reached.
+photograph, also of those held out, is off by 2/255 at random: there 42 dB is the most that could be reached. The
+photographs are made by the CPU; a host where Warp has no CPU takes them from a folder.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 from concent_warp.render.splat_cfg import SplatFitCfg
 from concent_warp.render.splat_fit import SplatFit
 from concent_warp.render.splat_start import visual_hull
-from concent_warp.render.splat_views import SplatViews
+from concent_warp.render.splat_views import FILE, SplatViews, read_views
 from measurements import Measurements
 from pages import FOLDER, machine, machine_line, table, write_page
 
@@ -38,14 +40,28 @@ CASES: dict[str, tuple[str, PhotographsCfg, dict[str, Any]]] = {
     "block, noise of 2/255": ("block", PhotographsCfg(count=56, rgb_std=2.0), {}),
     "block, without view dependence": ("block", PhotographsCfg(count=56), {"degree": 0}),
     "block, 24 photographs": ("block", PhotographsCfg(count=24), {}),
+    "box, 120 photographs": ("box", PhotographsCfg(count=120), {}),
+    "box, 24,000 splats": ("box", PhotographsCfg(count=120), {"most": 24_000, "views": 4}),
 }
 """Object, photographs, changes of the settings."""
 
 
-def measure(case: str, device: str, iterations: int) -> tuple[dict[str, Any], np.ndarray]:
-    body, photographing, changes = CASES[case]
+def views_of(case: str, folder: Path | None) -> SplatViews:
+    """Return the photographs of a case, from a folder if they are there."""
+    body, photographing, _ = CASES[case]
+    path = None if folder is None else folder / f"{body}_{photographing.count}_{photographing.rgb_std:g}"
+    if path is not None and (path / FILE).exists():
+        return read_views(path)
     world = WorldCfg().build(ShapeSorterCfg().build())
     views = SplatViews(*photographs(world, body, photographing), masked=True)
+    if path is not None:
+        views.write(path)
+    return views
+
+
+def measure(case: str, device: str, iterations: int, folder: Path | None) -> tuple[dict[str, Any], np.ndarray]:
+    _, photographing, changes = CASES[case]
+    views = views_of(case, folder)
     cfg = SplatFitCfg(iterations=iterations, **changes)
     begun = time.perf_counter()
     fit = SplatFit(views, visual_hull(views, cfg.start, np.random.default_rng(cfg.seed)), cfg, device=device)
@@ -61,6 +77,7 @@ def measure(case: str, device: str, iterations: int) -> tuple[dict[str, Any], np
         "seconds": seconds,
         "psnr": float(np.mean([score.psnr for score in scores])),
         "worst": float(min(score.psnr for score in scores)),
+        "worst_view": int(min(scores, key=lambda score: score.psnr).view),
         "psnr_object": float(np.mean([score.psnr_object for score in scores])),
         "machine": machine(device),
     }
@@ -95,10 +112,17 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     parser.add_argument("--iterations", type=int, default=1500, help="steps of a fit")
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES), help="what to measure")
+    parser.add_argument("--photographs", type=Path, help="folder that photographs are taken from, and kept in")
+    parser.add_argument("--make", action="store_true", help="only make the photographs")
+    parser.add_argument("--pictures", type=Path, default=FOLDER, help="folder of the pictures")
     parser.add_argument("--out", type=Path, default=DATA, help="file of JSON lines")
     parser.add_argument("--seconds", type=float, default=None, help="time after which no fit is begun [s]")
     parser.add_argument("--table", action="store_true", help="write the page from the stored data")
     arguments = parser.parse_args()
+    if arguments.make:
+        for case in arguments.cases:
+            views_of(case, arguments.photographs)
+        return
     kept = Measurements(arguments.out, seconds=arguments.seconds)
     if not arguments.table:
         import cv2
@@ -106,13 +130,14 @@ def main() -> None:
         pictures = {}
         for case in arguments.cases:
             if kept.wanted(f"{arguments.device} {case}"):
-                row, pictures[case] = measure(case, arguments.device, arguments.iterations)
+                row, pictures[case] = measure(case, arguments.device, arguments.iterations, arguments.photographs)
                 kept.add(f"{arguments.device} {case}", {"device": arguments.device, "case": case, **row})
         kept.close()
         if {"block", "box"} <= set(pictures):
             both = np.vstack([pictures["block"], pictures["box"]])
-            cv2.imwrite(str(FOLDER / f"{NAME}.png"), both[..., ::-1])
-    write(kept.rows)
+            cv2.imwrite(str(arguments.pictures / f"{NAME}.png"), both[..., ::-1])
+    if arguments.out == DATA:
+        write(kept.rows)
 
 
 if __name__ == "__main__":

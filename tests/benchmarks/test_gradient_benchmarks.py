@@ -32,3 +32,34 @@ def test_a_world_takes_the_same_memory_whatever_their_number(script):
     one, four = benchmark.measure(1, "cpu", 1), benchmark.measure(4, "cpu", 1)
     assert one["bytes"] == four["bytes"] > 0
     assert four["seconds"] > 0
+
+
+def test_a_page_keeps_what_other_machines_measured_and_takes_in_all_parts(script, tmp_path, monkeypatch):
+    benchmark = script("es_vs_gradient")
+    facts = benchmark.machine("cpu")
+    point = {"simulations": 10, "seconds": 1.0, "fitted": 1.0, "unseen": 2.0, "loss_mm": 1.0}
+
+    def rows(scene, device):
+        common = {"scene": scene, "seed": 0, "start": [3.0, 3.0], "helped": True, "curve": [point, point]}
+        return {f"{scene} 0 {method} {device}": {**common, "method": method} for method in benchmark.METHODS}
+
+    paths = [tmp_path / "a.jsonl", tmp_path / "b.jsonl"]
+    for path, scene in zip(paths, ("settle", "push"), strict=True):
+        kept = benchmark.Measurements(path)
+        for key, row in rows(scene, "cuda:0").items():
+            kept.add(key, {**row, "machine": {"device": "a graphics processor", **facts}})
+    written = {}
+    before = {"machines": {"cpu": {**facts, "date": "2020-01-01"}}, "rows": rows("tumble", "cpu")}
+    monkeypatch.setattr(benchmark, "FOLDER", tmp_path)
+    monkeypatch.setattr(benchmark, "read_data", lambda _: before)
+    monkeypatch.setattr(benchmark, "write_data", lambda _, data: written.update(data))
+    monkeypatch.setattr(benchmark, "write_page", lambda _, text: written.update(page=text))
+    benchmark.report(benchmark.Args(out=paths[0], parts=(paths[1],), report=True))
+    cpu, cuda = written["page"].split("Measured ")[1:]
+    assert cpu.startswith("2020-01-01")
+    assert "| tumble | 1 |" in cpu
+    assert "a graphics processor" in cuda
+    assert "| settle | 1 |" in cuda
+    assert "| push | 1 |" in cuda
+    assert set(written["machines"]) == {"cpu", "cuda:0"}
+    assert len(written["rows"]) == 6
