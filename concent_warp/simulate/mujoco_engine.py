@@ -18,7 +18,7 @@ from concent_warp.simulate.contact_log import collect
 from concent_warp.simulate.engine import Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants, with_laws
-from concent_warp.simulate.processes import WORTH, in_processes
+from concent_warp.simulate.processes import FEWEST, WORTH, in_processes
 from concent_warp.simulate.threads import simulations_at_a_time
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class MujocoEngine:
     def _simulated(self, run: Run, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants, as many at a time as may be."""
         count = min(self.threads, len(rows))
-        if run.variants.laws and count > 1 and len(rows) * run.steps >= WORTH:
+        if run.variants.laws and count >= FEWEST and len(rows) * run.steps >= WORTH:
             return in_processes(self._in_turn, run, rows, self.threads)
         # Laws are written in Python, of which one thread runs at a time: several would only get in each other's way.
         with ThreadPoolExecutor(1 if run.variants.laws else count) as pool:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from concent_warp.simulate.inputs import Run
 
 T = TypeVar("T")
+FEWEST = 3
+"""Processes from which on it pays: what they are sent and send back takes its time as well."""
 WORTH = 20_000
 """Steps, of all simulations together, from which on it pays to hand them over: they take a second in one thread."""
 

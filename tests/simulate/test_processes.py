@@ -38,7 +38,7 @@ def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
     monkeypatch.setattr(mujoco_engine, "WORTH", 1)
     with monkeypatch.context() as here:
         here.setattr(MujocoEngine, "_simulate", None)  # in this process alone
-        shared = run(2)
+        shared = run(3)
     for name in ("qpos", "qvel", "sensordata", "diverged"):
         np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
     assert np.ptp(alone.qpos[:, -1]) > 0.1
@@ -46,14 +46,14 @@ def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
 
 def test_few_steps_stay_where_they_are(monkeypatch):
     monkeypatch.setattr(MujocoEngine, "_in_turn", None)
-    assert not run(2).diverged.any()
+    assert not run(3).diverged.any()
 
 
 def test_an_error_in_another_process_is_told_as_here(monkeypatch):
     monkeypatch.setattr(mujoco_engine, "WORTH", 1)
     effect = effect_class("load_friction")("hinge")
-    engine = MujocoEngine(Model(Scene(PENDULUM)), threads=2)
+    engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3)
     law = effect.law(engine.compiled)
     assert law is not None
     with pytest.raises(ValueError):  # a law without its parameters
-        engine.run(Variants(2, laws=((law, np.zeros((2, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])
+        engine.run(Variants(3, laws=((law, np.zeros((3, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])
