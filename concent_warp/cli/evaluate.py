@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from concent_warp.train.environment import Environment
     from concent_warp.train.evaluate import Evaluation
     from concent_warp.train.resets import InitialStates
+    from concent_warp.train.run import Run as TrainedRun
     from concent_warp.train.task import Task
 
 
@@ -44,6 +45,9 @@ class Arguments:
     hide: tuple[str, ...] = ()
     """Effects to hide in the stand-in world, each as name=value in the unit of its main parameter, as in
     joint_friction=1.2; an unknown name lists those that there are."""
+    pace: float = 1.0
+    """How large the steps of the robot's commands are, as a share of those that the policy was trained with: below 1 it
+    moves more slowly, for as long an episode."""
     videos: int = 0
     """How many of the first episodes in the stand-in world to film, as MP4."""
     out: Path | None = None
@@ -70,6 +74,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
 
     if arguments.episodes < 1:
         raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
+    if not 0 < arguments.pace <= 1:
+        raise TrainError("the pace is not right", expected="more than 0, at most 1", found=arguments.pace)
     hidden = wanted(arguments.hide)
     if hidden and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
@@ -77,7 +83,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         raise TrainError("videos are of the stand-in world", fix="add --world reality")
     path = given_checkpoint(arguments.checkpoint, arguments.pretrained)
     films = video_files(arguments, Path() if arguments.checkpoint is None else path.parent)
-    made = Run.load(path.parent)
+    made = paced(Run.load(path.parent), arguments.pace)
     task = made.task()
     states = made.evaluation_states(task, arguments.episodes, arguments.seed)
     torch.manual_seed(arguments.seed)
@@ -104,9 +110,18 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     if arguments.json:
         named = str(path) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
         document: dict[str, Any] = {"checkpoint": named, "seed": arguments.seed, "hidden": dict(hidden)}
+        document["pace"] = arguments.pace
         document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
         print(json.dumps(document, indent=1, allow_nan=False))
     return found
+
+
+def paced(run: TrainedRun, pace: float) -> TrainedRun:
+    """Return a run whose actions take smaller steps."""
+    environment = run.cfg.environment
+    action = environment.action
+    action = replace(action, turn=pace * action.turn, slide=pace * action.slide, gripper=pace * action.gripper)
+    return replace(run, cfg=replace(run.cfg, environment=replace(environment, action=action)))
 
 
 class Reel:

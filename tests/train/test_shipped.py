@@ -1,5 +1,6 @@
 """A policy that comes with the package runs at once, and any run can be made into one."""
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from concent_warp.train.shipped import FOLDER, ORIGIN, names, ship, shipped
 from several_processes import make_run
 
 from concent_warp.cli import main
+from concent_warp.cli.evaluate import paced
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,18 @@ def test_policy_that_comes_with_the_package_succeeds_on_a_cpu(tmp_path, capsys, 
     assert main(["evaluate", "--pretrained", "shape_sorter", *options]) == 0
     assert capsys.readouterr().out == first
     assert not list(tmp_path.iterdir())
+
+
+def test_policy_at_half_the_pace_takes_half_the_steps_of_the_commands(capsys):
+    options = ["evaluate", "--pretrained", "--episodes", "4", "--world", "simulation", "--device", "cpu", "--json"]
+    assert main([*options, "--pace", "0.5"]) == 0
+    slow = json.loads(capsys.readouterr().out)
+    assert slow["pace"] == 0.5
+    assert slow["worlds"]["simulation"]["successes"] == 4
+    run = Run.load(FOLDER / "shape_sorter")
+    np.testing.assert_allclose(paced(run, 0.5).task().robot.step, 0.5 * run.task().robot.step)
+    assert main([*options, "--pace", "1.5"]) != 0
+    assert "the pace is not right" in capsys.readouterr().err
 
 
 def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
