@@ -276,7 +276,9 @@ def draw(rows: dict[str, dict[str, Any]], device: str, path: Path) -> None:
                 ax.set_title(scene, fontsize=10)
     axes[0, 0].set_ylabel("error [mm]")
     axes[1, 0].set_ylabel("error [mm]")
-    axes[0, 0].legend(fontsize=8, frameon=False)
+    named = [ax for ax in axes.flat if ax.get_legend_handles_labels()[0]]
+    if named:
+        named[0].legend(fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
