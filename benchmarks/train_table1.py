@@ -206,10 +206,10 @@ def section(rows: Sequence[Row]) -> list[str]:
             ])  # fmt: skip
     head = ["case", "succeed", "95 % interval", "episodes", "seeds", "paper", "targets met", "in simulation"]
     parts = [table(head, lines)]
-    order = " > ".join(sorted(pooled, key=lambda title: -pooled[title]))
-    parts.append(f"In the order found: {order}.")
-    if absent := [case.title for case in CASES.values() if case.title not in pooled]:
-        parts.append(f"Not tried yet: {'; '.join(absent)}.")
+    absent = [case.title for case in CASES.values() if case.title not in pooled]
+    if len(pooled) > 1:
+        order = " > ".join(sorted(pooled, key=lambda title: -pooled[title]))
+        parts.append(f"In the order found: {order}." + f" Not tried yet: {'; '.join(absent)}." * bool(absent))
     parts.append("How the episodes ended, and what the policies were trained for:")
     parts.append(table(["case, seed", "outcomes", "stage", "steps", "seconds"], [ended(row) for row in rows]))
     if rows:
