@@ -213,6 +213,12 @@ class RandomisationCfg:
     """Delay of the arm's commands [s]."""
     lag: Range = (0.0, 0.0)
     """Time constant with which the arm's set points follow its commands [s]."""
+    push: tuple[float, float] = (0.0, 0.0)
+    """Standard deviations of a force [N] and of a torque [N m], each along any direction, that act on object 1 for the
+    length of an action now and then, where the stage holds it: it is turned in the hand, or knocked out of the way, and
+    the policy learns what to do then. Not in an evaluation."""
+    push_share: float = 0.2
+    """Share of the actions in which they act."""
 
 
 @dataclass(frozen=True)

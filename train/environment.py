@@ -120,6 +120,8 @@ class Environment(VecEnv):
         self._success, self._dropped, self._lost = cfg.success, cfg.dropped, cfg.lost
         self._rest = max(1, round(cfg.chain.rest / self.control_step))
         self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
+        force, torque = cfg.randomisation.push
+        self._push = real([force] * 3 + [torque] * 3) if force or torque else None
         pool = self._states
         self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
         self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
@@ -157,9 +159,11 @@ class Environment(VecEnv):
         self._offended = torch.zeros((), dtype=torch.bool, device=device)
         self._none = torch.zeros(n, device=device)
         self._skill = torch.zeros((), device=device)
+        self._pushing = torch.ones((), device=device)
 
     def reset(self) -> None:
-        """Start an episode in every world, at random places of the episode, so that they do not end all at once."""
+        """Start an episode in every world for training, at random places of it, so that they do not end all at once."""
+        self._pushing.fill_(1)
         with torch.no_grad():
             self._start(torch.ones_like(self.done))
             self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
@@ -169,7 +173,8 @@ class Environment(VecEnv):
             self.refresh()
 
     def start_from(self, rows: Sequence[int]) -> None:
-        """Start an episode in every world from the states of these rows, one each."""
+        """Start an episode in every world from the states of these rows, one each; from here on nothing is pushed."""
+        self._pushing.zero_()
         index = torch.as_tensor(np.asarray(rows), device=self.device)
         with torch.no_grad():
             self._start(torch.ones_like(self.done), index)
@@ -298,6 +303,15 @@ class Environment(VecEnv):
         if len(self._gripper):
             opened = p.ctrl[:, self._gripper] + action[:, joints:] * self._step[joints:]
             p.ctrl[:, self._gripper] = opened.clamp(self._range[self._gripper, 0], self._range[self._gripper, 1])
+        if self._push is not None:
+            self._push_object(self._push)
+
+    def _push_object(self, deviation: torch.Tensor) -> None:
+        """Have forces and torques of these standard deviations (6,) act on object 1 in some worlds that hold it."""
+        held = self._frames[self.stage.long(), 0] > 0
+        hit = held & (torch.rand(self.num_envs, device=self.device) < self._settings.randomisation.push_share)
+        wrench = torch.randn(self.num_envs, 6, device=self.device) * deviation * self._pushing
+        self.physics.wrench[:, self.task.objects[0]] = wrench * hit[:, None]
 
     def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the objects' poses, in the hand for those that the stage holds: (N, O, 3) [m] and (N, O, 4)."""

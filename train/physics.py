@@ -38,6 +38,8 @@ class Physics(Protocol):
     """Shape (N, nv)."""
     ctrl: torch.Tensor
     """Shape (N, nu)."""
+    wrench: torch.Tensor
+    """Force [N] and torque [N m] on each body about its centre of mass, world frame, shape (N, nbody, 6)."""
     mocap: tuple[torch.Tensor, torch.Tensor]
     """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of what is fixed where a world has it."""
     warmstart: torch.Tensor
@@ -77,7 +79,7 @@ class Actor:
     """What acts on a world of C MuJoCo besides its commands: a hidden effect, say."""
 
     force: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
-    """Called before every step; adds to `qfrc_applied` and `xfrc_applied`, which are cleared before it."""
+    """Called before every step; adds to `qfrc_applied` and `xfrc_applied`, of which nothing is left from before."""
     command: Callable[[float, np.ndarray], np.ndarray] | None = None
     """Maps time [s] and the command (nu,) to the one that acts."""
 
@@ -124,6 +126,7 @@ class MujocoPhysics:
         self.qvel = torch.zeros(worlds, model.nv, dtype=torch.float64)
         self.warmstart = torch.zeros_like(self.qvel)
         self.ctrl = torch.zeros(worlds, model.nu)
+        self.wrench = torch.zeros(worlds, model.nbody, 6)
         fixed = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
         places = [np.tile(values[fixed], (worlds, 1, 1)) for values in (model.body_pos, model.body_quat)]
         self.mocap = torch.from_numpy(places[0]), torch.from_numpy(places[1])
@@ -162,15 +165,17 @@ class MujocoPhysics:
 
     def _advance(self, ctrl: np.ndarray) -> None:
         """Simulate the steps of one action under the commands of each, shape (D, N, nu)."""
+        wrench = self.wrench.numpy().astype(float)
         for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
             self._write(i, m, d)
+            d.xfrc_applied[:] = wrench[i]
             for command in ctrl[:, i]:
                 for actor in self._actors[i]:
                     command = command if actor.command is None else actor.command(d.time, command)
                 d.ctrl[:] = command
                 if self._laws[i] or self._actors[i]:
                     d.qfrc_applied[:] = 0
-                    d.xfrc_applied[:] = 0
+                    d.xfrc_applied[:] = wrench[i]
                     for target, values in self._unedited[i]:
                         target[:] = values
                     for law in self._laws[i]:
@@ -265,6 +270,8 @@ class WarpPhysics:
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self._follow(following, capture)
+            self._wrench = wp.zeros_like(d.xfrc_applied) if laws else d.xfrc_applied
+            self.wrench = wp.to_torch(self._wrench)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
             self.mocap = (
@@ -329,7 +336,7 @@ class WarpPhysics:
                 for target, values in self._unedited:
                     wp.copy(target, values)
                 self._data.qfrc_applied.zero_()
-                self._data.xfrc_applied.zero_()
+                wp.copy(self._data.xfrc_applied, self._wrench)
                 for law, values in self._laws:
                     law.launch(self._model, self._data, values)
             self._mjw.step(self._model, self._data)

@@ -241,6 +241,17 @@ class Trainer:
         torch.save(document, partial)
         partial.replace(path)
 
+    def begin_with(self, path: Path) -> None:
+        """Take over the policy of a checkpoint; value function and all else stay as they are.
+
+        Raises:
+            TrainError: It is of another network.
+        """
+        try:
+            self.algorithm.load(load_checkpoint(path, self.device), {"actor": True}, True)
+        except RuntimeError as error:
+            raise TrainError("the policy is of another network", where=path, found=str(error)[:200]) from None
+
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint, as if training had not stopped.
 

@@ -93,6 +93,7 @@ def train(
     report: Report | None = None,
     seconds: float | None = None,
     ranks: Ranks | None = None,
+    begin_with: Path | None = None,
 ) -> tuple[Trainer, Round | None]:
     """Train, and return the trainer and its last round.
 
@@ -105,9 +106,10 @@ def train(
         seconds: Time after which to stop [s].
         ranks: The processes that train together, joined already; this one alone by default. Each has
             `run.cfg.environment.worlds` worlds of its own.
+        begin_with: Checkpoint whose policy to begin with, where nothing is gone on with.
 
     Raises:
-        TrainError: The folder's training was begun with other settings.
+        TrainError: The folder's training was begun with other settings, or the policy to begin with does not fit.
     """
     ranks = Ranks() if ranks is None else ranks
     with ranks.agreeing():
@@ -122,6 +124,8 @@ def train(
         environment.reset()
         if resume and folder is not None:
             trainer.resume(folder / CHECKPOINT)
+        elif begin_with is not None:
+            trainer.begin_with(begin_with)
     return trainer, trainer.learn(report, seconds=seconds)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.given_policy import given_checkpoint
 from concent_warp.cli.run_folder import resuming_command, run_folder, write_settings
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
@@ -38,6 +39,9 @@ class Arguments:
     """Demonstration to train from; the first by default."""
     events: Path | None = None
     """Its contact events (.json); extracted where they are not given."""
+    begin_with: Path | None = None
+    """Policy to begin with, a run folder of a training or its checkpoint file, to train it on with other settings; by
+    default weights are drawn at random."""
     device: str | None = None
     """Warp's name of the device; the first CUDA device by default where there is one."""
     resume: bool = False
@@ -74,11 +78,12 @@ def run(arguments: Arguments) -> Round | None:
     from concent_warp.train.ranks import Ranks
 
     ranks = Ranks.here()
+    begin_with = None if arguments.begin_with is None else given_checkpoint(arguments.begin_with, None)
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
     claimed = run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
     with ranks.joined(ranks.device(arguments.device)), claimed if ranks.first else nullcontext():
         try:
-            last = train_in(folder, arguments, ranks)
+            last = train_in(folder, arguments, ranks, begin_with)
         except KeyboardInterrupt:
             saved = (folder / CHECKPOINT).exists()
             ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was trained yet."
@@ -91,8 +96,8 @@ def run(arguments: Arguments) -> Round | None:
     return last
 
 
-def train_in(folder: Path, arguments: Arguments, ranks: Ranks) -> Round | None:
-    """Train with a folder that was made."""
+def train_in(folder: Path, arguments: Arguments, ranks: Ranks, begin_with: Path | None) -> Round | None:
+    """Train with a folder that was made, from a policy of a checkpoint or from none."""
     from concent_warp.events.sequence import ContactEventSequence
     from concent_warp.train.run import Run, train
 
@@ -111,4 +116,12 @@ def train_in(folder: Path, arguments: Arguments, ranks: Ranks) -> Round | None:
             left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
             update(this.iteration / cfg.ppo.iterations, text, left)
 
-        return train(made, folder, device=arguments.device, resume=arguments.resume, report=show, ranks=ranks)[1]
+        return train(
+            made,
+            folder,
+            device=arguments.device,
+            resume=arguments.resume,
+            report=show,
+            ranks=ranks,
+            begin_with=begin_with,
+        )[1]

@@ -93,6 +93,23 @@ def test_other_settings_and_foreign_files_are_refused_on_resuming(made, tmp_path
         train(made, tmp_path, device="cpu", resume=True)
 
 
+def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
+    train(made, tmp_path / "first", device="cpu")
+    given = weights(tmp_path / "first")
+    hardly = replace(SHORT, iterations=1, learning_rate=1e-12, schedule="fixed")
+    still = replace(made, cfg=replace(made.cfg, seed=1, ppo=hardly))
+    same = []
+    for begin_with in (None, tmp_path / "first" / CHECKPOINT):
+        trainer, _ = train(still, None, device="cpu", begin_with=begin_with)
+        found = dict(trainer.algorithm.actor.named_parameters())
+        same.append([torch.allclose(value, given[name], rtol=0, atol=1e-9) for name, value in found.items()])
+    assert not all(same[0])
+    assert all(same[1])
+    wider = replace(still, cfg=replace(still.cfg, ppo=replace(hardly, hidden=(32,))))
+    with pytest.raises(TrainError, match="another network"):
+        train(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
+
+
 def test_first_diverged_state_is_saved(made, tmp_path, monkeypatch):
     step = Environment.step
 

@@ -1,0 +1,89 @@
+"""Forces and torques that push what is held."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from concent_warp.train.environment import Environment
+from concent_warp.train.physics import MujocoPhysics, WarpPhysics
+from concent_warp.train.worlds import make_environment
+from small_insertion import SETTINGS
+
+from concent_warp.effects.registry import effect_class
+
+PUSHED = replace(SETTINGS, randomisation=replace(SETTINGS.randomisation, push=(2.0, 0.05), push_share=0.5))
+
+
+def acted(environment: Environment) -> torch.Tensor:
+    """Return what acted on each body in an action, shape (N, nbody, 6)."""
+    environment.step(torch.zeros(environment.num_envs, environment.num_actions))
+    return environment.physics.wrench.clone()
+
+
+@pytest.mark.parametrize("law", [False, True])
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_wrench_moves_the_body_that_it_acts_on_as_newton_says(task, engine, law):
+    m, body, steps = task.compiled, task.objects[0], 5
+    effect = effect_class("stribeck_friction")(m.joint(int(task.robot.joint[0])).name)
+    acting = effect.law(m)
+    assert acting is not None
+    laws = [(acting, np.zeros((2, len(effect.parameters(m)))))] if law else []
+    if engine == "warp":
+        physics = WarpPhysics(m, 2, steps, laws, device="cpu", nconmax=200, njmax=800)
+    else:
+        physics = MujocoPhysics(m, 2, steps, laws)
+    physics.qpos[:] = torch.as_tensor(task.replay.qpos[0]).to(physics.qpos.dtype)
+    joint = m.body_jntadr[body]
+    physics.qpos[:, m.jnt_qposadr[joint] + 2] += 1.0  # in the air
+    physics.wrench[1, body] = torch.tensor([0.3, 0.0, 0.6, 0.0, 0.0, 1e-4])
+    for _ in range(2):
+        physics.advance()
+    dof = m.jnt_dofadr[joint]
+    gained = (physics.qvel[1] - physics.qvel[0])[dof : dof + 6].double().numpy()
+    time = 2 * steps * m.opt.timestep
+    expected = [0.3 * time / m.body_mass[body], 0.0, 0.6 * time / m.body_mass[body]]
+    np.testing.assert_allclose(gained[:3], expected, rtol=1e-3, atol=1e-4)
+    assert gained[5] == pytest.approx(1e-4 * time / m.body_inertia[body, 2], rel=1e-3)
+
+
+def test_pushes_come_in_training_and_not_in_an_evaluation(task, states):
+    torch.manual_seed(0)
+    environment = make_environment(task, PUSHED, states, device="cpu")
+    body = task.objects[0]
+    pushes = torch.stack([acted(environment)[:, body] for _ in range(20)])
+    hit = pushes.abs().sum(dim=2) > 0
+    assert float(hit.float().mean()) == pytest.approx(0.5, abs=0.1)
+    assert float(pushes[hit][:, :3].std()) == pytest.approx(2.0, rel=0.15)
+    assert float(pushes[hit][:, 3:].std()) == pytest.approx(0.05, rel=0.15)
+    environment.start_from(list(range(environment.num_envs)))
+    assert not acted(environment).any()
+    environment.reset()
+    others = acted(environment)
+    assert others[:, body].any()
+    others[:, body] = 0
+    assert not others.any()
+
+
+def test_what_is_not_held_is_not_pushed(task, states):
+    environment = make_environment(task, PUSHED, states, device="cpu")
+    environment._frames.zero_()
+    assert not acted(environment).any()
+
+
+def test_pushed_training_goes_on_as_if_it_had_not_stopped(task, states):
+    """Pushes are drawn from the generator that a checkpoint keeps."""
+    found = []
+    for stop in (False, True):
+        torch.manual_seed(3)
+        environment = make_environment(task, PUSHED, states, device="cpu")
+        for _ in range(3):
+            acted(environment)
+        if stop:
+            kept, generator = environment.state(), torch.get_rng_state()
+            environment = make_environment(task, PUSHED, states, device="cpu")
+            environment.restore(kept)
+            torch.set_rng_state(generator)
+        found.append((acted(environment), environment.observation.clone()))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
