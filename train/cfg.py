@@ -361,6 +361,13 @@ class TrainCfg:
                 expected=f"a divisor of the decimation, {e.decimation}",
                 found=f"stride {e.stride}",
             )
+        push = e.randomisation
+        if min(push.push) < 0 or not 0 <= push.push_share <= 1:
+            raise TrainError(
+                "pushes are not right",
+                expected="deviations of at least 0 and a share from 0 to 1",
+                found=f"push {push.push}, push_share {push.push_share}",
+            )
         if e.worlds * p.steps < p.batches:
             raise TrainError(
                 "a round holds fewer steps than batches", expected=f"at least {p.batches}", found=e.worlds * p.steps

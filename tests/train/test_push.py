@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from concent_warp.train.cfg import TrainCfg, TrainError
 from concent_warp.train.environment import Environment
 from concent_warp.train.physics import MujocoPhysics, WarpPhysics
 from concent_warp.train.worlds import make_environment
@@ -63,6 +64,12 @@ def test_pushes_come_in_training_and_not_in_an_evaluation(task, states):
     assert others[:, body].any()
     others[:, body] = 0
     assert not others.any()
+
+
+@pytest.mark.parametrize("wrong", [{"push": (-1.0, 0.1)}, {"push_share": 1.5}])
+def test_pushes_that_cannot_be_are_refused(wrong):
+    with pytest.raises(TrainError, match="pushes are not right"):
+        TrainCfg(environment=replace(PUSHED, randomisation=replace(PUSHED.randomisation, **wrong)))
 
 
 def test_what_is_not_held_is_not_pushed(task, states):
