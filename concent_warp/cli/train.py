@@ -74,11 +74,13 @@ class Arguments:
 def run(arguments: Arguments) -> Round | None:
     """Train and write the run folder, one of several processes where torchrun started them."""
     quiet_warp()
-    from concent_warp.train.ppo import CHECKPOINT
+    from concent_warp.train.ppo import CHECKPOINT, load_checkpoint
     from concent_warp.train.ranks import Ranks
 
     ranks = Ranks.here()
     begin_with = None if arguments.begin_with is None else given_checkpoint(arguments.begin_with, None)
+    if begin_with is not None:
+        load_checkpoint(begin_with)  # what is no checkpoint is refused before anything is written
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
     claimed = run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
     with ranks.joined(ranks.device(arguments.device)), claimed if ranks.first else nullcontext():

@@ -110,6 +110,17 @@ def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
         train(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
 
 
+def test_what_is_no_policy_to_begin_with_is_refused_before_anything_is_written(tmp_path, capsys):
+    text = tmp_path / "notes.md"
+    text.write_text("not a checkpoint")
+    for path, reason in ((text, "not a checkpoint"), (tmp_path / "nowhere", "no such training")):
+        out = tmp_path / "out"
+        command = ["train", str(tmp_path / "demo.h5"), "--model", str(tmp_path / "model.toml"), "--out", str(out)]
+        assert main([*command, "--begin-with", str(path)]) != 0
+        assert reason in capsys.readouterr().err
+        assert not out.exists()
+
+
 def test_first_diverged_state_is_saved(made, tmp_path, monkeypatch):
     step = Environment.step
 
