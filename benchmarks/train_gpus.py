@@ -78,7 +78,8 @@ def trained(args: Args, given: list[str], folder: Path, gpus: int, worlds: int, 
     late = curve[len(curve) // 2 :]
     first, last = late[0], late[-1]
     rate = (last[0] - first[0]) / (last[1] - first[1]) if len(late) > 1 else curve[-1][0] / curve[-1][1]
-    return {"gpus": gpus, "worlds": worlds, "seed": seed, "steps_per_second": rate, "curve": curve}
+    row = {"gpus": gpus, "worlds": worlds, "seed": seed, "steps_per_second": rate, "curve": curve}
+    return {**row, "options": " ".join(args.options)}
 
 
 def measure(args: Args, out: Path) -> None:
@@ -118,11 +119,12 @@ def page(rows: list[Row]) -> str:
         gain = f"{rate / base[0]:.2f}" if base else "-"
         counted = f"{len(ends)} of {len(group)}"
         lines.append([f"{gpus} x {worlds:,}", f"{rate:,.0f}", gain, counted, steps, seconds, f"{last:.1%}"])
+    options = " and ".join(sorted({f"`{row['options']}`" for row in rows if row["options"]})) or "default settings"
     head = ("GPUs x worlds", "steps/s", "of one", f"reach {LEARNT:.0%}", "steps", "seconds", "in the end")
     return f"""# Training on several GPUs
 
-Insertion stage of the shape sorter with the arm, `concent train` under torchrun, default settings; each GPU has the
-given number of worlds. Steps are those of all GPUs; rates are those of the second half of the training, with learning.
+Insertion stage of the shape sorter with the arm, `concent train` under torchrun, {options}; each GPU has
+the given number of worlds. Steps are those of all GPUs; rates are those of the second half of the training, with learning.
 Seconds leave out start and compilation. Success is that of the episodes of a round, while exploring; medians over the
 seeds.
 

@@ -115,14 +115,15 @@ def perform(
     arm = arm_joints(model, gripper)
     path = aligned(path, start_rotation)
     angles = solve_path(model, task.robot.tcp_site, arm, data.qpos, path.position, path.rotation)
-    angles += deflection(model, task.robot.tcp_site, arm, data.qpos, angles, path.force)
+    # The expert knows the drives as they are drawn, not what is hidden in them.
+    angles += deflection(scene.model, task.robot.tcp_site, arm, data.qpos, angles, path.force)
     action = np.zeros((len(path.time), model.nu))
     for column in range(model.nu):
         if column in gripper:
             action[:, column] = path.opening
         else:
             action[:, column] = angles[:, arm.index(int(model.actuator_trnid[column, 0]))]
-    settle(model, data, action[0])
+    settle(model, data, action[0], effects)
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     log = simulate(cfg.sensing, scene, model, data, path.time, action, effects, rng, progress)
 

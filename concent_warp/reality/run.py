@@ -26,12 +26,24 @@ class Log:
     visible: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
 
-def settle(model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray) -> None:
-    """Let the objects come to rest before the recording starts."""
+def settle(
+    model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray, effects: tuple[HiddenEffect, ...] = ()
+) -> None:
+    """Let objects and arm come to rest before the recording starts, under the forces of the effects."""
     data.ctrl[:] = ctrl
     for _ in range(round(0.3 / model.opt.timestep)):
+        act(model, data, effects)
         mujoco.mj_step(model, data)
     data.time = 0.0
+
+
+def act(model: mujoco.MjModel, data: mujoco.MjData, effects: tuple[HiddenEffect, ...]) -> None:
+    """Apply the forces of the effects, and none else, in the next step."""
+    data.qfrc_applied[:] = 0
+    data.xfrc_applied[:] = 0
+    for effect in effects:
+        if effect.force is not None:
+            effect.force(model, data)
 
 
 def simulate(
@@ -62,11 +74,7 @@ def simulate(
                 ctrl = effect.command(now, ctrl)
         wander = keep * wander + kick * rng.normal(size=model.nu)
         data.ctrl[:] = ctrl + wander
-        data.qfrc_applied[:] = 0
-        data.xfrc_applied[:] = 0
-        for effect in effects:
-            if effect.force is not None:
-                effect.force(model, data)
+        act(model, data, effects)
         qpos = data.qpos.copy()
         mujoco.mj_step(model, data)  # sensors, poses and contacts are those of the state before the step
         log.time.append(now)
