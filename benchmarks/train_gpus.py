@@ -124,9 +124,9 @@ def page(rows: list[Row]) -> str:
     return f"""# Training on several GPUs
 
 Insertion stage of the shape sorter with the arm, `concent train` under torchrun, {options}; each GPU has
-the given number of worlds. Steps are those of all GPUs; rates are those of the second half of the training, with learning.
-Seconds leave out start and compilation. Success is that of the episodes of a round, while exploring; medians over the
-seeds.
+the given number of worlds. Steps are those of all GPUs; rates are those of the second half of the training, with
+learning. Seconds leave out start and compilation. Success is that of the episodes of a round, while exploring; medians
+over the seeds.
 
 {table(head, lines)}
 {machine_line(rows[0]["machine"])} Made by `python benchmarks/train_gpus.py --out F`, then `--report F`.
