@@ -29,7 +29,7 @@ from pages import machine, machine_line, read_data, table, write_data, write_pag
 from train_cases import CASES, HIDDEN, Case
 from train_learning import POLICY, RESULT, changed
 
-from concent_warp.cli.evaluate import Arguments, real_environment
+from concent_warp.cli.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
 
 NAME = "train_table1"
@@ -74,6 +74,8 @@ class Args:
     """Initial states of each seed."""
     hidden: str = HIDDEN
     """Effect that is hidden in the world of some cases."""
+    force: float = 1.0
+    """Share of the force that policies may exert, as of `concent evaluate`."""
     processes: int = 1
     table: bool = False
     """Write the page from what is there, without runs."""
@@ -100,7 +102,8 @@ def policy_folder(args: Args, case: str, seed: int) -> Path:
 def key(args: Args, case: str, seed: int) -> str:
     """Return the name under which the trial of a policy is kept."""
     settings = json.loads((policy_folder(args, case, seed).parent / RESULT).read_text())["settings"]
-    return f"{case} {args.stage} {seed} {changed(settings)}".strip()
+    gently = f"--force {args.force:g}" * (args.force < 1)
+    return " ".join(f"{case} {args.stage} {seed} {changed(settings)} {gently}".split())
 
 
 def reference(case: Case) -> str:
@@ -113,7 +116,8 @@ def trial(args: Args, name: str, seed: int) -> Row:
     quiet_warp()
     torch.set_num_threads(1)
     case, folder = CASES[name], policy_folder(args, name, seed)
-    run, judge = Run.load(folder), Run.load(policy_folder(args, reference(case), seed))
+    run = restrained(Run.load(folder), 1.0, args.force)
+    judge = Run.load(policy_folder(args, reference(case), seed))
     task, shown = run.task(), judge.task()
     states = judge.evaluation_states(shown, args.episodes, seed)
     # A model in which the demonstration does not get as far has fewer stages.
@@ -137,7 +141,7 @@ def trial(args: Args, name: str, seed: int) -> Row:
         "case": name, "seed": seed, "episodes": args.episodes, "successes": int(found.success.sum()),
         "outcomes": found.counts(), "stages": stages, "met": met, "hidden": list(hide),
         "simulation": result["simulation"], "trained": {k: result[k] for k in ("stage", "steps", "seconds", "worlds")},
-        "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]),
+        "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]), "force": args.force,
     }  # fmt: skip
 
 
@@ -181,15 +185,16 @@ def page(rows: Sequence[Row], stage: str) -> str:
     """Return the page."""
     title = "# Table 1 in the stand-in world" + (": all stages chained" if stage == "all" else "")
     parts = [title, "Written by `benchmarks/train_table1.py`; do not edit.", ABOUT]
-    for how, seconds in sorted({manner(row) for row in rows}):
-        parts.append(f"## {seconds} s of training with " + (f"`{how}`" if how else "the default settings"))
-        parts += section([row for row in rows if manner(row) == (how, seconds)])
+    for how, seconds, force in sorted({manner(row) for row in rows}):
+        gently = "" if force == 1 else f", run with `--force {force:g}`"
+        parts.append(f"## {seconds} s of training with " + (f"`{how}`" if how else "the default settings") + gently)
+        parts += section([row for row in rows if manner(row) == (how, seconds, force)])
     return "\n\n".join(parts)
 
 
-def manner(row: Row) -> tuple[str, int]:
-    """Return the settings with which a policy was trained, and for how long, to 10 s."""
-    return row.get("settings", ""), 10 * round(row["trained"]["seconds"] / 10)
+def manner(row: Row) -> tuple[str, int, float]:
+    """Return the settings with which a policy was trained, for how long, to 5 s, and with what force it was run."""
+    return row.get("settings", ""), 5 * round(row["trained"]["seconds"] / 5), row.get("force", 1.0)
 
 
 def titled(row: Row) -> str:

@@ -48,6 +48,9 @@ class Arguments:
     pace: float = 1.0
     """How large the steps of the robot's commands are, as a share of those that the policy was trained with: below 1 it
     moves more slowly, for as long an episode."""
+    force: float = 1.0
+    """How far commands may lead the joints, as a share of what the policy was trained with: with the stiffness of the
+    drives, the largest force that it exerts."""
     videos: int = 0
     """How many of the first episodes in the stand-in world to film, as MP4."""
     out: Path | None = None
@@ -74,8 +77,9 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
 
     if arguments.episodes < 1:
         raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
-    if not 0 < arguments.pace <= 1:
-        raise TrainError("the pace is not right", expected="more than 0, at most 1", found=arguments.pace)
+    for name, share in (("pace", arguments.pace), ("share of the force", arguments.force)):
+        if not 0 < share <= 1:
+            raise TrainError(f"the {name} is not right", expected="more than 0, at most 1", found=share)
     hidden = wanted(arguments.hide)
     if hidden and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
@@ -83,7 +87,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         raise TrainError("videos are of the stand-in world", fix="add --world reality")
     path = given_checkpoint(arguments.checkpoint, arguments.pretrained)
     films = video_files(arguments, Path() if arguments.checkpoint is None else path.parent)
-    made = paced(Run.load(path.parent), arguments.pace)
+    made = restrained(Run.load(path.parent), arguments.pace, arguments.force)
     task = made.task()
     states = made.evaluation_states(task, arguments.episodes, arguments.seed)
     torch.manual_seed(arguments.seed)
@@ -110,17 +114,18 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     if arguments.json:
         named = str(path) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
         document: dict[str, Any] = {"checkpoint": named, "seed": arguments.seed, "hidden": dict(hidden)}
-        document["pace"] = arguments.pace
+        document |= {"pace": arguments.pace, "force": arguments.force}
         document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
         print(json.dumps(document, indent=1, allow_nan=False))
     return found
 
 
-def paced(run: TrainedRun, pace: float) -> TrainedRun:
-    """Return a run whose actions take smaller steps."""
+def restrained(run: TrainedRun, pace: float, force: float) -> TrainedRun:
+    """Return a run whose actions take smaller steps, and whose commands lead the joints by less."""
     environment = run.cfg.environment
     action = environment.action
     action = replace(action, turn=pace * action.turn, slide=pace * action.slide, gripper=pace * action.gripper)
+    action = replace(action, turn_lead=force * action.turn_lead, slide_lead=force * action.slide_lead)
     return replace(run, cfg=replace(run.cfg, environment=replace(environment, action=action)))
 
 
