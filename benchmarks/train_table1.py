@@ -185,10 +185,13 @@ def page(rows: Sequence[Row], stage: str) -> str:
     """Return the page."""
     title = "# Table 1 in the stand-in world" + (": all stages chained" if stage == "all" else "")
     parts = [title, "Written by `benchmarks/train_table1.py`; do not edit.", ABOUT]
-    for how, seconds, force in sorted({manner(row) for row in rows}):
+    groups: dict[tuple[str, int, float], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(manner(row), []).append(row)
+    for (how, seconds, force), group in sorted(groups.items(), key=lambda one: (-len(one[1]), one[0])):
         gently = "" if force == 1 else f", run with `--force {force:g}`"
         parts.append(f"## {seconds} s of training with " + (f"`{how}`" if how else "the default settings") + gently)
-        parts += section([row for row in rows if manner(row) == (how, seconds, force)])
+        parts += section(group)
     return "\n\n".join(parts)
 
 

@@ -12,12 +12,22 @@ LARGEST = 1.0 - 1e-6
 """Magnitude to which actions are kept off the ends, where the squashing cannot be undone in single precision."""
 
 
+FARTHEST = 4.0
+"""Magnitude to which means of u are kept in training: tanh(4) is 0.9993. What a network answers to an observation far
+out of the ordinary may be in the hundreds; there a small update changes densities by more than single precision holds,
+and one such step of one world would end a training with losses that are not finite."""
+
+
 class SquashedGaussian(GaussianDistribution):
     """a = tanh(u), u normal: log p(a) = log N(u) - sum log(1 - tanh(u)^2).
 
     `mean`, `std`, `params` and the divergence are those of u; the divergence of two squashed Gaussians is that of the
     Gaussians, as tanh is one to one.
     """
+
+    def update(self, mlp_output: torch.Tensor) -> None:
+        """Take means (..., A) of u, kept within -4..4."""
+        super().update(mlp_output.clamp(-FARTHEST, FARTHEST))
 
     def sample(self) -> torch.Tensor:
         """Return actions, shape (..., A), strictly between -1 and 1."""

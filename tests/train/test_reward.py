@@ -109,3 +109,17 @@ def test_squashed_gaussian_is_the_density_of_its_samples():
     assert float(distribution.entropy.detach().mean()) == pytest.approx(entropy, abs=1e-2)
     exported = distribution.as_deterministic_output_module()(torch.tensor([0.4]))
     assert float(exported) == float(distribution.deterministic_output(torch.tensor([0.4])))
+
+
+@pytest.mark.parametrize("far", [20.0, 1e3, 1e6])
+def test_an_observation_out_of_the_ordinary_leaves_densities_and_divergence_finite(far):
+    torch.manual_seed(0)
+    distribution = SquashedGaussian(8, init_std=0.4, std_type="log")
+    distribution.update(torch.full((1000, 8), far))
+    actions, before = distribution.sample(), distribution.params
+    old = distribution.log_prob(actions)
+    distribution.update(torch.full((1000, 8), 0.9 * far, requires_grad=True))
+    ratio = (distribution.log_prob(actions) - old).exp()
+    assert ratio.isfinite().all()
+    assert float(ratio.detach().max()) < 10
+    assert float(distribution.kl_divergence(before, distribution.params).detach().max()) < 1

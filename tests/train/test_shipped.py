@@ -15,7 +15,7 @@ from concent_warp.train.shipped import FOLDER, ORIGIN, names, ship, shipped
 from several_processes import make_run
 
 from concent_warp.cli import main
-from concent_warp.cli.evaluate import paced
+from concent_warp.cli.evaluate import restrained
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +38,19 @@ def test_policy_that_comes_with_the_package_succeeds_on_a_cpu(tmp_path, capsys, 
     assert not list(tmp_path.iterdir())
 
 
-def test_policy_at_half_the_pace_takes_half_the_steps_of_the_commands(capsys):
+def test_policy_at_half_the_pace_and_force_takes_half_the_steps_and_leads_of_the_commands(capsys):
     options = ["evaluate", "--pretrained", "--episodes", "4", "--world", "simulation", "--device", "cpu", "--json"]
-    assert main([*options, "--pace", "0.5"]) == 0
+    assert main([*options, "--pace", "0.5", "--force", "0.5"]) == 0
     slow = json.loads(capsys.readouterr().out)
-    assert slow["pace"] == 0.5
+    assert (slow["pace"], slow["force"]) == (0.5, 0.5)
     assert slow["worlds"]["simulation"]["successes"] == 4
     run = Run.load(FOLDER / "shape_sorter")
-    np.testing.assert_allclose(paced(run, 0.5).task().robot.step, 0.5 * run.task().robot.step)
-    assert main([*options, "--pace", "1.5"]) != 0
-    assert "the pace is not right" in capsys.readouterr().err
+    robot, trained = restrained(run, 0.5, 0.4).task().robot, run.task().robot
+    np.testing.assert_allclose(robot.step, 0.5 * trained.step)
+    np.testing.assert_allclose(robot.lead, 0.4 * trained.lead)
+    for option, name in (("--pace", "pace"), ("--force", "share of the force")):
+        assert main([*options, option, "1.5"]) != 0
+        assert f"the {name} is not right" in capsys.readouterr().err
 
 
 def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
