@@ -8,7 +8,8 @@ def train_gpus(script):
 
 def row(gpus, worlds, rate, curve):
     facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
-    return {"gpus": gpus, "worlds": worlds, "seed": 0, "steps_per_second": rate, "curve": curve, "machine": facts}
+    measured = {"gpus": gpus, "worlds": worlds, "seed": 0, "steps_per_second": rate, "curve": curve}
+    return {**measured, "machine": facts, "options": ""}
 
 
 def test_page_sets_each_number_of_gpus_against_one(train_gpus):
@@ -19,3 +20,7 @@ def test_page_sets_each_number_of_gpus_against_one(train_gpus):
     text = train_gpus.page([two, one])
     assert "| 1 x 8 | 1,000 | 1.00 | 1 of 1 | 4.00 M | 4 s | 90.0% |" in text
     assert "| 2 x 8 | 1,900 | 1.90 | 0 of 1 | - | - | 60.0% |" in text
+    assert "default settings" in text
+    text = train_gpus.page([{**one, "options": "--environment.stride 2"}])
+    assert "`--environment.stride 2`" in text
+    assert "default settings" not in text
