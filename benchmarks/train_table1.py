@@ -206,14 +206,19 @@ def overview(groups: Sequence[tuple[tuple[str, int, float], Sequence[Row]]]) -> 
     for (how, seconds, force), group in groups:
         of = sorted((row for row in group if row["case"] == "ours"), key=lambda row: row["seed"])
         if of:
-            successes, episodes = sum(r["successes"] for r in of), sum(r["episodes"] for r in of)
-            low, high = wilson(successes, episodes)
-            name = f"`{how}`" if how else "default settings"
-            each = ", ".join(f"{r['seed']}: {r['successes'] / r['episodes']:.0%}" for r in of)
-            shares = [f"{successes / episodes:.1%}", f"{low:.1%} to {high:.1%}", each]
-            lines.append((-successes / episodes, [name, f"{seconds}", f"{force:g}", *shares]))
-    head = ["trained with", "seconds", "force", "succeed", "95 % interval", "seeds"]
+            share, shown = pooled(of)
+            lines.append((-share, [f"`{how}`" if how else "default settings", f"{seconds}", f"{force:g}", *shown]))
+    head = ["trained with", "seconds", "force", "succeed", "95 % interval", "episodes", "seeds"]
     return table(head, [line for _, line in sorted(lines)])
+
+
+def pooled(of: Sequence[Row]) -> tuple[float, list[str]]:
+    """Return the success of all policies of a case, and as a table shows it: with interval, counts and seeds."""
+    successes, episodes = sum(r["successes"] for r in of), sum(r["episodes"] for r in of)
+    low, high = wilson(successes, episodes)
+    each = ", ".join(f"{r['seed']}: {r['successes'] / r['episodes']:.0%}" for r in of)
+    share = successes / episodes
+    return share, [f"{share:.1%}", f"{low:.1%} to {high:.1%}", f"{successes} of {episodes}", each]
 
 
 def manner(row: Row) -> tuple[str, int, float]:
@@ -231,26 +236,20 @@ def section(rows: Sequence[Row]) -> list[str]:
     """Return what there is to say of policies that were trained in one way."""
     rows = sorted(rows, key=lambda row: (list(CASES).index(row["case"]), row["seed"]))
     lines = []
-    pooled: dict[str, float] = {}
+    found: dict[str, float] = {}
     for name in CASES:
         of = sorted((row for row in rows if row["case"] == name), key=lambda row: row["seed"])
         if of:
-            successes, episodes = sum(r["successes"] for r in of), sum(r["episodes"] for r in of)
-            low, high = wilson(successes, episodes)
-            pooled[titled(of[0])] = successes / episodes
+            found[titled(of[0])], shown = pooled(of)
             met = np.mean([np.mean(r["met"]) / r["stages"] for r in of])
             simulation = np.mean([r["simulation"]["rate"] for r in of])
-            each = ", ".join(f"{r['seed']}: {r['successes'] / r['episodes']:.0%}" for r in of)
-            lines.append([
-                titled(of[0]), f"{successes / episodes:.1%}", f"{low:.1%} to {high:.1%}", f"{successes} of {episodes}",
-                each, PAPER.get(name, ""), f"{met:.0%}", f"{simulation:.1%}",
-            ])  # fmt: skip
+            lines.append([titled(of[0]), *shown, PAPER.get(name, ""), f"{met:.0%}", f"{simulation:.1%}"])
     head = ["case", "succeed", "95 % interval", "episodes", "seeds", "paper", "targets met", "in simulation"]
     parts = [table(head, lines)]
     tried = {row["case"] for row in rows}
     absent = [case.title for name, case in CASES.items() if name not in tried]
-    if len(pooled) > 1:
-        order = " > ".join(sorted(pooled, key=lambda case: -pooled[case]))
+    if len(found) > 1:
+        order = " > ".join(sorted(found, key=lambda case: -found[case]))
         parts.append(f"In the order found: {order}." + f" Not tried yet: {'; '.join(absent)}." * bool(absent))
     parts.append("How the episodes ended, and what the policies were trained for:")
     parts.append(table(["case, seed", "outcomes", "stage", "steps", "seconds"], [ended(row) for row in rows]))

@@ -51,8 +51,10 @@ def test_expert_puts_the_block_into_the_hole_on_every_seed(shown):
         assert not held[-1]
 
 
-@pytest.mark.parametrize(("effect", "magnitude"), [("backlash", 0.005), ("joint_compliance", 0.003)])
-def test_expert_succeeds_where_gears_stand_in_for_the_drives_and_starts_at_rest(shown, effect, magnitude):
+@pytest.mark.parametrize(
+    ("effect", "magnitude"), [("backlash", 0.005), ("joint_compliance", 0.003), ("gravity_compensation", -0.2)]
+)
+def test_expert_succeeds_with_drives_that_are_not_as_drawn_and_starts_at_rest(shown, effect, magnitude):
     cfg, plain, _ = shown
     world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, ((effect, magnitude),))
     recording, truths = record(cfg, [0], effects=tuple(one.effect for one in world.hidden()))
@@ -61,7 +63,7 @@ def test_expert_succeeds_where_gears_stand_in_for_the_drives_and_starts_at_rest(
     for name, channel in plain.demonstrations[0].action.items():
         np.testing.assert_allclose(recording.demonstrations[0].action[name].value, channel.value, atol=1e-6)
     start, soon = truths[0].qpos[0], truths[0].qpos[np.searchsorted(truths[0].time, 0.05)]
-    assert np.abs(soon - start)[:7].max() < 2e-3
+    assert np.abs(soon - start)[:7].max() < 5e-4
 
 
 def test_seeds_give_different_demonstrations(shown):
