@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -31,8 +32,8 @@ from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 
 NAME = "train_gpus"
-LEARNT = 0.95
-"""Share of successful episodes, while exploring, from which the task counts as learnt."""
+MARKS = (0.25, 0.5, 0.9)
+"""Shares of successful episodes, while exploring, whose first time is told."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,18 @@ def measure(args: Args, out: Path) -> None:
     kept.close()
 
 
-def learnt(row: Row) -> tuple[int, float] | None:
-    """Return steps and seconds after which a training succeeded often, None where it never did."""
-    return next(((steps, seconds) for steps, seconds, success in row["curve"] if success >= LEARNT), None)
+def first(row: Row, mark: float) -> tuple[int, float] | None:
+    """Return steps and seconds after which a share of the episodes succeeded, None where it never did."""
+    return next(((steps, seconds) for steps, seconds, success in row["curve"] if success >= mark), None)
+
+
+def reached(rows: Sequence[Row], mark: float) -> str:
+    """Return when trainings reached a share of success, as a table shows it: medians of those that did."""
+    ends = [end for row in rows if (end := first(row, mark)) is not None]
+    if not ends:
+        return "-"
+    some = f" ({len(ends)} of {len(rows)})" if len(ends) < len(rows) else ""
+    return f"{median(end[0] for end in ends) / 1e6:.2f} M, {median(end[1] for end in ends):.0f} s{some}"
 
 
 def page(rows: list[Row]) -> str:
@@ -112,15 +122,13 @@ def page(rows: list[Row]) -> str:
     lines = []
     for (gpus, worlds), group in sorted(groups.items()):
         rate = median(row["steps_per_second"] for row in group)
-        ends = [end for row in group if (end := learnt(row)) is not None]
-        steps = f"{median(end[0] for end in ends) / 1e6:.2f} M" if ends else "-"
-        seconds = f"{median(end[1] for end in ends):.0f} s" if ends else "-"
         last = median(row["curve"][-1][2] for row in group)
         gain = f"{rate / base[0]:.2f}" if base else "-"
-        counted = f"{len(ends)} of {len(group)}"
-        lines.append([f"{gpus} x {worlds:,}", f"{rate:,.0f}", gain, counted, steps, seconds, f"{last:.1%}"])
+        times = [reached(group, mark) for mark in MARKS]
+        lines.append([f"{gpus} x {worlds:,}", f"{rate:,.0f}", gain, str(len(group)), *times, f"{last:.1%}"])
     options = " and ".join(sorted({f"`{row['options']}`" for row in rows if row["options"]})) or "default settings"
-    head = ("GPUs x worlds", "steps/s", "of one", f"reach {LEARNT:.0%}", "steps", "seconds", "in the end")
+    marks = [f"{mark:.0%} after" for mark in MARKS]
+    head = ["GPUs x worlds", "steps/s", "of one", "seeds", *marks, "in the end"]
     return f"""# Training on several GPUs
 
 Insertion stage of the shape sorter with the arm, `concent train` under torchrun, {options}; each GPU has
