@@ -38,6 +38,14 @@ def test_policy_that_comes_with_the_package_succeeds_on_a_cpu(tmp_path, capsys, 
     assert not list(tmp_path.iterdir())
 
 
+def test_whole_task_comes_with_the_package_too(capsys):
+    options = ["--episodes", "4", "--world", "simulation", "--device", "cpu", "--json"]
+    assert main(["evaluate", "--pretrained", "pick_align_insert", *options]) == 0
+    found = json.loads(capsys.readouterr().out)["worlds"]["simulation"]
+    assert found["successes"] == 4
+    assert [(one["stage"], one["episodes"]) for one in found["stages met"]] == [("pick", 4), ("align", 4), ("insert", 4)]
+
+
 def test_policy_at_half_the_pace_and_force_takes_half_the_steps_and_leads_of_the_commands(capsys):
     options = ["evaluate", "--pretrained", "--episodes", "4", "--world", "simulation", "--device", "cpu", "--json"]
     assert main([*options, "--pace", "0.5", "--force", "0.5"]) == 0
@@ -54,7 +62,7 @@ def test_policy_at_half_the_pace_and_force_takes_half_the_steps_and_leads_of_the
 
 
 def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
-    assert "shape_sorter" in names()
+    assert set(names()) == {"shape_sorter", "pick_align_insert"}
     for name in names():
         origin = tomllib.loads((FOLDER / name / ORIGIN).read_text())
         assert origin["command"].startswith(("concent train ", "torchrun "))
@@ -105,7 +113,7 @@ def test_folders_are_replaced_only_on_demand_and_only_such(folder, tmp_path, cap
     [
         ([], "either --checkpoint with a run folder or --pretrained, found neither"),
         (["--pretrained", "--checkpoint", "runs"], "found both"),
-        (["--pretrained", "dishwasher"], "no such policy comes with the package; expected one of ['shape_sorter'"),
+        (["--pretrained", "dishwasher"], "no such policy comes with the package; expected one of ['pick_align_insert'"),
     ],
 )
 def test_policy_that_is_not_told_apart_is_refused(options, sentence, capsys):
