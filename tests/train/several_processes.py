@@ -6,9 +6,12 @@ from pathlib import Path
 
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.ppo import Trainer
 from concent_warp.train.ranks import Ranks
+from concent_warp.train.resets import draw_states
 from concent_warp.train.run import Run, train
-from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+from concent_warp.train.worlds import make_environment
+from small_insertion import SETTINGS, make_demonstration, make_events, make_model, make_task
 
 from concent_warp.recording.recording import Recording
 
@@ -27,6 +30,42 @@ def rounds(run: Run, count: int) -> Run:
     return replace(run, cfg=replace(run.cfg, ppo=replace(PPO, iterations=count)))
 
 
+def updated(ranks: Ranks) -> dict[str, torch.Tensor]:
+    """Return the weights after an update from given steps of 4 worlds, shared among the processes.
+
+    All steps are one batch and nothing is drawn, so that it does not matter which process has which worlds.
+    """
+    count, steps = 4, 6
+    environment = replace(SETTINGS, worlds=count // ranks.count, reset=replace(SETTINGS.reset, states=8))
+    ppo = PpoCfg(steps=steps, hidden=(16,), epochs=3, batches=1, entropy=0.0)
+    task = make_task(environment)
+    worlds = make_environment(task, environment, draw_states(task, environment.reset, 0), device="cpu")
+    algorithm = Trainer(worlds, TrainCfg(environment=environment, ppo=ppo), None, ranks).algorithm
+    algorithm.train_mode()
+    observation = worlds.get_observations()
+    mine = slice(ranks.rank * worlds.num_envs, (ranks.rank + 1) * worlds.num_envs)
+    given = torch.Generator().manual_seed(0)
+    drawn = {
+        name: torch.randn(steps, count, width, generator=given)[:, mine]
+        for name, width in (
+            ("observation", observation["policy"].shape[1]), ("action", worlds.num_actions), ("returns", 1), ("gain", 1)
+        )
+    }  # fmt: skip
+    none = torch.zeros(worlds.num_envs)
+    with torch.inference_mode():
+        for seen, action in zip(drawn["observation"], drawn["action"].tanh(), strict=True):
+            observation["policy"] = seen.clone()
+            algorithm.act(observation)
+            algorithm.transition.actions = action.clone()
+            algorithm.transition.actions_log_prob = algorithm.actor.get_output_log_prob(action)
+            algorithm.process_env_step(observation, none, none, {})
+    algorithm.storage.returns = drawn["returns"].clone()
+    algorithm.storage.advantages = drawn["gain"].clone()
+    algorithm.update()
+    networks = {"actor": algorithm.actor, "critic": algorithm.critic}
+    return {f"{which}.{k}": v.clone() for which, network in networks.items() for k, v in network.state_dict().items()}
+
+
 def main(out: Path) -> None:
     ranks, run = Ranks.here(), make_run()
     with ranks.joined("cpu"):
@@ -34,6 +73,7 @@ def main(out: Path) -> None:
         assert last is not None
         weights = trainer.algorithm.save()["actor_state_dict"]
         torch.save({"weights": weights, "steps": last.steps, "log": last.log}, out / f"rank{ranks.rank}.pt")
+        torch.save(updated(ranks), out / f"updated{ranks.rank}.pt")
         train(rounds(run, 2), out / "parts", device="cpu", ranks=ranks)
         train(run, out / "parts", device="cpu", ranks=ranks, resume=True)
         try:

@@ -11,7 +11,7 @@ from concent_warp.train.cfg import TrainError
 from concent_warp.train.ppo import CHECKPOINT
 from concent_warp.train.ranks import Ranks
 from concent_warp.train.run import train
-from several_processes import make_run
+from several_processes import make_run, updated
 
 from concent_warp.cli import main
 
@@ -51,6 +51,13 @@ def test_each_process_has_worlds_of_its_own(trained):
     assert first.shape == second.shape
     difference = (first[:, None, :3] - second[None, :, :3]).abs().amax(dim=-1)
     assert difference.min() > 1e-6
+
+
+def test_update_is_that_of_one_process_with_the_worlds_of_both(trained):
+    alone, shared = updated(Ranks()), loaded(trained / "updated0.pt")
+    assert same(shared, loaded(trained / "updated1.pt"))
+    for name, value in alone.items():
+        torch.testing.assert_close(shared[name], value, rtol=1e-5, atol=1e-6)
 
 
 def test_policy_is_not_that_of_a_single_process(trained):

@@ -43,7 +43,7 @@ def test_whole_task_comes_with_the_package_too(capsys):
     assert main(["evaluate", "--pretrained", "pick_align_insert", *options]) == 0
     found = json.loads(capsys.readouterr().out)["worlds"]["simulation"]
     assert found["successes"] == 4
-    assert [(one["stage"], one["episodes"]) for one in found["stages met"]] == [("pick", 4), ("align", 4), ("insert", 4)]
+    assert found["stages met"] == [{"stage": stage, "episodes": 4} for stage in ("pick", "align", "insert")]
 
 
 def test_policy_at_half_the_pace_and_force_takes_half_the_steps_and_leads_of_the_commands(capsys):
