@@ -77,9 +77,6 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
 
     if arguments.episodes < 1:
         raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
-    for name, share in (("pace", arguments.pace), ("share of the force", arguments.force)):
-        if not 0 < share <= 1:
-            raise TrainError(f"the {name} is not right", expected="more than 0, at most 1", found=share)
     hidden = wanted(arguments.hide)
     if hidden and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
@@ -121,7 +118,14 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
 
 
 def restrained(run: TrainedRun, pace: float, force: float) -> TrainedRun:
-    """Return a run whose actions take smaller steps, and whose commands lead the joints by less."""
+    """Return a run whose actions take smaller steps, and whose commands lead the joints by less.
+
+    Raises:
+        TrainError: One of the shares is not above 0 and at most 1.
+    """
+    for name, share in (("pace", pace), ("share of the force", force)):
+        if not 0 < share <= 1:
+            raise TrainError(f"the {name} is not right", expected="more than 0, at most 1", found=share)
     environment = run.cfg.environment
     action = environment.action
     action = replace(action, turn=pace * action.turn, slide=pace * action.slide, gripper=pace * action.gripper)

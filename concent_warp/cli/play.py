@@ -46,6 +46,10 @@ class Arguments:
     """Where the policy acts: in the model that it was trained in, or in the stand-in world."""
     hide: tuple[str, ...] = ()
     """Effects to hide in the stand-in world, as for concent evaluate."""
+    pace: float = 1.0
+    """Share of the robot's pace in training, as for concent evaluate."""
+    force: float = 1.0
+    """Share of the force that the policy may exert, as for concent evaluate."""
     port: int = 8080
     """Port of the page; the next free one where it is taken."""
     host: str = "127.0.0.1"
@@ -102,7 +106,7 @@ def prepared(arguments: Arguments) -> tuple[Player, mujoco.MjModel]:
     if wanted(arguments.hide) and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")
     path = given_checkpoint(arguments.checkpoint, arguments.pretrained)
-    made = Run.load(path.parent)
+    made = evaluate.restrained(Run.load(path.parent), arguments.pace, arguments.force)
     task = made.task()
     states = made.evaluation_states(task, arguments.states, arguments.seed)
     torch.manual_seed(arguments.seed)
