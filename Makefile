@@ -29,7 +29,7 @@ check: .venv/installed-dev layout
 	$(BIN)/ruff check .
 	$(BIN)/pyright --project pyproject.toml
 	cd $(dir $(LAYOUT)) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-cache
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 format: .venv/installed-dev
 	$(BIN)/ruff format .
