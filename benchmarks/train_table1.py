@@ -9,7 +9,7 @@ The policies are those that `benchmarks/train_learning.py` trained, in simulatio
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -104,15 +104,26 @@ def policy_folder(args: Args, case: str, seed: int) -> Path:
 def key(args: Args, case: str, seed: int) -> str:
     """Return the name under which the trial of a policy is to be kept."""
     result = json.loads((policy_folder(args, case, seed).parent / RESULT).read_text())
-    row = {"settings": changed(result["settings"]), "trained": result, "force": args.force}
+    row = {
+        "settings": changed(result["settings"]),
+        "trained": result,
+        "force": args.force,
+        "hidden": hidden(args, case),
+    }
     return named({"case": case, "seed": seed, **row}, args.stage)
+
+
+def hidden(args: Args, case: str) -> list[str]:
+    """Return what is hidden in the world of a case."""
+    return [args.hidden] if CASES[case].world == "hidden" else []
 
 
 def named(row: Row, stage: str) -> str:
     """Return the name under which a trial is kept."""
     how, seconds, force = manner(row)
     gently = f"--force {force:g}" * (force < 1)
-    return " ".join(f"{row['case']} {stage} {row['seed']} {seconds} s {how} {gently}".split())
+    without = " ".join(["hiding", *row["hidden"]]) if row.get("hidden") else ""
+    return " ".join(f"{row['case']} {stage} {row['seed']} {seconds} s {how} {gently} {without}".split())
 
 
 def reference(case: Case) -> str:
@@ -132,10 +143,10 @@ def trial(args: Args, name: str, seed: int) -> Row:
     # A model in which the demonstration does not get as far has fewer stages.
     starts = replace(states, stage=np.clip(states.stage, task.first, task.stage))
     torch.manual_seed(seed)
-    hide = (args.hidden,) if case.world == "hidden" else ()
+    hide = hidden(args, name)
     # Each model has contact points of its own to tell a lost block by; here its place at the end tells.
     cfg = replace(run.cfg.environment, worlds=min(args.episodes, 32), engine="mujoco", dropped=0.05)
-    environment = real_environment(task, cfg, starts, Arguments(checkpoint=folder, hide=hide))
+    environment = real_environment(task, cfg, starts, Arguments(checkpoint=folder, hide=tuple(hide)))
     trainer = Trainer(environment, run.cfg)
     trainer.algorithm.load(load_checkpoint(folder / CHECKPOINT), {"actor": True}, True)
     watcher = Watcher(args.episodes)
@@ -148,7 +159,7 @@ def trial(args: Args, name: str, seed: int) -> Row:
     result = json.loads((folder.parent / RESULT).read_text())
     return {
         "case": name, "seed": seed, "episodes": args.episodes, "successes": int(found.success.sum()),
-        "outcomes": found.counts(), "stages": stages, "met": met, "hidden": list(hide),
+        "outcomes": found.counts(), "stages": stages, "met": met, "hidden": hide,
         "simulation": result["simulation"], "trained": {k: result[k] for k in ("stage", "steps", "seconds", "worlds")},
         "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]),
         "force": args.force,
@@ -200,6 +211,8 @@ def page(rows: Sequence[Row], stage: str) -> str:
         groups.setdefault(manner(row), []).append(row)
     ordered = sorted(groups.items(), key=lambda one: (-len(one[1]), one[0]))
     parts += ["## Ours at a glance", overview(ordered)]
+    if any(row.get("hidden") for row in rows):
+        parts += ["## With an effect hidden, at a glance", overview_of_hidden(ordered)]
     compared = [one for one in ordered if len({row["case"] for row in one[1]}) > 1]
     for what, name in (("Trials", "machine"), ("Policies", "trained_on")):
         parts += [f"{what}: {line}" for line in dict.fromkeys(machine_line(row[name]) for row in rows)]
@@ -225,6 +238,26 @@ def overview(groups: Sequence[tuple[tuple[str, int, float], Sequence[Row]]]) -> 
             lines.append(((len(of) < 3, -share), [name, f"{seconds}", f"{force:g}", *shown, f"{targets(of):.0%}"]))
     head = ["trained with", "seconds", "force", "succeed", "95 % interval", "episodes", "seeds", "targets met"]
     return table(head, [line for _, line in sorted(lines)])
+
+
+def overview_of_hidden(groups: Sequence[tuple[tuple[str, int, float], Sequence[Row]]]) -> str:
+    """Return a table of the cases with an effect hidden, by the effect and by the ways of training and running."""
+    lines = []
+    for (how, seconds, force), group in groups:
+        for title, of in by_title(row for row in group if row.get("hidden")).items():
+            name = f"`{how}`" if how else "default settings"
+            order = (of[0]["hidden"], how, seconds, force, list(CASES).index(of[0]["case"]))
+            lines.append((order, [title, name, f"{seconds}", f"{force:g}", *pooled(of)[1]]))
+    head = ["case", "trained with", "seconds", "force", "succeed", "95 % interval", "episodes", "seeds"]
+    return table(head, [line for _, line in sorted(lines)])
+
+
+def by_title(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return the rows of each case and of what is hidden in it, in the order of cases and seeds."""
+    found: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda row: (list(CASES).index(row["case"]), row.get("hidden", []), row["seed"])):
+        found.setdefault(titled(row), []).append(row)
+    return found
 
 
 def pooled(of: Sequence[Row]) -> tuple[float, list[str]]:
@@ -254,25 +287,34 @@ def titled(row: Row) -> str:
 
 def section(rows: Sequence[Row]) -> list[str]:
     """Return what there is to say of policies that were trained in one way."""
-    rows = sorted(rows, key=lambda row: (list(CASES).index(row["case"]), row["seed"]))
-    lines = []
-    found: dict[str, float] = {}
-    for name in CASES:
-        of = sorted((row for row in rows if row["case"] == name), key=lambda row: row["seed"])
-        if of:
-            found[titled(of[0])], shown = pooled(of)
-            simulation = np.mean([r["simulation"]["rate"] for r in of])
-            lines.append([titled(of[0]), *shown, PAPER.get(name, ""), f"{targets(of):.0%}", f"{simulation:.1%}"])
+    groups, lines = by_title(rows), []
+    for title, of in groups.items():
+        simulation = np.mean([r["simulation"]["rate"] for r in of])
+        lines.append([title, *pooled(of)[1], PAPER.get(of[0]["case"], ""), f"{targets(of):.0%}", f"{simulation:.1%}"])
     head = ["case", "succeed", "95 % interval", "episodes", "seeds", "paper", "targets met", "in simulation"]
     parts = [table(head, lines)]
     tried = {row["case"] for row in rows}
     absent = [case.title for name, case in CASES.items() if name not in tried]
-    if len(found) > 1:
-        order = " > ".join(sorted(found, key=lambda case: -found[case]))
-        parts.append(f"In the order found: {order}." + f" Not tried yet: {'; '.join(absent)}." * bool(absent))
+    for what in sorted({tuple(row.get("hidden", ())) for row in rows}):
+        ordered = order([of for of in groups.values() if tuple(of[0].get("hidden", ())) == what])
+        parts += [ordered] if ordered else []
+    if absent:
+        parts.append(f"Not tried: {'; '.join(absent)}.")
     parts.append("How the episodes ended, and what the policies were trained for:")
-    parts.append(table(["case, seed", "outcomes", "stage", "steps", "seconds"], [ended(row) for row in rows]))
+    parts.append(
+        table(["case, seed", "outcomes", "stage", "steps", "seconds"], [ended(r) for of in groups.values() for r in of])
+    )
     return parts
+
+
+def order(groups: Sequence[Sequence[Row]]) -> str:
+    """Return a sentence on the order of cases of a world, by the seeds that all of them have; empty without such."""
+    seeds = set.intersection(*({row["seed"] for row in of} for of in groups)) if len(groups) > 1 else set()
+    if not seeds:
+        return ""
+    found = {titled(of[0]): pooled([row for row in of if row["seed"] in seeds])[0] for of in groups}
+    text = " > ".join(f"{case}, {found[case]:.1%}" for case in sorted(found, key=lambda case: -found[case]))
+    return f"In the order found, on the seeds that all have ({', '.join(map(str, sorted(seeds)))}): {text}."
 
 
 def ended(row: Row) -> list[str]:
