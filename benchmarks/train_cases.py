@@ -29,10 +29,10 @@ from concent_warp.recording.recording import Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 
-HIDDEN = "joint_compliance=0.004"
-"""What is hidden in the stand-in world of some cases: gears that give way, by 4 mrad under 1 N m in the strongest drive
-and by more in weaker ones. Demonstrations still succeed under it, policies that do not know of it fail more often."""
-MODEL, DEMONSTRATION = "model.toml", "demonstration.h5"
+HIDDEN = "actuator_delay=0.1"
+"""What is hidden in the stand-in world of some cases: commands that act a tenth of a second late. Demonstrations still
+succeed under it, policies that do not know of it fail more often."""
+MODEL, DEMONSTRATION, WORLD = "model.toml", "demonstration.h5", "hidden.txt"
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,14 @@ def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
 def make(case: Case, seed: int, args: Args) -> None:
     """Make model and demonstration of a case, in one piece or not at all."""
     folder = args.out / "models" / case.material(seed)
+    hidden = args.hidden if case.world == "hidden" else ""
     if folder.exists():
+        made = folder / WORLD
+        if made.is_file() and made.read_text() != hidden:
+            raise SystemExit(f"{folder}: was made with {made.read_text()} hidden, not {hidden}; give another --out")
         return
     quiet_warp()
-    recording = demonstrate(seed, (args.hidden,) if case.world == "hidden" else ())
+    recording = demonstrate(seed, (hidden,) if hidden else ())
     scene = Scene(recording.scene)
     placement = "surface" if case.geometry == "surface" else "inset"
     model = Model(scene, ContactGeometryCfg(count=args.spheres, placement=placement, seed=seed).build(scene))
@@ -115,6 +119,7 @@ def make(case: Case, seed: int, args: Args) -> None:
     model.save(partial / MODEL)
     slim = replace(recording[0], image={})
     write_hdf5(replace(recording, demonstrations=(slim,)), partial / DEMONSTRATION)
+    (partial / WORLD).write_text(hidden)
     partial.rename(folder)
     print(f"made {folder.name}", flush=True)
 

@@ -18,7 +18,7 @@ from concent_warp.diagnose.candidates import candidates
 from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
 from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
-from concent_warp.diagnose.diagnosis import VERDICTS, Diagnosis, Finding
+from concent_warp.diagnose.diagnosis import Diagnosis, Finding
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.fit.effects import fit_effects
 from concent_warp.model import Model
@@ -158,7 +158,7 @@ def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagn
 
 def say_diagnosis(found: Diagnosis) -> None:
     """Write the verdict in sentences, where the model fails, and the table of effects."""
-    say(f"[bold]{escape(VERDICTS[found.verdict].capitalize())}[/bold]")
+    say(f"[bold]{escape(found.headline.capitalize())}[/bold]")
     for sentence in found.sentences():
         say(escape(sentence))
     places = [str(place["sentence"]) for place in found.where if place.get("sentence")]

@@ -171,6 +171,14 @@ class Diagnosis:
         """The effects that were accepted, in the order of their addition."""
         return tuple(f for f in self.effects if f.accepted)
 
+    @property
+    def headline(self) -> str:
+        """The verdict in words, which also tells of effects that were found beside what none explains."""
+        if self.verdict == "none_of_these" and self.accepted:
+            found = "effects are" if len(self.accepted) > 1 else "an effect is"
+            return f"{found} missing, and besides something that no effect in the library explains"
+        return VERDICTS[self.verdict]
+
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis in plain types, as documented in ``docs/diagnose.md``."""
         return {

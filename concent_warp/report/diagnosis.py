@@ -80,6 +80,12 @@ def headline(diagnosis: Mapping[str, Any]) -> str:
             return f"The model lacks something, and the data cannot tell whether it is {names}.{left}"
         case "none_needed":
             return "No discrepancy was detected: the model explains the measurements down to their noise."
+        case "none_of_these" if any(accepted(e) for e in effects):
+            groups = diagnosis.get("groups") or []
+            alike = [next((g for g in groups if e["name"] in g), [str(e["name"])]) for e in best]
+            names = listed([listed([words(name) for name in group], "or") for group in alike])
+            besides = "besides something that none of the effects in the library explains"
+            return f"The model lacks {names}, and {besides}. {gain_sentence(best)}{left}"
         case "none_of_these":
             return f"The model lacks something that none of the effects in the library explains.{left}"
     return f"The diagnosis ended with “{diagnosis.get('verdict')}”.{left}"

@@ -77,6 +77,15 @@ def test_what_no_effect_explains_is_said_with_its_share():
     assert said[-1] == "Next: swing faster"
 
 
+def test_the_headline_tells_of_effects_beside_what_none_explains():
+    assert diagnosis().headline == VERDICTS["effect"]
+    assert diagnosis(verdict="none_of_these", effects=()).headline == VERDICTS["none_of_these"]
+    partly = diagnosis(verdict="none_of_these").headline
+    assert partly == "an effect is missing, and besides something that no effect in the library explains"
+    both = (finding("joint_friction", 0.8), finding("mass", 0.2, step=1))
+    assert diagnosis(verdict="none_of_these", effects=both).headline.startswith("effects are missing, and besides")
+
+
 def test_doubts_about_the_data_come_first():
     assert diagnosis(issues=("a gap of 1 s.",)).sentences()[0] == "a gap of 1 s."
 
