@@ -132,9 +132,9 @@ def main(args: Args) -> None:
     if not args.table:
         done = set() if args.again else set(read_data(NAME).get("rows", {}))
         known = {c.name: c for c in cases()}
-        todo = [name for name in args.names if name not in done]
-        work = Parallel(n_jobs=args.jobs, return_as="generator")(delayed(synthetic)(known[name]) for name in todo)
-        for name, row in zip(todo, work, strict=True):
+        pending = [name for name in args.names if name not in done]
+        work = Parallel(n_jobs=args.jobs, return_as="generator")(delayed(synthetic)(known[name]) for name in pending)
+        for name, row in zip(pending, work, strict=True):
             assert row is not None
             keep(name, row)
         for name, case in real_cases(args).items() if args.real else ():

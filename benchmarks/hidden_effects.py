@@ -70,15 +70,15 @@ def main(args: Args) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     chosen = [c for c in cases() if wanted(c, args)]
     if not args.report:
-        todo = [replace(c, seed=c.seed + args.shift) for c in chosen if not path(args.out, c).is_file()]
-        random.Random(0).shuffle(todo)  # so that what is done when it is stopped is a fair part of the whole
+        pending = [replace(c, seed=c.seed + args.shift) for c in chosen if not path(args.out, c).is_file()]
+        random.Random(0).shuffle(pending)  # so that what is done when it is stopped is a fair part of the whole
         begun = time.monotonic()
         with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
-            futures = {pool.submit(study, case, args.out, args.each): case for case in todo}
+            futures = {pool.submit(study, case, args.out, args.each): case for case in pending}
             for k, future in enumerate(as_completed(futures)):
                 result = future.result()
-                left = (time.monotonic() - begun) * (len(todo) - k - 1) / (k + 1)
-                print(f"{k + 1:3d}/{len(todo)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
+                left = (time.monotonic() - begun) * (len(pending) - k - 1) / (k + 1)
+                print(f"{k + 1:3d}/{len(pending)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
     rows = [json.loads(path(args.out, c).read_text()) for c in chosen if path(args.out, c).is_file()]
     if args.report or not (args.rigs or args.effects or args.names or args.shift != SHIFT or len(args.kinds) < 4):
         write = write_again if args.again else write_report

@@ -9,7 +9,9 @@ a physical effect is hidden in that world. What is made already is not made agai
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -94,9 +96,6 @@ def make(case: Case, seed: int, args: Args) -> None:
     folder = args.out / "models" / case.material(seed)
     hidden = args.hidden if case.world == "hidden" else ""
     if folder.exists():
-        made = folder / WORLD
-        if made.is_file() and made.read_text() != hidden:
-            raise SystemExit(f"{folder}: was made with {made.read_text()} hidden, not {hidden}; give another --out")
         return
     quiet_warp()
     recording = demonstrate(seed, (hidden,) if hidden else ())
@@ -130,9 +129,18 @@ def material(out: Path, case: Case, seed: int) -> tuple[Model, Recording]:
     return Model.load(folder / MODEL), load_recording(folder / DEMONSTRATION)
 
 
+def same_world(out: Path, cases: Iterable[str], seeds: Iterable[int], hidden: str) -> None:
+    """End with a sentence where models of these cases were made with something else hidden; older ones do not say."""
+    for case, seed in product((CASES[name] for name in cases), seeds):
+        made = out / "models" / case.material(seed) / WORLD
+        if case.world == "hidden" and made.is_file() and made.read_text() != hidden:
+            raise SystemExit(f"{made}: the model was made with {made.read_text()} hidden, not {hidden}; pass --hidden")
+
+
 def main() -> None:
     """Make all that is asked for."""
     args = tyro.cli(Args, description=__doc__)
+    same_world(args.out, args.cases, args.seeds, args.hidden)
     wanted_ = {CASES[name].material(seed): (CASES[name], seed) for name in args.cases for seed in args.seeds}
     Parallel(n_jobs=args.processes)(delayed(make)(case, seed, args) for case, seed in wanted_.values())
 

@@ -38,9 +38,9 @@ all spheres in the physics (FULL). Actions are random.
 
 A batched engine has room for so many contacts and no more. *fixed* is FULL with VCP's buffers: what finds no room is
 dropped, and the states are wrong though finite. *fitting* is FULL with buffers found by doubling those that were too
-small until no step of no world dropped anything. Dropped are the world's steps in which something was; diverged the
-worlds whose state was not finite or beyond all bounds, of the episodes that ended. Memory is what the environment took,
-its graphs included, beyond one of 16 worlds.
+small until no step of no world dropped anything in a run of its own; in the run that is timed a few may still. Dropped
+are the world's steps in which something was; diverged the worlds whose state was not finite or beyond all bounds, of
+the episodes that ended. Memory is what the environment took, its graphs included, beyond one of 16 worlds.
 """
 
 

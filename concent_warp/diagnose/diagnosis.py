@@ -173,10 +173,9 @@ class Diagnosis:
 
     @property
     def headline(self) -> str:
-        """The verdict in words, which also tells of effects that were found beside what none explains."""
+        """The verdict in words; where effects were accepted and more is left, it says both, not that they are right."""
         if self.verdict == "none_of_these" and self.accepted:
-            found = "effects are" if len(self.accepted) > 1 else "an effect is"
-            return f"{found} missing, and besides something that no effect in the library explains"
+            return "the library explains a part; something is missing that no effect in it explains"
         return VERDICTS[self.verdict]
 
     def to_json(self) -> dict[str, Any]:

@@ -150,10 +150,10 @@ def looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list
     """Look around a fit, farther where need be; stop where a lower cost is found."""
     seen: list[Look] = []
     for _ in range(1 + EXTENSIONS):
-        todo = ways(base, c, seen)
-        if not todo:
+        untried = ways(base, c, seen)
+        if not untried:
             break
-        seen += all_of(look, [(base, c, *way) for way in todo])
+        seen += all_of(look, [(base, c, *way) for way in untried])
         if min(s.cost for s in seen) < c.fit.cost - worth:
             break
     return seen

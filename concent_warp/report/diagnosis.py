@@ -84,8 +84,8 @@ def headline(diagnosis: Mapping[str, Any]) -> str:
             groups = diagnosis.get("groups") or []
             alike = [next((g for g in groups if e["name"] in g), [str(e["name"])]) for e in best]
             names = listed([listed([words(name) for name in group], "or") for group in alike])
-            besides = "besides something that none of the effects in the library explains"
-            return f"The model lacks {names}, and {besides}. {gain_sentence(best)}{left}"
+            lacks = "The model lacks something that none of the effects in the library explains"
+            return f"{lacks}, beside what {names} can account for. {gain_sentence(best)}{left}"
         case "none_of_these":
             return f"The model lacks something that none of the effects in the library explains.{left}"
     return f"The diagnosis ended with “{diagnosis.get('verdict')}”.{left}"
