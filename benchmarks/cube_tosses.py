@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from concent_warp.fit.target import BodyTarget, Segment, measured_pose, observed_poses, whole
 from concent_warp.fit.windows import Measured, windows
 from concent_warp.model import Model
-from concent_warp.recording.contactnets import EDGE
+from concent_warp.recording.formats.contactnets import EDGE
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.contact_geometry import ContactGeometry

@@ -42,8 +42,8 @@ from concent_warp.fit.least_squares import FitCfg, Solver
 from concent_warp.fit.observation import Window
 from concent_warp.fit.prediction import Prediction
 from concent_warp.model import Model
-from concent_warp.recording.bam import DRIVE, JOINT, SENSOR, read_bam
-from concent_warp.recording.contactnets import read_contactnets
+from concent_warp.recording.formats.bam import DRIVE, JOINT, SENSOR, read_bam
+from concent_warp.recording.formats.contactnets import read_contactnets
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 

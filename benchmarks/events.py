@@ -26,7 +26,7 @@ from concent_warp.events.sequence import ContactEventSequence, Stage
 from concent_warp.ground import contact_overlap, extract_all
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg

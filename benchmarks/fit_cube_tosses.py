@@ -33,7 +33,7 @@ from scipy import stats
 
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, fit_geometry
-from concent_warp.recording.contactnets import EDGE, FRICTION, read_contactnets
+from concent_warp.recording.formats.contactnets import EDGE, FRICTION, read_contactnets
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data" / "contactnets_cube"

@@ -33,7 +33,7 @@ from concent_warp.cli.terminal import quiet_warp
 from concent_warp.fit.geometry import FitCfg, Search, cut
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene

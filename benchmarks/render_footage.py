@@ -23,7 +23,7 @@ from concent_warp.reality.footage import FootageCfg, developed
 from concent_warp.reality.laboratory import light
 from concent_warp.reality.photographs import PhotographsCfg, photographs
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.recording.hdf5 import read_hdf5, write_hdf5
+from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
 
 CAMERAS = ("base", "wrist")

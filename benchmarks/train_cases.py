@@ -25,7 +25,7 @@ from concent_warp.fit.geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
 from concent_warp.reality.hidden_in_task import TaskWorld, wanted
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.build_geometry import ContactGeometryCfg

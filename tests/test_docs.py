@@ -14,7 +14,7 @@ import tyro
 
 from concent_warp.cli.entry import COMMANDS
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

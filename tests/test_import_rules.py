@@ -50,7 +50,7 @@ def test_package_keeps_the_rules(tree):
         ("kernels.chamfer", "model"),
         ("errors", "kernels"),
         ("scene.scene", "model"),
-        ("recording.hdf5", "simulate.replay"),
+        ("recording.formats.hdf5", "simulate.replay"),
         ("model", "simulate.engine"),
         ("simulate.replay", "events.extract"),
         ("fit.geometry", "report.report"),

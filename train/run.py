@@ -15,7 +15,7 @@ from concent_warp.train.worlds import make_environment
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
+from concent_warp.perception.rigid_motion import kabsch
 from concent_warp.recording.recording import Channel, Demonstration
-from concent_warp.recording.rigid import kabsch
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.replay import commands, initial_state, step_count
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from concent_warp.recording.pinhole import Pinhole
+from concent_warp.perception.pinhole import Pinhole
+from concent_warp.perception.visible_region import cast
 from concent_warp.recording.recording import Channel
-from concent_warp.recording.region import cast
 from concent_warp.scene.scene import Scene
 
 SLACK = 2e-3

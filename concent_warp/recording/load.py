@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.bam import read_bam
-from concent_warp.recording.contactnets import read_contactnets
-from concent_warp.recording.csv import read_csv
-from concent_warp.recording.hdf5 import read_hdf5
+from concent_warp.recording.formats.bam import read_bam
+from concent_warp.recording.formats.contactnets import read_contactnets
+from concent_warp.recording.formats.csv import read_csv
+from concent_warp.recording.formats.hdf5 import read_hdf5
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 

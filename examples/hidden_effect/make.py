@@ -17,7 +17,7 @@ from concent_warp.reality.hidden import hidden
 from concent_warp.reality.rig import Trial, record_rig
 from concent_warp.reality.rig_pendulum import PENDULUM
 from concent_warp.reality.signals import glide, hold, joined, sweep
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 
 FRICTION = 0.03
 """What the drawing lacks [N m]."""

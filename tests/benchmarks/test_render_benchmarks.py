@@ -5,7 +5,7 @@ import pytest
 import torch
 from concent_warp.render.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from tests.render import small_arm
 from tests.render.test_networks import pairs
 

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 
 XML = """

@@ -3,7 +3,7 @@ import pytest
 from concent_warp.cli import main
 from concent_warp.effects.registry import effects
 from concent_warp.model import Model
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from tests.cli.conftest import XML
 from tests.fit.swinging import DAMPING, swung

@@ -8,7 +8,7 @@ import pytest
 from concent_warp.cli import main
 from concent_warp.diagnose.diagnosis import Diagnosis
 from concent_warp.model import Model
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel
 from tests.fit.swinging import DAMPING, NOISE, swing_scene, swung
 

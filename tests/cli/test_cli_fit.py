@@ -11,7 +11,7 @@ from concent_warp.errors import ConcentError
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.fit.geometry import Search
 from concent_warp.model import Model
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 
 SMALL = ["--count", "60", "--radius", "0.008", "--fit.generations", "3", "--fit.evolution.population", "4"]

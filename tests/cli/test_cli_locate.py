@@ -3,7 +3,7 @@ import json
 import numpy as np
 
 from concent_warp.cli import main
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from tests.diagnose.locate_scenes import swing, throw
 
 

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from concent_warp.perception.pinhole import Pinhole, pixel_grid
 from concent_warp.reality.camera import edges, film
 from concent_warp.reality.sensing import SLACK, SensingCfg, seen
-from concent_warp.recording.pinhole import Pinhole, pixel_grid
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 SCENE = ShapeSorterCfg().build()

@@ -11,7 +11,7 @@ from concent_warp.reality.hidden_in_task import TaskWorld
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.recording.recording import Demonstration
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
 SHIFT = np.array([0.005, 0.0, 0.0])

@@ -11,7 +11,7 @@ from concent_warp.reality.instruments import Instrument
 from concent_warp.reality.rig import perform, record_rig
 from concent_warp.reality.rigs import RIGS
 from concent_warp.recording.recording import Recording
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 
 QUICK = ("pendulum", "drop", "tumble", "spin", "push")
 

@@ -6,7 +6,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
-from concent_warp.recording.bam import JOINT, SENSOR, TICK, read_bam
+from concent_warp.recording.formats.bam import JOINT, SENSOR, TICK, read_bam
 from concent_warp.recording.load import load_recording
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.engine import Variants

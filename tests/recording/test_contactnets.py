@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.contactnets import EDGE, INERTIA, MASS, PERIOD, read_contactnets, toss_scene
+from concent_warp.recording.formats.contactnets import EDGE, INERTIA, MASS, PERIOD, read_contactnets, toss_scene
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "contactnets_cube"
 torch = pytest.importorskip("torch")

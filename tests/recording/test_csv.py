@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.csv import read_csv
+from concent_warp.recording.formats.csv import read_csv
 
 
 @pytest.fixture

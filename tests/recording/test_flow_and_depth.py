@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from concent_warp.recording.flow import corners, depth_at, follow, grey, shrunk
-from concent_warp.recording.pinhole import Pinhole, pixel_grid
-from concent_warp.recording.region import BodyShape, shown
+from concent_warp.perception.optical_flow import corners, depth_at, follow, grey, shrunk
+from concent_warp.perception.pinhole import Pinhole, pixel_grid
+from concent_warp.perception.visible_region import BodyShape, shown
 
 K = np.array([[300.0, 0, 79.5], [0, 300.0, 59.5], [0, 0, 1]])
 HEIGHT, WIDTH = 120, 160

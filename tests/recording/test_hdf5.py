@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording import hdf5
-from concent_warp.recording.hdf5 import read_hdf5, write_hdf5
+from concent_warp.recording.formats import hdf5
+from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
 
 
@@ -133,7 +133,7 @@ def test_a_killed_write_leaves_the_old_file(path):
     script = f"""
         import os, signal
         from pathlib import Path
-        from concent_warp.recording import hdf5
+        from concent_warp.recording.formats import hdf5
         recording = hdf5.read_hdf5(Path({str(path)!r}))
         hdf5.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
         hdf5.write_hdf5(recording, Path({str(path)!r}))

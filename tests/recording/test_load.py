@@ -3,8 +3,8 @@ import os
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.contactnets import read_contactnets
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.contactnets import read_contactnets
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 
 

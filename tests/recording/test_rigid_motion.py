@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from concent_warp.recording.rigid import consensus, inverse, kabsch, moved
+from concent_warp.perception.rigid_motion import consensus, inverse, kabsch, moved
 
 RNG = np.random.default_rng(0)
 

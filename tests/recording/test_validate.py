@@ -5,7 +5,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 
 
 def edited(recording: Recording, kind: str, name: str, **changes) -> Recording:

@@ -18,7 +18,7 @@ from small_insertion import SETTINGS, make_demonstration, make_model
 
 from concent_warp.cli import main
 from concent_warp.events.extract import extract
-from concent_warp.recording.hdf5 import write_hdf5
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 

@@ -23,7 +23,7 @@ from concent_warp.errors import RecordingError, SceneError
 from concent_warp.recording.bounds import MAX_BYTES, MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
 from concent_warp.recording.naming import PREFIX, by_number, name_of
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
 SCENE = "scene.xml"

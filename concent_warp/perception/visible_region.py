@@ -7,8 +7,8 @@ import copy
 import mujoco
 import numpy as np
 
-from concent_warp.recording.pinhole import Pinhole, pixel_grid
-from concent_warp.recording.rigid import inverse, moved
+from concent_warp.perception.pinhole import Pinhole, pixel_grid
+from concent_warp.perception.rigid_motion import inverse, moved
 
 OWN = 5
 """Geom group that the body's geoms are put into, so that rays meet no others."""

@@ -6,7 +6,7 @@ import math
 from xml.etree import ElementTree
 
 from concent_warp.recording.bounds import MAX_SCENE_BYTES, MAX_SCENE_COPIES
-from concent_warp.recording.place import Place
+from concent_warp.recording.validation.location import Place
 
 FREE_TEXT = ("name", "class", "data")
 """Attributes that hold words, so that ``nan`` is not a number in them."""

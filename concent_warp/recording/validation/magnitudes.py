@@ -16,7 +16,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.recording.place import Place
+from concent_warp.recording.validation.location import Place
 
 FAR = 20.0
 """Distance [m] that is never refused."""

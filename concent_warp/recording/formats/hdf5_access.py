@@ -26,7 +26,7 @@ from concent_warp.recording.bounds import (
     MAX_SCENE_BYTES,
     MAX_TEXT_BYTES,
 )
-from concent_warp.recording.hdf5_heap import memory_bound
+from concent_warp.recording.formats.hdf5_heap import memory_bound
 
 KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
 """Compression and checksums that come with h5py."""

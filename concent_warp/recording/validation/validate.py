@@ -15,13 +15,18 @@ import numpy as np
 
 from concent_warp.errors import SceneError
 from concent_warp.recording.bounds import MAX_MAGNITUDE, MAX_SAMPLES
-from concent_warp.recording.clocks import check_clocks
-from concent_warp.recording.images import check_image
-from concent_warp.recording.magnitudes import check_command, check_lengths, check_measurement, check_positions
 from concent_warp.recording.naming import PREFIX
-from concent_warp.recording.place import Place
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
-from concent_warp.recording.scene_text import check_scene_text
+from concent_warp.recording.validation.clocks import check_clocks
+from concent_warp.recording.validation.images import check_image
+from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.magnitudes import (
+    check_command,
+    check_lengths,
+    check_measurement,
+    check_positions,
+)
+from concent_warp.recording.validation.scene_text import check_scene_text
 from concent_warp.scene.scene import Scene
 
 QUATERNION_TOLERANCE = 0.05

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.recording.bounds import MAX_MAGNITUDE
-from concent_warp.recording.magnitudes import check_lengths
-from concent_warp.recording.place import Place
 from concent_warp.recording.recording import ImageStream
+from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.magnitudes import check_lengths
 
 ROTATION_TOLERANCE = 1e-3
 """How far from the unit matrix R R^T may be: calibrations are printed with four digits and more."""

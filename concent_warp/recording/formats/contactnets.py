@@ -18,7 +18,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.recording.bounds import MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
 from concent_warp.recording.naming import PREFIX, by_number
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 
 if TYPE_CHECKING:
     import torch

@@ -15,11 +15,11 @@ import numpy as np
 
 from concent_warp.errors import RecordingError, SceneError
 from concent_warp.recording.bounds import MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_SCENE_BYTES
-from concent_warp.recording.hdf5_access import SafeFile
-from concent_warp.recording.hdf5_heap import check_heaps
+from concent_warp.recording.formats.hdf5_access import SafeFile
+from concent_warp.recording.formats.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
-from concent_warp.recording.validate import validate
+from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
 FORMAT = "concent-recording"

@@ -15,11 +15,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.flow import corners, depth_at, follow, grey, shrunk
-from concent_warp.recording.pinhole import Pinhole
+from concent_warp.perception.optical_flow import corners, depth_at, follow, grey, shrunk
+from concent_warp.perception.pinhole import Pinhole
+from concent_warp.perception.rigid_motion import consensus, inverse, moved
+from concent_warp.perception.visible_region import BodyShape, shown
 from concent_warp.recording.recording import Demonstration, ImageStream, PointTrack, Recording
-from concent_warp.recording.region import BodyShape, shown
-from concent_warp.recording.rigid import consensus, inverse, moved
 from concent_warp.scene.scene import Scene
 
 

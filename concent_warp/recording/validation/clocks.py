@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.recording.place import Place
 from concent_warp.recording.recording import Demonstration
+from concent_warp.recording.validation.location import Place
 
 JUDGED_SAMPLES = 10
 """Channels with fewer samples are not judged: a state before and after is a sound recording."""

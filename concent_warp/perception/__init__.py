@@ -1,0 +1,1 @@
+"""RGB-D video to object poses and point tracks."""

@@ -1,0 +1,1 @@
+"""Checks of a recording: clocks, magnitudes, images, scene text."""
