@@ -14,8 +14,8 @@ import numpy as np
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SCENE = """
 <mujoco>

@@ -13,9 +13,9 @@ from concent_warp.fit.windows import Measured, windows
 from concent_warp.model import Model
 from concent_warp.recording.formats.contactnets import EDGE
 from concent_warp.recording.recording import Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import bracketing

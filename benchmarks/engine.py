@@ -30,8 +30,8 @@ from pages import FOLDER, table, write_page
 
 from concent_warp.model import Model, write_text
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.engine import Contacts, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count

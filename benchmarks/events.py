@@ -29,8 +29,8 @@ from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Demonstration, Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import replay
 

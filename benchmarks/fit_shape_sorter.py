@@ -27,10 +27,10 @@ from concent_warp.fit.geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.recording.recording import Demonstration
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.contact_geometry import ContactGeometry
-from concent_warp.scene.disturb import disturb, offset_normal, toward_axis
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.disturb import disturb, offset_normal, toward_axis
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName

@@ -18,9 +18,9 @@ from concent_warp.fit.offset import offset_directions
 from concent_warp.fit.perturbation import Perturbation
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SceneName = Literal["settle", "push", "tumble", "insertion"]
 SCENES: tuple[SceneName, ...] = ("settle", "push", "tumble", "insertion")

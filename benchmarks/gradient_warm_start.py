@@ -30,8 +30,8 @@ from concent_warp.diagnose.diagnosis import Diagnosis
 from concent_warp.fit.factors import FactorCfg, factors
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from concent_warp.simulate.engine import Rollout, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 

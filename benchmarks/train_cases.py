@@ -28,8 +28,8 @@ from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 HIDDEN = "actuator_delay=0.1"
 """What is hidden in the stand-in world of some cases: commands that act a tenth of a second late. Demonstrations still

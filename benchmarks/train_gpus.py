@@ -28,8 +28,8 @@ from pages import machine, machine_line, read_data, table, write_data, write_pag
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 NAME = "train_gpus"
 MARKS = (0.25, 0.5, 0.9)

@@ -46,8 +46,8 @@ from train_throughput_parts import (
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.warp_engine import preferred_device
 
 T = TypeVar("T")

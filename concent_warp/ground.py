@@ -25,8 +25,8 @@ from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.fit.geometry import FitCfg, FitResult, Method, Progress, fit_geometry
 from concent_warp.model import Model, write_text
 from concent_warp.report.report import write_report
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:

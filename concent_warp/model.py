@@ -17,8 +17,8 @@ import numpy as np
 from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
 from concent_warp.effects.table import checked_values, effects_table, read_effects
 from concent_warp.errors import ModelError
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 FORMAT = "concent-model"
 VERSION = 1

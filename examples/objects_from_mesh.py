@@ -13,10 +13,10 @@ import numpy as np
 import trimesh
 
 from concent_warp.model import Model
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.export import save_mjcf
-from concent_warp.scene.objects import load_object
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.shapes.objects import load_object
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.export import save_mjcf
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 

@@ -19,8 +19,8 @@ from concent_warp.fit.geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 SCENE = """

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RenderError
-from concent_warp.scene.contact_geometry import GROUP
+from concent_warp.scene.spheres.contact_geometry import GROUP
 
 if TYPE_CHECKING:
     import torch

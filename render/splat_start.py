@@ -11,9 +11,9 @@ from concent_warp.render.splats import COEFFICIENTS, Splats
 from scipy.spatial import KDTree
 
 from concent_warp.errors import RenderError
-from concent_warp.scene.objects import MESHES, read_mesh, read_points
-from concent_warp.scene.ply import read_header
-from concent_warp.scene.splat import HARMONIC
+from concent_warp.scene.shapes.objects import MESHES, read_mesh, read_points
+from concent_warp.scene.shapes.ply import read_header
+from concent_warp.scene.shapes.splat import HARMONIC
 
 CELLS = 72
 """Cells along an edge of the cube in which the hull is carved."""

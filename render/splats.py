@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from concent_warp.errors import RenderError
-from concent_warp.scene.sampling import farthest_point_sampling
-from concent_warp.scene.splat import GaussianSplats, read_splats, write_splats
+from concent_warp.scene.shapes.splat import GaussianSplats, read_splats, write_splats
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
 COEFFICIENTS = (1, 4, 9, 16)
 """Coefficients of spherical harmonics of degrees 0 to 3."""

@@ -24,7 +24,7 @@ GIVEN = {
 from pathlib import Path
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.select import make_engine
 recording = load_recording("demo.h5")

@@ -11,9 +11,9 @@ from concent_warp.train.cfg import CollisionCfg
 from concent_warp.train.physics import Physics
 from concent_warp.train.task import Task
 
-from concent_warp.scene.inset import inset
-from concent_warp.scene.sampling import farthest_point_sampling
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.inset import inset
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
 if TYPE_CHECKING:
     import trimesh

@@ -15,7 +15,7 @@ from concent_warp.fit.geometry import FitCfg
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
-from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName
 
 

@@ -16,8 +16,8 @@ from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from concent_warp.diagnose.contact_state import Touch, extent
 from concent_warp.errors import SceneError
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
 
 if TYPE_CHECKING:
     from concent_warp.diagnose.wrench import SteadyForce, Wrenches

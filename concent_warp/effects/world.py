@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.joints import MUJOCO
 from concent_warp.effects.select import free_bodies, name
-from concent_warp.scene.contact_geometry import GROUP as SPHERES
+from concent_warp.scene.spheres.contact_geometry import GROUP as SPHERES
 
 AIR = 1.2
 """Density of air at 20 degrees [kg/m^3]."""

@@ -19,7 +19,7 @@ from concent_warp.simulate.replay import replay, step_count
 if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration
-    from concent_warp.scene.contact_geometry import ContactGeometry
+    from concent_warp.scene.spheres.contact_geometry import ContactGeometry
     from concent_warp.simulate.engine import ContactLog, Engine
 
 

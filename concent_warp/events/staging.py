@@ -26,7 +26,7 @@ from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import Stage
 from concent_warp.events.target import target_event
 from concent_warp.events.touches import Motion, Touches
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 KINDS = get_args(Kind)
 NAMED = ("pick", "align", "insert")

@@ -9,7 +9,7 @@ import numpy as np
 from concent_warp.fit.faces import Faces
 from concent_warp.fit.objective import Candidates
 from concent_warp.fit.perturbation import Noise, Perturbation, smoothed
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from concent_warp.fit.newton_loss import NewtonLoss
 from concent_warp.fit.newton_physics import NewtonCfg
 from concent_warp.fit.newton_worlds import Parameters
 from concent_warp.fit.perturbation import rbf
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 
 @dataclass(frozen=True)

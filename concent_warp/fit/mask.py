@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from concent_warp.model import Model
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 
 def robot_bodies(model: mujoco.MjModel) -> np.ndarray:

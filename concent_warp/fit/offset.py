@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 PROBES = 40_000
 """Surface points looked at to find the faces that a sphere belongs to."""

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 Noise = Literal["gaussian_process", "centroid", "independent"]
 JITTER = 1e-6

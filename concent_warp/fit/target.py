@@ -198,8 +198,8 @@ def joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict[
 
 def carried_points(scene: Scene, body: str) -> np.ndarray:
     """Return points spread over a body's surface, body frame [m], shape (CARRIED_POINTS, 3)."""
-    from concent_warp.scene.sampling import farthest_point_sampling
-    from concent_warp.scene.surface import Surface
+    from concent_warp.scene.shapes.surface import Surface
+    from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
     points, _ = Surface.of_body(scene, body).sample(20 * CARRIED_POINTS, np.random.default_rng(0))
     return points[farthest_point_sampling(points, CARRIED_POINTS)]

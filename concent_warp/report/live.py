@@ -18,7 +18,7 @@ import numpy as np
 
 from concent_warp.errors import ConcentError
 from concent_warp.report.scene_data import SHAPES, VISIBLE_GROUPS, mesh_arrays
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 KEPT, LEFT_OUT, TOUCHING = (20, 60, 150), (95, 100, 110), (185, 20, 0)
 """Colours of spheres: in the physics, left out of it, and touching something."""

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from concent_warp.events.sequence import ContactEventSequence
     from concent_warp.model import Model
-    from concent_warp.scene.contact_geometry import ContactGeometry
+    from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SHAPES = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",

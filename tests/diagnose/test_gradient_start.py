@@ -15,8 +15,8 @@ from concent_warp.errors import ModelError
 from concent_warp.fit.factors import Factors
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 TRUE, GIVEN, NOISE = 0.1, 0.4, 1e-4
 """Friction of the block and of its model, and noise of a coordinate [m]."""

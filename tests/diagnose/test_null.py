@@ -3,8 +3,8 @@ import pytest
 
 from concent_warp.diagnose.null import without_object_contact
 from concent_warp.model import Model
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 XML = """
 <mujoco>

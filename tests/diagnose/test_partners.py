@@ -4,8 +4,8 @@ import pytest
 from concent_warp.diagnose.partners import Partners, box_of, subtree
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import replay
 

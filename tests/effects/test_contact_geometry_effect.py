@@ -8,8 +8,8 @@ from small_worlds import BALL, BLOCK, move, world
 from concent_warp.effects.geometry import ContactGeometryOffset
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 MM = 1e-3
 EFFECT = ContactGeometryOffset("thing")

@@ -3,7 +3,7 @@ import pytest
 from small_worlds import BALL, BLOCK, G, move, world
 
 from concent_warp.effects.world import AirDrag, GravityTilt, Wind
-from concent_warp.scene.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 MASS, RADIUS = 0.4, 0.05
 AREA = np.pi * RADIUS**2

@@ -3,8 +3,8 @@ import pytest
 
 from concent_warp.events.roles import Roles
 from concent_warp.model import Model
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 XML = """
 <mujoco>

@@ -10,7 +10,7 @@ from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.extract import extract
 from concent_warp.events.overlap import overlap
 from concent_warp.events.sequence import ContactEventSequence, Stage
-from concent_warp.scene.build_geometry import ContactGeometryCfg
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 FINGERS = ("left_finger", "right_finger")

@@ -8,8 +8,8 @@ import pytest
 
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, PointTrack, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 HALF = 0.02
 RADIUS = 0.004

@@ -31,7 +31,7 @@ def test_a_fit_to_measured_tosses_improves_unseen_ones_and_mends_the_size(monkey
 def test_the_standing_width_is_that_of_the_planes_on_which_a_cube_stands(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     tosses = importlib.import_module("cube_tosses")
-    geometry = importlib.import_module("concent_warp.scene.contact_geometry")
+    geometry = importlib.import_module("concent_warp.scene.spheres.contact_geometry")
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * 0.05
     sunk = np.array([[0.04, 0.01, 0.01], [-0.04, -0.01, 0.01]])
     position = np.concatenate([corners, sunk])

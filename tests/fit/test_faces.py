@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from concent_warp.fit.faces import Faces, flattened
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.contact_geometry import ContactGeometry
-from concent_warp.scene.disturb import disturb
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.disturb import disturb
 from tests.fit.conftest import DROP
 
 LENGTH = 0.03

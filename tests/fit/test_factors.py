@@ -10,8 +10,8 @@ from concent_warp.errors import EngineError, ModelError, RecordingError
 from concent_warp.fit.factors import FactorCfg, FactorDescent, factors
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Demonstration, PointTrack, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 HALF, RADIUS, MODEL_FRICTION = 0.02, 0.002, 0.4
 SLIDING = """

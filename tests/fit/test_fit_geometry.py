@@ -10,9 +10,9 @@ from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.disturb import disturb
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.disturb import disturb
 from tests.fit.conftest import DROP, HALF, RADIUS, corner_spheres, dropped
 
 CFG = FitCfg(

@@ -3,9 +3,9 @@ import numpy as np
 
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.model import Model
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from tests.fit.conftest import DROP, corner_spheres
 
 

@@ -18,8 +18,8 @@ from concent_warp.fit.newton_worlds import Parameters
 from concent_warp.fit.target import whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from tests.fit.conftest import DROP, HALF, corner_spheres
 from tests.fit.tossing import toss_scene, tosses
 

@@ -1,8 +1,8 @@
 import numpy as np
 
 from concent_warp.fit.offset import offset_directions
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SCENE = """
 <mujoco>

@@ -3,8 +3,8 @@ import pytest
 
 from concent_warp.fit.offset import offset_directions
 from concent_warp.fit.perturbation import Perturbation, rbf, smoothed
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from tests.fit.conftest import DROP
 
 

@@ -12,8 +12,8 @@ from concent_warp.fit.target import whole
 from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.replay import step_count
 from tests.fit.tossing import EDGE, PERIOD, toss_scene, tosses
 

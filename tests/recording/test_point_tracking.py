@@ -14,7 +14,7 @@ from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
 
 START, STOP, RATE = 2.0, 4.0, 20.0
 """The window in which the block is lifted, carried and set down on the box [s], and the camera's rate [Hz]."""

@@ -3,7 +3,7 @@ import torch
 from concent_warp.render.splats import Splats
 
 from concent_warp.errors import RenderError
-from concent_warp.scene.objects import load_object
+from concent_warp.scene.shapes.objects import load_object
 
 
 def shell(count=400, degree=2, radius=0.03):

@@ -9,8 +9,8 @@ from concent_warp.fit.geometry import FitResult
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.report.report import write_report
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 XML = """

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError, SceneError
-from concent_warp.scene.build_geometry import ContactGeometryCfg, apportion
-from concent_warp.scene.disturb import disturb, offset_normal, toward_axis
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.solid import Box
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.solid import Box
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.build import ContactGeometryCfg, apportion
+from concent_warp.scene.spheres.disturb import disturb, offset_normal, toward_axis
 
 SCENE = Scene(
     """<mujoco><worldbody>

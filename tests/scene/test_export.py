@@ -2,9 +2,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.model import Model
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.export import export_mjcf, save_mjcf
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.spheres.export import export_mjcf, save_mjcf
 
 SCENE = Scene(
     """<mujoco><option timestep=".002"/><default><geom friction=".9" margin=".0005"/>

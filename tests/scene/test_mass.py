@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError
-from concent_warp.scene.mass import split_mass
-from concent_warp.scene.solid import Box
+from concent_warp.scene.shapes.solid import Box
+from concent_warp.scene.spheres.mass import split_mass
 
 HALF = np.array([0.02, 0.03, 0.04])
 MASS = 0.08

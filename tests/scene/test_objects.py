@@ -4,10 +4,10 @@ import pytest
 import trimesh
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.build_geometry import ContactGeometryCfg
-from concent_warp.scene.objects import load_object
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.solid import Box
+from concent_warp.scene.shapes.objects import load_object
+from concent_warp.scene.shapes.solid import Box
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 HALF = np.array([0.02, 0.03, 0.01])
 

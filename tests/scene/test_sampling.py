@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError
-from concent_warp.scene.sampling import farthest_point_sampling
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
 
 def test_each_choice_is_the_farthest_from_those_before():

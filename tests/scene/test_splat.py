@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.ply import read_vertices
-from concent_warp.scene.splat import read_splats, write_splats
+from concent_warp.scene.shapes.ply import read_vertices
+from concent_warp.scene.shapes.splat import read_splats, write_splats
 
 FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 FIELDS += [f"f_rest_{k}" for k in range(24)]

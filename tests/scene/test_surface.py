@@ -6,11 +6,11 @@ import trimesh
 from scipy.spatial import KDTree
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.cloud import PointCloud, without_outliers
-from concent_warp.scene.mesh import MeshSolid
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.solid import Box, Capsule, Cylinder, Ellipsoid
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.cloud import PointCloud, without_outliers
+from concent_warp.scene.shapes.mesh import MeshSolid
+from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Ellipsoid
+from concent_warp.scene.shapes.surface import Surface
 
 SOLIDS = {
     "box": Box(np.array([0.02, 0.03, 0.04])),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.model import Model
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 XML = """
 <mujoco>

@@ -10,8 +10,8 @@ from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 HOLE = 0.12

@@ -15,8 +15,8 @@ from small_insertion import SETTINGS, make_demonstration, make_model, make_task
 
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.scene.build_geometry import ContactGeometryCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from concent_warp.train.virtual import surface_points, within
 from concent_warp.train.worlds import make_environment
 from small_insertion import SETTINGS
 
-from concent_warp.scene.solid import Box
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.solid import Box
+from concent_warp.scene.shapes.surface import Surface
 
 HALF, RADIUS, SLACK = 0.02, 0.004, 0.0005
 CUBE = Surface.of_solids([Box(np.full(3, HALF))])

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.solid import Distances, Solid, unit
+from concent_warp.scene.shapes.solid import Distances, Solid, unit
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

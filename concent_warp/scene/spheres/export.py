@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ModelError
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 FIELDS = (
     "pos", "friction", "condim", "contype", "conaffinity", "priority", "solmix", "solref", "solimp", "margin", "gap",

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.cloud import without_outliers
-from concent_warp.scene.ply import PlyHeader, read_vertices
+from concent_warp.scene.shapes.cloud import without_outliers
+from concent_warp.scene.shapes.ply import PlyHeader, read_vertices
 
 HARMONIC = 0.28209479177387814
 """Value of the constant spherical harmonic, ``1 / (2 sqrt(pi))``."""

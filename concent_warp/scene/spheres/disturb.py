@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from concent_warp.errors import ModelError
-from concent_warp.scene.cloud import nearest_points
-from concent_warp.scene.contact_geometry import ContactGeometry
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.cloud import nearest_points
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SelectFaces = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From surface points [m] and outward normals, each (n, 3) in the body frame, to which of them are meant, (n,) bool."""

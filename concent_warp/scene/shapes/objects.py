@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.cloud import PointCloud
-from concent_warp.scene.mesh import MeshSolid, closed_mesh, hull
-from concent_warp.scene.ply import read_header, read_vertices
-from concent_warp.scene.splat import is_splats, read_splats
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.cloud import PointCloud
+from concent_warp.scene.shapes.mesh import MeshSolid, closed_mesh, hull
+from concent_warp.scene.shapes.ply import read_header, read_vertices
+from concent_warp.scene.shapes.splat import is_splats, read_splats
+from concent_warp.scene.shapes.surface import Surface
 
 if TYPE_CHECKING:
     import trimesh

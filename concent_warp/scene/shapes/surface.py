@@ -18,7 +18,7 @@ import numpy as np
 
 from concent_warp.errors import SceneError
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, Placed, Solid
+from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, Placed, Solid
 
 PROBE = 1e-6
 """How far outside a surface point is looked at to tell an outer face from an inner one, relative to the size."""
@@ -152,7 +152,7 @@ def geom_solid(scene: Scene, geom: int) -> Solid:
     elif kind == kinds.mjGEOM_MESH:
         import trimesh
 
-        from concent_warp.scene.mesh import MeshSolid
+        from concent_warp.scene.shapes.mesh import MeshSolid
 
         mesh = model.mesh(model.geom_dataid[geom])
         first, last = mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
 
 STAGES = 6
 """Radii on the way to the wanted one: a centre goes in step by step, and does not jump through a thin wall."""

@@ -14,12 +14,12 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ModelError, SceneError
-from concent_warp.scene.contact_geometry import ContactGeometry
-from concent_warp.scene.inset import inset
-from concent_warp.scene.mass import split_mass
-from concent_warp.scene.sampling import farthest_point_sampling
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.surface import Surface
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.inset import inset
+from concent_warp.scene.spheres.mass import split_mass
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
 SMALLEST = 0.05
 """Spheres that would have to shrink below this share of the radius, at sharp edges, are not candidates."""

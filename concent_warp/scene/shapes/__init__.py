@@ -1,0 +1,1 @@
+"""Surfaces and volumes of objects: primitives, meshes, point clouds, Gaussian splats."""

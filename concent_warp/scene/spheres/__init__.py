@@ -1,0 +1,1 @@
+"""Contact geometry: spheres that stand for the objects in contact."""
