@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from concent_warp.kernels.chamfer import ChamferPlan, chamfer
-from concent_warp.kernels.chamfer_cuda import Tiling
+from concent_warp.kernels.chamfer.distance import ChamferPlan, chamfer
+from concent_warp.kernels.chamfer.distance_cuda import Tiling
 from scipy.spatial import KDTree
 
 PAGE = Path(__file__).parents[1] / "docs/benchmarks/chamfer.md"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 import warp as wp
-from concent_warp.kernels.splat import PARAMETERS, SplatArrays, SplatPlan
+from concent_warp.kernels.splats.splats import PARAMETERS, SplatArrays, SplatPlan
 from concent_warp.render.splats import Splats
 
 from concent_warp.errors import RenderError

@@ -46,8 +46,8 @@ def test_package_keeps_the_rules(tree):
 @pytest.mark.parametrize(
     ("module", "imported"),
     [
-        ("kernels.chamfer", "errors"),
-        ("kernels.chamfer", "model"),
+        ("kernels.chamfer.distance", "errors"),
+        ("kernels.chamfer.distance", "model"),
         ("errors", "kernels"),
         ("scene.scene", "model"),
         ("recording.formats.hdf5", "simulate.replay"),

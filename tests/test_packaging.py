@@ -41,7 +41,7 @@ def test_wheel_holds_every_file_of_the_four_rooms_under_one_name(wheel, rooms):
     found = {name for name in ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert found == expected
     assert {
-        "concent_warp/kernels/chamfer.py",
+        "concent_warp/kernels/chamfer/distance.py",
         "concent_warp/train/__init__.py",
         "concent_warp/render/__init__.py",
     } < found

@@ -20,7 +20,7 @@ from concent_warp.train.task import Task
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 QUANTILE = 1.959964
 """Half width of the 95 % interval of a normal distribution in standard deviations."""

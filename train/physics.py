@@ -18,7 +18,7 @@ from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)

@@ -24,7 +24,7 @@ import numpy as np
 from concent_warp.errors import ModelError
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 Family = Literal["joints", "objects", "contact", "world", "measurement"]
 Kind = Literal["joint", "actuator", "body", "geom", "sensor", "none"]

@@ -8,8 +8,8 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import entry_points
 
-from concent_warp.effects import contact, drives, geometry, joints, measurement, objects, world
 from concent_warp.effects.effect import Effect
+from concent_warp.effects.library import contact, drives, geometry, joints, measurement, objects, world
 from concent_warp.errors import ModelError
 
 GROUP = "concent_warp.effects"

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.law import Law
+from concent_warp.effects.force_model import Law
 
 SMALLEST = 1e-12
 """Sizes below this count as none."""

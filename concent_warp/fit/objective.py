@@ -158,7 +158,7 @@ class Objective:
         """
         import torch
 
-        from concent_warp.kernels.chamfer import chamfer
+        from concent_warp.kernels.chamfer.distance import chamfer
 
         # Points are linear in the pose, so that is interpolated and not the larger clouds.
         pose = transforms(position, quaternion)

@@ -16,7 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
     from concent_warp.model import Model
 
 Contacts = Literal["none", "touched", "all"]

@@ -22,7 +22,7 @@ from concent_warp.simulate.processes import FEWEST, WORTH, in_processes
 from concent_warp.simulate.threads import simulations_at_a_time
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
     from concent_warp.model import Model
 
 WARNING = mujoco.mjtWarning

@@ -23,7 +23,7 @@ from concent_warp.simulate.engine import Contacts
 from concent_warp.simulate.warp_model import WorldModel
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER: mjw.euler,

@@ -8,8 +8,8 @@ from concent_warp.diagnose.compare import compare
 from concent_warp.diagnose.comparison import Phase
 from concent_warp.diagnose.comparison_table import markdown_table, rich_table
 from concent_warp.diagnose.units import shown
-from concent_warp.effects.drives import ActuatorDelay
-from concent_warp.effects.measurement import Latency
+from concent_warp.effects.library.drives import ActuatorDelay
+from concent_warp.effects.library.measurement import Latency
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording

@@ -4,10 +4,10 @@ import pytest
 
 from concent_warp.diagnose.experiment import imagined, separations, start_effects, suggest
 from concent_warp.diagnose.motions import Bench, Motion
-from concent_warp.effects.contact import SlidingFriction, TorsionalFriction
-from concent_warp.effects.joints import JointDamping, JointFriction
-from concent_warp.effects.measurement import SensorBias
-from concent_warp.effects.world import GravityTilt
+from concent_warp.effects.library.contact import SlidingFriction, TorsionalFriction
+from concent_warp.effects.library.joints import JointDamping, JointFriction
+from concent_warp.effects.library.measurement import SensorBias
+from concent_warp.effects.library.world import GravityTilt
 from concent_warp.fit.observe import channel_noises
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording

@@ -9,8 +9,8 @@ import pytest
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, diagnose, silent
 from concent_warp.diagnose.gradient_start import GradientStarts, factor_of, moved
 from concent_warp.diagnose.search import fit_candidate, screen
-from concent_warp.effects.contact import ContactCompliance, SlidingFriction
-from concent_warp.effects.objects import Inertia, Mass
+from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
+from concent_warp.effects.library.objects import Inertia, Mass
 from concent_warp.errors import ModelError
 from concent_warp.fit.factors import Factors
 from concent_warp.model import ContactParameters, Model

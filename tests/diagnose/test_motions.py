@@ -4,7 +4,7 @@ import pytest
 from concent_warp.diagnose.motions import EXTRA, Bench, heavier, slope_turned
 from concent_warp.diagnose.motions_bodies import Toy, body_motions, roll
 from concent_warp.diagnose.motions_drives import drive_motions
-from concent_warp.effects.world import AirDrag, GravityTilt
+from concent_warp.effects.library.world import AirDrag, GravityTilt
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

@@ -3,7 +3,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from small_worlds import BALL, BLOCK, FLOOR, GRIPPER, G, move, world
 
-from concent_warp.effects.contact import (
+from concent_warp.effects.library.contact import (
     Adhesion,
     AnisotropicFriction,
     ContactCompliance,
@@ -12,7 +12,7 @@ from concent_warp.effects.contact import (
     SlidingFriction,
     TorsionalFriction,
 )
-from concent_warp.effects.drives import GripForce
+from concent_warp.effects.library.drives import GripForce
 
 MASS, RADIUS = 0.4, 0.05
 UPRIGHT = [1, 0, 0, 0]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from small_worlds import BALL, BLOCK, move, world
 
-from concent_warp.effects.geometry import ContactGeometryOffset
+from concent_warp.effects.library.geometry import ContactGeometryOffset
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from small_worlds import GRIPPER, MOTOR, SLIDER, G, move, world
 
-from concent_warp.effects.drives import (
+from concent_warp.effects.library.drives import (
     ActuatorDelay,
     ActuatorGain,
     ActuatorLag,

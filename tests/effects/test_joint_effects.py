@@ -3,7 +3,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from small_worlds import MOTOR, PENDULUM, SLIDER, G, move, world
 
-from concent_warp.effects.joints import (
+from concent_warp.effects.library.joints import (
     Armature,
     JointDamping,
     JointFriction,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from small_worlds import BLOCK, PENDULUM, G, world
 
-from concent_warp.effects.measurement import FrameOffset, Latency, LengthScale, SensorBias, SensorGain, TimeBase
+from concent_warp.effects.library.measurement import FrameOffset, Latency, LengthScale, SensorBias, SensorGain, TimeBase
 
 HALF = np.pi / 2
 

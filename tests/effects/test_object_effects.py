@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from small_worlds import BALL, BLOCK, FLOOR, MOTOR, PENDULUM, SLIDER, G, move, world
 
-from concent_warp.effects.objects import CenterOfMass, Inertia, Mass, Size
+from concent_warp.effects.library.objects import CenterOfMass, Inertia, Mass, Size
 
 CART = SLIDER.format(joint="", actuator=MOTOR)
 

@@ -10,7 +10,7 @@ from concent_warp.model import Model
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 OWN = """
-from concent_warp.effects.joints import JointEffect, JointDamping
+from concent_warp.effects.library.joints import JointEffect, JointDamping
 
 class CableSpring(JointEffect):
     name, summary, source, signature = "cable_spring", "tau = -k q", "Hooke", "torque in proportion to position"

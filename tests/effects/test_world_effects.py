@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from small_worlds import BALL, BLOCK, G, move, world
 
-from concent_warp.effects.world import AirDrag, GravityTilt, Wind
+from concent_warp.effects.library.world import AirDrag, GravityTilt, Wind
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 MASS, RADIUS = 0.4, 0.05

@@ -83,7 +83,7 @@ def test_slopes_are_those_of_central_differences(model):
 
 
 def test_friction_of_an_effect_that_the_model_has_counts(model):
-    from concent_warp.effects.contact import SlidingFriction
+    from concent_warp.effects.library.contact import SlidingFriction
 
     right = model.add(SlidingFriction("block"), [0.2])
     found = factors(right, slid(0.2))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from concent_warp.kernels import chamfer_cpu, chamfer_cuda, chamfer_cuda_gradient, chamfer_gradient
-from concent_warp.kernels.chamfer import ChamferPlan, chamfer, chamfer_parts
-from concent_warp.kernels.chamfer_pairs import batch_of
+from concent_warp.kernels.chamfer import distance_cpu, distance_cuda, distance_gradient, distance_gradient_cuda
+from concent_warp.kernels.chamfer.distance import ChamferPlan, chamfer, chamfer_parts
+from concent_warp.kernels.chamfer.pairs import batch_of
 from scipy.spatial import KDTree
 
 
@@ -45,7 +45,7 @@ def test_distance_matches_kd_tree(n, m, squared):
 
 def test_sets_too_large_for_one_pass_match_kd_tree():
     rng = np.random.default_rng(5)
-    n, m = chamfer_cpu.GATHERED_POINTS + 5, chamfer_cpu.GATHERED_POINTS + 90
+    n, m = distance_cpu.GATHERED_POINTS + 5, distance_cpu.GATHERED_POINTS + 90
     a, b = points(rng, n), points(rng, m)
     a_valid = torch.from_numpy(rng.random(n) > 0.3)
     parts = chamfer_parts(a, b, a_valid)
@@ -253,7 +253,7 @@ def test_wrong_input_is_named(a, b, a_valid, message):
 
 def test_best_tiling_wastes_little_on_padding():
     for n in (1, 64, 100, 128, 200, 512, 600, 1024):
-        tiling = chamfer_cuda.best_tiling(n)
+        tiling = distance_cuda.best_tiling(n)
         padded = -(-n // (32 * tiling.points_per_lane)) * 32 * tiling.points_per_lane
         assert padded < max(2 * n, 65)
 
@@ -311,10 +311,10 @@ def test_values_and_gradients_of_many_pairs_match_kd_tree(device, n, m):
 
 def test_cuda_kernels_compile_without_a_gpu(tmp_path):
     kernels = [
-        chamfer_cuda.one_pass_kernel(chamfer_cuda.best_tiling(512)),
-        chamfer_cuda_gradient.nearest_kernel(),
-        chamfer_gradient.mean_distance,
-        chamfer_cuda_gradient.gradient_kernel(),
+        distance_cuda.one_pass_kernel(distance_cuda.best_tiling(512)),
+        distance_gradient_cuda.nearest_kernel(),
+        distance_gradient.mean_distance,
+        distance_gradient_cuda.gradient_kernel(),
     ]
     for k, kernel in enumerate(kernels):
         folder = tmp_path / str(k)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import splat_reference
 import warp as wp
-from concent_warp.kernels import splat_blend, splat_projection, splat_tiles
-from concent_warp.kernels.splat import SplatArrays, SplatPlan
+from concent_warp.kernels.splats import blend, projection, tiles
+from concent_warp.kernels.splats.splats import SplatArrays, SplatPlan
 from rigid_poses import on_each_device
 
 NAMES = ("means", "quats", "scales", "opacities", "harmonics")
@@ -265,7 +265,7 @@ def test_what_cannot_be_is_refused():
             call()
 
 
-@pytest.mark.parametrize("module", [splat_projection, splat_tiles, splat_blend])
+@pytest.mark.parametrize("module", [projection, tiles, blend])
 def test_cuda_kernels_of_splats_compile_without_a_gpu(tmp_path, module):
     (code,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert code.stat().st_size > 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.effect import Effect, Parameter, written
-from concent_warp.effects.law import Law
+from concent_warp.effects.force_model import Law
 from concent_warp.effects.registry import effects
 from concent_warp.errors import EngineError
 from concent_warp.model import Model

@@ -13,8 +13,8 @@ from concent_warp.train.task import Task
 from concent_warp.train.worlds import make_environment, make_physics
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
-from concent_warp.effects.drives import ActuatorDelay, ActuatorLag, DriveEffect
 from concent_warp.effects.effect import AddedEffect, Parameter
+from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 
 DELAY = AddedEffect(ActuatorDelay("x", "y"), (0.031,), ((0.0, 0.062),))
 LAG = AddedEffect(ActuatorLag("x", "z"), (0.04,), ((0.02, 0.06),))

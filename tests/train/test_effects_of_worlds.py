@@ -15,9 +15,9 @@ from concent_warp.train.worlds import make_physics
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect
-from concent_warp.effects.joints import JointDamping, Stribeck
-from concent_warp.effects.measurement import Latency
-from concent_warp.effects.objects import Mass, Size
+from concent_warp.effects.library.joints import JointDamping, Stribeck
+from concent_warp.effects.library.measurement import Latency
+from concent_warp.effects.library.objects import Mass, Size
 
 DAMPING = AddedEffect(JointDamping("x", "y"), (30.0, 20.0), ((20.0, 40.0), (20.0, 20.0)))
 STRIBECK = AddedEffect(

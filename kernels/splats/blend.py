@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .splat_projection import Frame
+from .projection import Frame
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,7 +11,7 @@ import struct
 
 import warp as wp
 
-from .splat_projection import NEAREST, Frame
+from .projection import NEAREST, Frame
 
 wp.set_module_options({"enable_backward": False})
 

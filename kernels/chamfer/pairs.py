@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from . import chamfer_cpu, chamfer_cuda, chamfer_cuda_gradient, chamfer_gradient
-from .chamfer_cuda import Tiling
+from . import distance_cpu, distance_cuda, distance_gradient, distance_gradient_cuda
+from .distance_cuda import Tiling
 
 MEAN_THREADS = 128
 """Threads of a block that averages the nearest distances of one pair."""
@@ -125,7 +125,7 @@ class Pairs:
 
     @property
     def _most_second_points(self) -> int:
-        return chamfer_cuda.SHARED_POINTS if self.device.is_cuda else chamfer_cpu.GATHERED_POINTS
+        return distance_cuda.SHARED_POINTS if self.device.is_cuda else distance_cpu.GATHERED_POINTS
 
     def swapped(self) -> Pairs:
         """The same pairs with first and second set exchanged."""
@@ -146,16 +146,16 @@ class Pairs:
         found: list[tuple[Any, int]] = []
         if self.fits_one_pass:
             tiling = tiling or self._ordered()[1]
-            one_pass = (chamfer_cuda.one_pass_kernel(tiling), tiling.threads)
-            found.append(one_pass if cuda else (chamfer_cpu.one_pass_kernel(), 1))
+            one_pass = (distance_cuda.one_pass_kernel(tiling), tiling.threads)
+            found.append(one_pass if cuda else (distance_cpu.one_pass_kernel(), 1))
         else:
-            found.append((chamfer_gradient.mean_distance, MEAN_THREADS if cuda else 1))
+            found.append((distance_gradient.mean_distance, MEAN_THREADS if cuda else 1))
         if gradient or not self.fits_one_pass:
-            search = (chamfer_cuda_gradient.nearest_kernel(), chamfer_cuda_gradient.NEAREST_THREADS)
-            found.append(search if cuda else (chamfer_cpu.nearest_kernel(), 1))
+            search = (distance_gradient_cuda.nearest_kernel(), distance_gradient_cuda.NEAREST_THREADS)
+            found.append(search if cuda else (distance_cpu.nearest_kernel(), 1))
         if gradient:
-            gathering = (chamfer_cuda_gradient.gradient_kernel(), chamfer_cuda_gradient.GATHER_THREADS)
-            found.append(gathering if cuda else (chamfer_gradient.gradient_by_scattering, 1))
+            gathering = (distance_gradient_cuda.gradient_kernel(), distance_gradient_cuda.GATHER_THREADS)
+            found.append(gathering if cuda else (distance_gradient.gradient_by_scattering, 1))
         return found
 
     def _ordered(self) -> tuple[bool, Tiling]:
@@ -163,8 +163,8 @@ class Pairs:
         most = self._most_second_points
         orders = [swap for swap, second in ((False, self.m), (True, self.n)) if second <= most]
         sizes = {False: (self.n, self.m), True: (self.m, self.n)}
-        swap = min(orders, key=lambda order: chamfer_cuda.instructions(*sizes[order]))
-        return swap, chamfer_cuda.best_tiling(sizes[swap][0])
+        swap = min(orders, key=lambda order: distance_cuda.instructions(*sizes[order]))
+        return swap, distance_cuda.best_tiling(sizes[swap][0])
 
     def distances(
         self,
@@ -189,9 +189,9 @@ class Pairs:
         if swap:
             outputs = (outputs[1], outputs[0], outputs[3], outputs[2])
         if self.device.is_cuda:
-            kernel, dim, threads = chamfer_cuda.one_pass_kernel(tiling), (self.count, tiling.threads), tiling.threads
+            kernel, dim, threads = distance_cuda.one_pass_kernel(tiling), (self.count, tiling.threads), tiling.threads
         else:
-            kernel, dim, threads = chamfer_cpu.one_pass_kernel(), (self.count,), 1
+            kernel, dim, threads = distance_cpu.one_pass_kernel(), (self.count,), 1
         inputs = [*first._sets(), first.n, first.m, squared]
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[*outputs], device=self.device, block_dim=threads)
 
@@ -201,11 +201,11 @@ class Pairs:
         for pairs, found in ((self, nearest[0]), (self.swapped(), nearest[1])):
             inputs = [*pairs._sets(), pairs.n, pairs.m]
             if device.is_cuda:
-                threads = chamfer_cuda_gradient.NEAREST_THREADS
-                chunks = -(-pairs.n // (threads * chamfer_cuda_gradient.NEAREST_PER_THREAD))
-                kernel, dim = chamfer_cuda_gradient.nearest_kernel(), (self.count, chunks, threads)
+                threads = distance_gradient_cuda.NEAREST_THREADS
+                chunks = -(-pairs.n // (threads * distance_gradient_cuda.NEAREST_PER_THREAD))
+                kernel, dim = distance_gradient_cuda.nearest_kernel(), (self.count, chunks, threads)
             else:
-                kernel, dim, threads = chamfer_cpu.nearest_kernel(), (self.count,), 1
+                kernel, dim, threads = distance_cpu.nearest_kernel(), (self.count,), 1
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=[found], device=device, block_dim=threads)
 
     def gradients(
@@ -223,10 +223,10 @@ class Pairs:
             if gradient is None:
                 continue
             if device.is_cuda:
-                threads = chamfer_cuda_gradient.GATHER_THREADS
-                kernel, dim = chamfer_cuda_gradient.gradient_kernel(), (self.count, -(-pairs.n // threads), threads)
+                threads = distance_gradient_cuda.GATHER_THREADS
+                kernel, dim = distance_gradient_cuda.gradient_kernel(), (self.count, -(-pairs.n // threads), threads)
             else:
-                kernel, dim, threads = chamfer_gradient.gradient_by_scattering, (self.count,), 1
+                kernel, dim, threads = distance_gradient.gradient_by_scattering, (self.count,), 1
             inputs = [
                 pairs.a, pairs.b, pairs.a_batch, pairs.b_batch,
                 nearest[own], nearest[other], counts[own], counts[other], upstream[own], upstream[other], squared,
@@ -239,7 +239,7 @@ class Pairs:
         for k, pairs in enumerate((self, self.swapped())):
             inputs = [pairs.a, pairs.b, pairs.a_batch, pairs.b_batch, nearest[k], squared, threads]
             wp.launch(
-                chamfer_gradient.mean_distance,
+                distance_gradient.mean_distance,
                 dim=(self.count, threads),
                 inputs=inputs,
                 outputs=[outputs[k], outputs[2 + k]],

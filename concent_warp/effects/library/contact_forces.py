@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.law import Law
+from concent_warp.effects.force_model import Law
 from concent_warp.effects.select import standing_geoms
 
 if TYPE_CHECKING:
@@ -83,11 +83,11 @@ class AnisotropicForce(Law):
         """See `Law.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import laws
+        from concent_warp.kernels import force_models
 
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        laws.anisotropic(m, d, *self._device, values, SMOOTH)
+        force_models.anisotropic(m, d, *self._device, values, SMOOTH)
 
 
 class Pull(Law):
@@ -190,7 +190,7 @@ class Pull(Law):
         """See `Law.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import laws
+        from concent_warp.kernels import force_models
 
         if self._device is None:
             self._device = (
@@ -199,7 +199,7 @@ class Pull(Law):
                 wp.array(self.round, dtype=bool),
                 wp.array(self.still, dtype=int),
             )
-        laws.pull(m, d, *self._device, values, self.gap)
+        force_models.pull(m, d, *self._device, values, self.gap)
 
 
 def outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:

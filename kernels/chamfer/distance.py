@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from .chamfer_cuda import Tiling
-from .chamfer_pairs import Pairs, batch_of, broadcast_shape
+from .distance_cuda import Tiling
+from .pairs import Pairs, batch_of, broadcast_shape
 
 
 class ChamferParts(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import free_bodies, name
 from concent_warp.scene.spheres.contact_geometry import GROUP as SPHERES
 

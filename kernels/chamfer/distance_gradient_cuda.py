@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from .chamfer_cuda import COMMON, DIFFERENCE, filled
+from .distance_cuda import COMMON, DIFFERENCE, filled
 
 NEAREST_THREADS = 128
 """Threads of a block that searches nearest points."""

@@ -15,9 +15,9 @@ from typing import Any
 
 import warp as wp
 
-from .splat_blend import Lists, blend, blend_gradient
-from .splat_projection import Frame, Scene, project
-from .splat_tiles import DEPTH_BITS, emit, find_tiles, measure, pad
+from .blend import Lists, blend, blend_gradient
+from .projection import Frame, Scene, project
+from .tiles import DEPTH_BITS, emit, find_tiles, measure, pad
 
 TILES = {"cpu": 8, "cuda": 16}
 """Edge of a tile that is quickest on a kind of device [px]."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.law import Law
+from concent_warp.effects.force_model import Law
 from concent_warp.effects.select import driven_joints
 
 if TYPE_CHECKING:
@@ -63,11 +63,11 @@ class LooseGear(Law):
         """See `Law.launch`."""
         import warp as wp
 
-        from concent_warp.kernels import laws
+        from concent_warp.kernels import force_models
 
         if self._device is None:
             self._device = wp.array(self.actuators, dtype=int)
-        laws.loose_gear(m, d, self._device, self.first, values)
+        force_models.loose_gear(m, d, self._device, self.first, values)
 
 
 @dataclass(frozen=True)

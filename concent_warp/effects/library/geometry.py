@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Parameter
-from concent_warp.effects.objects import BodyEffect, keep_inertia
+from concent_warp.effects.library.objects import BodyEffect, keep_inertia
 from concent_warp.effects.select import free_bodies, name
 
 GEOM = mujoco.mjtGeom

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.contact_laws import AnisotropicForce, Pull
-from concent_warp.effects.drives import GRIPS
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.library.contact_forces import AnisotropicForce, Pull
+from concent_warp.effects.library.drives import GRIPS
+from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
     fingers,
     free_bodies,
@@ -22,7 +22,7 @@ from concent_warp.effects.select import (
 )
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 SLIDING, TORSIONAL, ROLLING = 0, 1, 2
 NEXT_TO_NOTHING = 1e-5

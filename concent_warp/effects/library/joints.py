@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.friction_laws import LoadFriction, StribeckFriction
+from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.select import SINGLE, dof_of, joints_by_type, typical_torque
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 STIFF = 1.5
 """Time constant of friction constraints in time steps; MuJoCo's default creeps."""

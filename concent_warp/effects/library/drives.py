@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.drive_laws import LooseGear
 from concent_warp.effects.effect import Effect, Parameter, Reader
-from concent_warp.effects.joints import MUJOCO
+from concent_warp.effects.library.gear_forces import LooseGear
+from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
     SINGLE,
     arm_actuators,
@@ -22,7 +22,7 @@ from concent_warp.effects.select import (
 )
 
 if TYPE_CHECKING:
-    from concent_warp.effects.law import Law
+    from concent_warp.effects.force_model import Law
 
 FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.law import Law
+from concent_warp.effects.force_model import Law
 
 if TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -60,9 +60,9 @@ class StribeckFriction(DofLaw):
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
-        from concent_warp.kernels import laws
+        from concent_warp.kernels import force_models
 
-        laws.stribeck(m, d, self.device_dof(), values)
+        force_models.stribeck(m, d, self.device_dof(), values)
 
 
 class LoadFriction(DofLaw):
@@ -91,6 +91,6 @@ class LoadFriction(DofLaw):
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `Law.launch`."""
-        from concent_warp.kernels import laws
+        from concent_warp.kernels import force_models
 
-        laws.load(m, d, self.device_dof(), values)
+        force_models.load(m, d, self.device_dof(), values)

@@ -1,0 +1,1 @@
+"""Chamfer distance and its gradients."""

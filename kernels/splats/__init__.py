@@ -1,0 +1,1 @@
+"""Rasterisation of Gaussian splats."""
