@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.fit.target import BodyTarget, Segment, measured_pose, observed_poses, whole
-from concent_warp.fit.windows import Measured, windows
+from concent_warp.estimation.object_tracks import BodyTarget, Segment, measured_pose, observed_poses, whole
+from concent_warp.estimation.windows import Measured, windows
 from concent_warp.model import Model
 from concent_warp.recording.formats.contactnets import EDGE
 from concent_warp.recording.recording import Recording

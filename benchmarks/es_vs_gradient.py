@@ -24,10 +24,10 @@ from gradient_scenes import SCENES, SceneName, record, starting_model
 from measurements import Measurements
 from pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 
+from concent_warp.estimation.object_tracks import whole
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, Search, cut
 from concent_warp.fit.objective import Objective
-from concent_warp.fit.target import whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine

@@ -26,11 +26,11 @@ from gradient_scenes import record, starting_model
 from measurements import Measurements
 from pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 
+from concent_warp.estimation.object_tracks import whole
 from concent_warp.fit.horizon import shortened
 from concent_warp.fit.newton_loss import NewtonLoss
 from concent_warp.fit.newton_scene import newton_scene
 from concent_warp.fit.newton_worlds import Parameters
-from concent_warp.fit.target import whole
 
 NAME = "gradient_throughput"
 

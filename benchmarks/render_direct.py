@@ -147,7 +147,7 @@ def seconds_of(paint: Draw, held: Pairs, reference: torch.Tensor, steps: int, ba
 
 def objects_seen(held: Pairs, recording: Recording, device: str) -> torch.Tensor:
     """Return where the simulation sees objects, and a few pixels around, shape (N, H, W) bool."""
-    from concent_warp.diagnose.measured_motion import measured_motion
+    from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 

@@ -226,7 +226,7 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     from concent_warp.render.pairs import drawn_scene
     from concent_warp.render.splats import Splats
 
-    from concent_warp.diagnose.measured_motion import measured_motion
+    from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
     from concent_warp.scene.scene import Scene
     from concent_warp.simulate.mujoco_engine import MujocoEngine

@@ -14,8 +14,8 @@ import torch
 from concent_warp.render.cameras import Camera, place_cameras
 from concent_warp.render.raw import RawCamera, Stage
 
-from concent_warp.diagnose.measured_motion import measured_motion
 from concent_warp.errors import RenderError
+from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene

@@ -68,7 +68,7 @@ def run(arguments: Arguments) -> Location:
         plot_location(found, model, arguments.png)
         written.append(arguments.png)
     if arguments.html is not None:
-        from concent_warp.diagnose.compare import compare
+        from concent_warp.compare.compare import compare
         from concent_warp.report.report import write_report
 
         models = {"model": model}

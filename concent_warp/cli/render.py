@@ -191,7 +191,7 @@ def film_policy(arguments: Arguments) -> Filming:
 
 def film_recording(arguments: Arguments) -> Filming:
     """Film the measured motion of the demonstrations of a recording, each an episode."""
-    from concent_warp.diagnose.measured_motion import measured_motion
+    from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
     from concent_warp.recording.load import load_recording
     from concent_warp.scene.scene import Scene

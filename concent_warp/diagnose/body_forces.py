@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from concent_warp.compare.phases import FREE, REST
 from concent_warp.diagnose.contact_state import BETWEEN, BodyWindows, body_windows
 from concent_warp.diagnose.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
 from concent_warp.diagnose.features import body_force_features, body_torque_features
 from concent_warp.diagnose.force_place import force_place
 from concent_warp.diagnose.location import BodyForce, ForceSeries, PhaseForce
-from concent_warp.diagnose.phases import FREE, REST
 from concent_warp.diagnose.wrench import Wrenches, joined, steady_force, wrenches
 
 if TYPE_CHECKING:
-    from concent_warp.diagnose.measured_motion import BodyMotion, Motion
     from concent_warp.diagnose.shooting import Windows
+    from concent_warp.estimation.measured_motion import BodyMotion, Motion
     from concent_warp.model import Model
 
 FEWEST_WINDOWS = 3

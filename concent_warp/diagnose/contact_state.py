@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.diagnose.phases import FREE, GRASPED, IMPACT, REST, SLIDE, SLIDING, STICK
+from concent_warp.compare.phases import FREE, GRASPED, IMPACT, REST, SLIDE, SLIDING, STICK
 from concent_warp.diagnose.shooting import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
-    from concent_warp.diagnose.measured_motion import BodyMotion, Motion
     from concent_warp.diagnose.shooting import Windows
+    from concent_warp.estimation.measured_motion import BodyMotion, Motion
 
 PUSHED, BETWEEN = "pushed", "between"
 """Further phases: the robot presses on it from one side; it sets out or comes to rest."""
@@ -46,7 +46,7 @@ class BodyWindows:
     """One free body in the windows of a demonstration, K of them."""
 
     phase: np.ndarray
-    """Names of phases as `concent_warp.diagnose.phases` has them, shape (K,)."""
+    """Names of phases as `concent_warp.compare.phases` has them, shape (K,)."""
     touches: tuple[Mapping[str, Touch], ...]
     """By the name of the other body."""
     free: np.ndarray

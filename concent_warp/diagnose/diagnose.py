@@ -22,7 +22,6 @@ from concent_warp.diagnose.evidence import SAME, alike, detectable_size, fitted_
 from concent_warp.diagnose.experiment import suggest
 from concent_warp.diagnose.flexible import unknown_force
 from concent_warp.diagnose.gradient_start import GradientStarts
-from concent_warp.diagnose.noise import UNDERESTIMATE
 from concent_warp.diagnose.search import (
     Candidate,
     Node,
@@ -40,6 +39,7 @@ from concent_warp.diagnose.search import (
 )
 from concent_warp.diagnose.settle import Look, settled
 from concent_warp.diagnose.where import where
+from concent_warp.estimation.noise import UNDERESTIMATE
 from concent_warp.fit.effects import check_finite
 from concent_warp.fit.least_squares import MANY
 from concent_warp.fit.observe import channel_noises, observe

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from concent_warp.compare.units import times, words
 from concent_warp.diagnose.motions import Bench, Motion
 from concent_warp.diagnose.motions_bodies import body_motions
 from concent_warp.diagnose.motions_drives import drive_motions
-from concent_warp.diagnose.units import times, words
 from concent_warp.errors import ConcentError
 from concent_warp.fit.observation import Reading, Source, Window, start_spread
 from concent_warp.fit.observe import channel_noises, keeps_close

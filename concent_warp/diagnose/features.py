@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.compare.phases import GRASPED
 from concent_warp.diagnose.contact_state import PUSHED
-from concent_warp.diagnose.phases import GRASPED
 from concent_warp.diagnose.shooting import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
     from concent_warp.diagnose.contact_state import BodyWindows
-    from concent_warp.diagnose.measured_motion import Motion
     from concent_warp.diagnose.shooting import Windows
+    from concent_warp.estimation.measured_motion import Motion
 
 DIRECTION, SPEED, ACCELERATION = "direction of motion", "velocity", "acceleration"
 SLOW, LIMIT = "direction of slow motion", "drive force near its peak"

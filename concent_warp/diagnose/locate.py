@@ -12,8 +12,8 @@ from concent_warp.diagnose.body_forces import body_force, judged
 from concent_warp.diagnose.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
 from concent_warp.diagnose.features import CONTACT, joint_features
 from concent_warp.diagnose.location import DETECTABLE, ForceSeries, JointForce, Location
-from concent_warp.diagnose.measured_motion import Motion, measured_motion
 from concent_warp.diagnose.shooting import WindowCfg, Windows, window_forces, window_length
+from concent_warp.estimation.measured_motion import Motion, measured_motion
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:

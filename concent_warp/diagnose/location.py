@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.diagnose.comparison import finite
+from concent_warp.compare.comparison import finite
 from concent_warp.diagnose.dependence import LEVEL, Dependences
 from concent_warp.diagnose.force_place import ForcePlace
 from concent_warp.diagnose.location_words import (

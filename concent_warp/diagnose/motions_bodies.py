@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.compare.units import words
 from concent_warp.diagnose.motions import EXTRA, Bench, Motion, heavier, slope_turned
-from concent_warp.diagnose.units import words
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from concent_warp.compare.units import words
 from concent_warp.diagnose.motions import EXTRA, LONGEST, RATE, Bench, Motion, heavier, slope_turned
-from concent_warp.diagnose.units import words
 from concent_warp.effects.select import driven_joints, gripper_actuators, last_links, servo_gain
 from concent_warp.recording.recording import Channel
 

@@ -23,7 +23,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.simulate.engine import ContactLog, Engine, Variants
 
 if TYPE_CHECKING:
-    from concent_warp.diagnose.measured_motion import Motion
+    from concent_warp.estimation.measured_motion import Motion
 
 SHARES = (np.arange(5) + 0.5) / 5
 """Instants within a window, as shares of its length, at which what forces depend on is taken."""

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.diagnose.compare import compare
-from concent_warp.diagnose.comparison import finite
+from concent_warp.compare.compare import compare
+from concent_warp.compare.comparison import finite
+from concent_warp.compare.worst_spans import Place, alike
 from concent_warp.diagnose.locate import locate
 from concent_warp.diagnose.location import Location
 from concent_warp.diagnose.location_words import body_sentence, joint_sentence
-from concent_warp.diagnose.places import Place, alike
 from concent_warp.errors import ConcentError
 from concent_warp.simulate.select import EngineName
 

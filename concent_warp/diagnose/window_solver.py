@@ -21,7 +21,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from concent_warp.diagnose.measured_motion import BodyMotion, JointMotion, Motion, Signal
+    from concent_warp.estimation.measured_motion import BodyMotion, JointMotion, Motion, Signal
     from concent_warp.simulate.engine import ContactLog, Engine
 
 FEWEST_READINGS = 5

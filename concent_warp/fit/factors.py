@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from concent_warp.errors import EngineError, ModelError, RecordingError
+from concent_warp.estimation.object_tracks import Segment, whole
 from concent_warp.fit.horizon import HorizonCfg, gradient_segments
 from concent_warp.fit.newton_loss import NewtonLoss, mujoco_loss
 from concent_warp.fit.newton_physics import NewtonCfg
 from concent_warp.fit.newton_scene import newton_scene
 from concent_warp.fit.newton_worlds import Parameters
-from concent_warp.fit.target import Segment, whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 

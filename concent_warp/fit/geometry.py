@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ModelError, RecordingError
+from concent_warp.estimation.object_tracks import Segment, observed_states, whole
+from concent_warp.estimation.windows import hold_out, windows
 from concent_warp.fit.checkpoint import Checkpoint
 from concent_warp.fit.evolution import Evolution, EvolutionCfg
 from concent_warp.fit.faces import Faces, flattened
@@ -19,9 +21,7 @@ from concent_warp.fit.gradient import GradientCfg
 from concent_warp.fit.mask import robot_bodies, spheres_near, touched_spheres, with_neighbours
 from concent_warp.fit.objective import Objective
 from concent_warp.fit.offset import offset_directions
-from concent_warp.fit.target import Segment, observed_states, whole
 from concent_warp.fit.warm_start import Warming, WarmStart
-from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.simulate.engine import Engine

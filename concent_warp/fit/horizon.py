@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.target import BodyTarget, Segment, observed_poses
-from concent_warp.fit.windows import windows
+from concent_warp.estimation.object_tracks import BodyTarget, Segment, observed_poses
+from concent_warp.estimation.windows import windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration
 

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.errors import EngineError
+from concent_warp.estimation.object_tracks import Segment, whole
 from concent_warp.fit.newton_physics import NewtonCfg
 from concent_warp.fit.newton_scene import NewtonScene, newton_scene
 from concent_warp.fit.newton_worlds import NewtonWorlds, Parameters
 from concent_warp.fit.objective import Objective
-from concent_warp.fit.target import Segment, whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine

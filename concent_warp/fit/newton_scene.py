@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.errors import EngineError, ModelError
+from concent_warp.estimation.object_tracks import Segment, observed_states
 from concent_warp.fit.newton_physics import FEWEST, Inertia, NewtonCfg, Physics, choose_physics, coupling
-from concent_warp.fit.target import Segment, observed_states
 from concent_warp.model import Model
 from concent_warp.simulate.engine import Rollout, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine

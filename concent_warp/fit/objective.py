@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.fit.target import BodyTarget, Segment
+from concent_warp.estimation.object_tracks import BodyTarget, Segment
 from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
 from concent_warp.simulate.replay import bracketing
 from concent_warp.simulate.select import has_cuda

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.windows import Measured
+from concent_warp.estimation.windows import Measured
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.diagnose.noise import pooled_noise
-from concent_warp.diagnose.residuals import kind_and_unit
+from concent_warp.compare.residuals import kind_and_unit
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.noise import pooled_noise
+from concent_warp.estimation.windows import Measured
 from concent_warp.fit.observation import FEWEST, START_NOISE, Source, Window, first_time, start_spread
-from concent_warp.fit.windows import Measured
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine

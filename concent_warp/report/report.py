@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import concent_warp
-from concent_warp.diagnose.bootstrap import RULE
-from concent_warp.diagnose.comparison import Comparison, finite
+from concent_warp.compare.bootstrap import RULE
+from concent_warp.compare.comparison import Comparison, finite
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import write_text
 from concent_warp.report.diagnosis import bullet_list, diagnosis_section

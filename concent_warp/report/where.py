@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from html import escape
 
-from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.noise import WORDS
-from concent_warp.diagnose.places import LEAST, Place, alike
-from concent_warp.diagnose.units import words
+from concent_warp.compare.comparison import Comparison
+from concent_warp.compare.units import words
+from concent_warp.compare.worst_spans import LEAST, Place, alike
+from concent_warp.estimation.noise import WORDS
 
 MOST_PLACES = 6
 """Places in the list."""

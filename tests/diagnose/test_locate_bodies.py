@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
+from concent_warp.compare.phases import FREE, REST, SLIDE
 from concent_warp.diagnose.body_forces import body_parts
 from concent_warp.diagnose.contact_state import free_motions, lasting_share
 from concent_warp.diagnose.force_place import face_words, lever
 from concent_warp.diagnose.location_words import direction_words
-from concent_warp.diagnose.measured_motion import measured_motion
-from concent_warp.diagnose.phases import FREE, REST, SLIDE
 from concent_warp.diagnose.shooting import WindowCfg, window_forces
+from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine

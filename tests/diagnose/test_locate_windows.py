@@ -3,10 +3,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnose.features import DIRECTION, joint_features
-from concent_warp.diagnose.measured_motion import measured_motion, turning
 from concent_warp.diagnose.shooting import WindowCfg, window_forces
-from concent_warp.diagnose.smoothing import smooth
 from concent_warp.diagnose.window_solver import misfit, response
+from concent_warp.estimation.measured_motion import measured_motion, turning
+from concent_warp.estimation.smoothing_spline import smooth
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene

@@ -137,8 +137,8 @@ def test_a_model_without_spheres_is_refused(drop, swollen):
 
 
 def test_the_true_geometry_scores_best(drop, swollen):
+    from concent_warp.estimation.object_tracks import whole
     from concent_warp.fit.objective import Candidates, Objective
-    from concent_warp.fit.target import whole
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 
     halves = HALF + np.array([-0.002, 0.0, 0.002])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import EngineError, ModelError
+from concent_warp.estimation.object_tracks import whole
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, fit_geometry
 from concent_warp.fit.gradient import GradientCfg
@@ -15,7 +16,6 @@ from concent_warp.fit.newton_loss import NewtonLoss, recording_gradient
 from concent_warp.fit.newton_physics import DAMPER, SPRING, Inertia, NewtonCfg, choose_physics, coupling
 from concent_warp.fit.newton_scene import newton_scene
 from concent_warp.fit.newton_worlds import Parameters
-from concent_warp.fit.target import whole
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene

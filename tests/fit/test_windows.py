@@ -4,12 +4,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.joint_motion import joint_motion
+from concent_warp.estimation.local_polynomial import Samples, body_motion
+from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.windows import hold_out, windows
 from concent_warp.fit.evolution import EvolutionCfg
 from concent_warp.fit.geometry import FitCfg, cut, fit_geometry
-from concent_warp.fit.joints import joint_motion
-from concent_warp.fit.motion import Samples, body_motion
-from concent_warp.fit.target import whole
-from concent_warp.fit.windows import hold_out, windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene

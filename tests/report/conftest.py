@@ -2,8 +2,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.compare import compare
-from concent_warp.diagnose.null import without_object_contact
+from concent_warp.compare.compare import compare
+from concent_warp.compare.no_contact import without_object_contact
 from concent_warp.events.extract import extract
 from concent_warp.fit.geometry import FitResult
 from concent_warp.model import Model

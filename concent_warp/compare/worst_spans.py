@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from concent_warp.diagnose.partners import Partners
-from concent_warp.diagnose.phases import Phase
-from concent_warp.diagnose.residuals import Residual
-from concent_warp.diagnose.units import shown, times, unit_shown, words
+from concent_warp.compare.contact_names import Partners
+from concent_warp.compare.phases import Phase
+from concent_warp.compare.residuals import Residual
+from concent_warp.compare.units import shown, times, unit_shown, words
 from concent_warp.events.filter import runs
 
 SMOOTHING = 0.05

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.diagnose.noise import Kind, Noise, Source, channel_noise, pooled_noise, turns
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.noise import Kind, Noise, Source, channel_noise, pooled_noise, turns
 from concent_warp.recording.recording import Channel
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, interpolate, predict
 

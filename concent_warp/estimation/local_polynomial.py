@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.fit.target import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
+from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 

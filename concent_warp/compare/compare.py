@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from concent_warp.diagnose.comparison import Comparison
-from concent_warp.diagnose.partners import Partners
-from concent_warp.diagnose.phases import Phase, StageLike, phases_by_body, stage_phases
-from concent_warp.diagnose.places import ranked, worst_places
-from concent_warp.diagnose.residuals import instrument_noise, residuals
+from concent_warp.compare.comparison import Comparison
+from concent_warp.compare.contact_names import Partners
+from concent_warp.compare.phases import Phase, StageLike, phases_by_body, stage_phases
+from concent_warp.compare.residuals import instrument_noise, residuals
+from concent_warp.compare.worst_spans import ranked, worst_places
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName, make_engine

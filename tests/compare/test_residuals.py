@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.residuals import mean_norm, residuals
+from concent_warp.compare.residuals import mean_norm, residuals
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack

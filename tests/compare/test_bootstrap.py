@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.bootstrap import (
+from concent_warp.compare.bootstrap import (
     WHOLE,
     autocorrelation_time,
     block_length,

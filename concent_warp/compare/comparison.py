@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.diagnose.bootstrap import LEVEL, RULE, effective_count, mean_interval
-from concent_warp.diagnose.noise import Source
-from concent_warp.diagnose.phases import FREE, Phase
-from concent_warp.diagnose.places import Place
-from concent_warp.diagnose.residuals import Residual
+from concent_warp.compare.bootstrap import LEVEL, RULE, effective_count, mean_interval
+from concent_warp.compare.phases import FREE, Phase
+from concent_warp.compare.residuals import Residual
+from concent_warp.compare.worst_spans import Place
 from concent_warp.errors import ModelError, RecordingError
+from concent_warp.estimation.noise import Source
 
 CARRIED = (FREE, "pick")
 """Phases in which an object stands still or is carried: what it does then says little of its contact geometry."""
@@ -35,7 +35,7 @@ class Summary:
     """Number of independent samples that their autocorrelation leaves."""
     mean: float
     low: float
-    """Lower end of the interval of the mean (see `concent_warp.diagnose.bootstrap`); NaN with too few samples."""
+    """Lower end of the interval of the mean (see `concent_warp.compare.bootstrap`); NaN with too few samples."""
     high: float
     """Upper end."""
     rms: float

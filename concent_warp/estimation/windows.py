@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.joints import JointMotion, joint_motion
-from concent_warp.fit.motion import BodyMotion, body_motion
-from concent_warp.fit.target import BodyTarget, Segment, whole
+from concent_warp.estimation.joint_motion import JointMotion, joint_motion
+from concent_warp.estimation.local_polynomial import BodyMotion, body_motion
+from concent_warp.estimation.object_tracks import BodyTarget, Segment, whole
 from concent_warp.recording.recording import Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.replay import commands

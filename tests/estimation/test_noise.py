@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from concent_warp.diagnose.noise import UNDERESTIMATE, channel_noise, pooled_noise
+from concent_warp.estimation.noise import UNDERESTIMATE, channel_noise, pooled_noise
 from concent_warp.recording.recording import Channel
 
 RATE = 100

@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.phases import Phase, phases_by_body, replay_phases, stage_phases, tell_a_task
+from concent_warp.compare.phases import Phase, phases_by_body, replay_phases, stage_phases, tell_a_task
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene

@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.compare import compare
-from concent_warp.diagnose.comparison import Phase
-from concent_warp.diagnose.comparison_table import markdown_table, rich_table
-from concent_warp.diagnose.units import shown
+from concent_warp.compare.compare import compare
+from concent_warp.compare.comparison import Phase
+from concent_warp.compare.comparison_table import markdown_table, rich_table
+from concent_warp.compare.units import shown
 from concent_warp.effects.library.drives import ActuatorDelay
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.errors import ModelError, RecordingError

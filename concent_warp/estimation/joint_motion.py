@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.motion import Samples, finite, more_precise
+from concent_warp.estimation.local_polynomial import Samples, finite, more_precise
 from concent_warp.recording.recording import Demonstration
 
 HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.diagnose.noise import Kind, channel_noise
-from concent_warp.diagnose.residuals import same_sign
-from concent_warp.diagnose.smoothing import Smooth, smooth
+from concent_warp.compare.residuals import same_sign
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.noise import Kind, channel_noise
+from concent_warp.estimation.smoothing_spline import Smooth, smooth
 from concent_warp.simulate.replay import commands, initial_state, interpolate, replay, step_count
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 import mujoco
 import pytest
 
-from concent_warp.diagnose.null import without_object_contact
+from concent_warp.compare.no_contact import without_object_contact
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from concent_warp.diagnose.comparison import Comparison, Summary
-from concent_warp.diagnose.units import percent, shown, times, unit_shown
+from concent_warp.compare.comparison import Comparison, Summary
+from concent_warp.compare.units import percent, shown, times, unit_shown
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.partners import Partners, box_of, subtree
+from concent_warp.compare.contact_names import Partners, box_of, subtree
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene

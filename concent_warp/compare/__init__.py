@@ -1,0 +1,1 @@
+"""Models against measurements: residuals, phases, tables."""

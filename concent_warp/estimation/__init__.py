@@ -1,0 +1,1 @@
+"""What the measurements say by themselves: noise, motion of joints and bodies, object tracks."""
