@@ -38,9 +38,9 @@ from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.least_squares import FitCfg, Solver
-from concent_warp.fit.observation import Window
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.least_squares import FitCfg, Solver
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.formats.bam import DRIVE, JOINT, SENSOR, read_bam
 from concent_warp.recording.formats.contactnets import read_contactnets

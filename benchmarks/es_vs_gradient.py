@@ -25,9 +25,10 @@ from measurements import Measurements
 from pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 
 from concent_warp.estimation.object_tracks import whole
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg, Search, cut
-from concent_warp.fit.objective import Objective
+from concent_warp.fit.fit_geometry import FitCfg, cut, warm_start
+from concent_warp.fit.geometry.evolution import EvolutionCfg
+from concent_warp.fit.geometry.objective import Objective
+from concent_warp.fit.geometry.search import Search
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -117,7 +118,7 @@ def run(args: Args, scene: SceneName, seed: int, method: MethodName) -> dict[str
     search = Search(model, cut(model, shown, cfg), cfg, args.engine)
     row: dict[str, Any] = {"scene": scene, "seed": seed, "method": method, "start": start}
     if method == "gradient+es":
-        search.warm("gradient+es", shown, None, False, None)
+        warm_start(search, "gradient+es", shown, cfg.gradient, None, False, None)
         found = search.gradients
         assert found is not None
         row |= {"helped": found.helped, "remark": found.remark}

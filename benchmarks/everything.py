@@ -9,9 +9,9 @@ import numpy as np
 
 from concent_warp.diagnose.candidates import candidates
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.fit.least_squares import FitCfg, Solver, projected
-from concent_warp.fit.observe import observe
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.least_squares import FitCfg, Solver, projected
+from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 

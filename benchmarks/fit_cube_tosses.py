@@ -31,8 +31,8 @@ from cube_tosses import Judge, free_fall, resting_height, rests_at, sphere_cube,
 from cube_tosses_report import write_report
 from scipy import stats
 
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.recording.formats.contactnets import EDGE, FRICTION, read_contactnets
 
 ROOT = Path(__file__).resolve().parent.parent

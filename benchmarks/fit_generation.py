@@ -30,7 +30,8 @@ from fit_shape_sorter import Start, judge, starting_geometry
 from pages import machine, machine_line, read_data, table, write_data, write_page
 
 from concent_warp.cli.terminal import quiet_warp
-from concent_warp.fit.geometry import FitCfg, Search, cut
+from concent_warp.fit.fit_geometry import FitCfg, cut
+from concent_warp.fit.geometry.search import Search
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.recording.formats.hdf5 import write_hdf5

@@ -22,8 +22,8 @@ import numpy as np
 import tyro
 
 from concent_warp.events.overlap import contact_frames, iou, resample, settle_frames, time_grid
-from concent_warp.fit.faces import Faces, flattened
-from concent_warp.fit.geometry import FitCfg, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+from concent_warp.fit.geometry.faces import Faces, flattened
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.recording.recording import Demonstration

@@ -18,12 +18,12 @@ from gradient_scenes import SCENES, SceneName, record, starting_model
 from pages import FOLDER, machine, machine_line, table, write_data, write_page
 
 from concent_warp.estimation.object_tracks import whole
-from concent_warp.fit.horizon import shortened
-from concent_warp.fit.newton_loss import NewtonLoss
-from concent_warp.fit.newton_scene import newton_scene
-from concent_warp.fit.newton_worlds import Parameters
-from concent_warp.fit.offset import offset_directions
-from concent_warp.fit.perturbation import Perturbation
+from concent_warp.fit.geometry.offset import offset_directions
+from concent_warp.fit.geometry.perturbation import Perturbation
+from concent_warp.fit.newton.horizon import shortened
+from concent_warp.fit.newton.loss import NewtonLoss
+from concent_warp.fit.newton.scene import newton_scene
+from concent_warp.fit.newton.worlds import Parameters
 
 NAME = "gradient_check"
 STEP, SHARE = 1e-5, 0.01

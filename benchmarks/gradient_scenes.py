@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.fit.offset import offset_directions
-from concent_warp.fit.perturbation import Perturbation
+from concent_warp.fit.geometry.offset import offset_directions
+from concent_warp.fit.geometry.perturbation import Perturbation
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene

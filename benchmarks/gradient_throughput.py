@@ -27,10 +27,10 @@ from measurements import Measurements
 from pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 
 from concent_warp.estimation.object_tracks import whole
-from concent_warp.fit.horizon import shortened
-from concent_warp.fit.newton_loss import NewtonLoss
-from concent_warp.fit.newton_scene import newton_scene
-from concent_warp.fit.newton_worlds import Parameters
+from concent_warp.fit.newton.horizon import shortened
+from concent_warp.fit.newton.loss import NewtonLoss
+from concent_warp.fit.newton.scene import newton_scene
+from concent_warp.fit.newton.worlds import Parameters
 
 NAME = "gradient_throughput"
 

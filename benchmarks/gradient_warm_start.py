@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
 from concent_warp.diagnose.diagnosis import Diagnosis
-from concent_warp.fit.factors import FactorCfg, factors
+from concent_warp.fit.newton.scale_factors import FactorCfg, factors
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

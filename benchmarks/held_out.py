@@ -14,10 +14,10 @@ import numpy as np
 from scipy import stats
 
 from concent_warp.estimation.windows import calm_starts
-from concent_warp.fit.least_squares import Solver
-from concent_warp.fit.observation import Source, Window
-from concent_warp.fit.observe import channel_noises, observe
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.observation import Source, Window
+from concent_warp.fit.effects.observe import channel_noises, observe
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 

@@ -33,7 +33,7 @@ from pages import machine, machine_line, read_data, table, write_data, write_pag
 
 from concent_warp.errors import ConcentError
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.fit.checkpoint import Checkpoint
+from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.model import Model
 
 NAME = "resume"

@@ -18,9 +18,9 @@ import numpy as np
 from everything import Blame, blamed
 
 from concent_warp.diagnose.candidates import candidates
-from concent_warp.fit.observation import Window
-from concent_warp.fit.observe import observe
-from concent_warp.fit.prediction import Prediction, SensorReader
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.prediction import Prediction, SensorReader
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.replay import commands

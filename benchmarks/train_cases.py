@@ -20,8 +20,8 @@ from joblib import Parallel, delayed
 
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects import fit_effects
-from concent_warp.fit.geometry import FitCfg, fit_geometry
+from concent_warp.fit.effects.fit import fit_effects
+from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
 from concent_warp.reality.hidden_in_task import TaskWorld, wanted
 from concent_warp.reality.record import RealityCfg, record

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.events.extract import extract
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel, Demonstration, Recording

@@ -53,13 +53,13 @@ def test_package_keeps_the_rules(tree):
         ("recording.formats.hdf5", "simulate.replay"),
         ("model", "simulate.engine"),
         ("simulate.replay", "events.extract"),
-        ("fit.geometry", "report.report"),
+        ("fit.fit_geometry", "report.report"),
         ("report.report", "ground"),
         ("ground", "cli.demo"),
         ("model", "train"),
         ("train", "render"),
         ("render", "train"),
-        ("fit.geometry", "reality.world"),
+        ("fit.fit_geometry", "reality.world"),
         ("compare.compare", "reality.record"),
         ("train", "reality.record"),
         ("reality.world", "model"),
@@ -81,7 +81,7 @@ def test_breach_is_noticed(tree, module, imported):
     ids=["in a function", "for types", "relative"],
 )
 def test_breach_is_noticed_wherever_it_stands(tree, statement):
-    assert "concent_warp.fit.geometry -> concent_warp.reality" in planted(tree, "fit.geometry", statement)
+    assert "concent_warp.fit.fit_geometry -> concent_warp.reality" in planted(tree, "fit.fit_geometry", statement)
 
 
 def test_module_without_a_place_is_noticed(tree):

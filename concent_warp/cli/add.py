@@ -22,7 +22,7 @@ from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
     from concent_warp.effects.effect import Effect, Parameter
-    from concent_warp.fit.effects import FittedEffects
+    from concent_warp.fit.effects.fit import FittedEffects
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     added = with_effect(model, chosen(model, kind, arguments.target), assigned(arguments.set))
     fitted = None
     if arguments.fit is not None:
-        from concent_warp.fit.effects import fit_effects
+        from concent_warp.fit.effects.fit import fit_effects
         from concent_warp.recording.load import load_recording
 
         recording = load_recording(arguments.fit).only(arguments.demonstrations)

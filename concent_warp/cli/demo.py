@@ -11,7 +11,7 @@ import tyro
 from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.cli.terminal import progress_bar, say
-from concent_warp.fit.geometry import FitCfg
+from concent_warp.fit.fit_geometry import FitCfg
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5

@@ -20,7 +20,7 @@ from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
 from concent_warp.diagnose.diagnosis import Diagnosis, Finding
 from concent_warp.errors import ConcentError, ModelError
-from concent_warp.fit.effects import fit_effects
+from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording

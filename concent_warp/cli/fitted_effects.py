@@ -14,9 +14,9 @@ from concent_warp.cli.terminal import quiet_warp, say, status_bar
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from concent_warp.diagnose.diagnosis import FittedParameter
     from concent_warp.effects.effect import AddedEffect
-    from concent_warp.fit.effects import FittedEffects
+    from concent_warp.fit.effects.fit import FittedEffects
+    from concent_warp.fit.effects.intervals import FittedParameter
 
 
 @contextmanager

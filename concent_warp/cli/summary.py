@@ -17,7 +17,7 @@ from concent_warp.compare.comparison_table import mean_and_interval, percent, un
 from concent_warp.events.sequence import ContactEventSequence
 
 if TYPE_CHECKING:
-    from concent_warp.fit.geometry import Progress
+    from concent_warp.fit.geometry.search import Progress
     from concent_warp.ground import Grounded
 
 

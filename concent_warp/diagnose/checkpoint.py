@@ -17,14 +17,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import Sums
 from concent_warp.diagnose.diagnose import Diagnosis, DiagnosisCfg, Procedure, Progress, silent
 from concent_warp.diagnose.search import Candidate, Node, Screened
 from concent_warp.diagnose.settle import Look
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
-from concent_warp.fit.least_squares import Fit, Linear
+from concent_warp.fit.effects.cross_validation import Sums
+from concent_warp.fit.effects.least_squares import Fit, Linear
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Recording
 

@@ -14,7 +14,6 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import bootstrap_interval, cut_blocks, sign_flip_p
 from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verdict
@@ -40,10 +39,11 @@ from concent_warp.diagnose.search import (
 from concent_warp.diagnose.settle import Look, settled
 from concent_warp.diagnose.where import where
 from concent_warp.estimation.noise import UNDERESTIMATE
-from concent_warp.fit.effects import check_finite
-from concent_warp.fit.least_squares import MANY
-from concent_warp.fit.observe import channel_noises, observe
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.cross_validation import bootstrap_interval, cut_blocks, sign_flip_p
+from concent_warp.fit.effects.fit import check_finite
+from concent_warp.fit.effects.least_squares import MANY
+from concent_warp.fit.effects.observe import channel_noises, observe
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName

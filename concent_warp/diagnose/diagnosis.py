@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these"]
@@ -18,28 +19,6 @@ VERDICTS: dict[Verdict, str] = {
     "none_of_these": "something is missing that no effect in the library explains",
 }
 """Verdicts in words."""
-
-
-@dataclass(frozen=True)
-class FittedParameter:
-    """A parameter of an effect, fitted."""
-
-    name: str
-    value: float
-    low: float
-    """Lower end of the 95 % interval."""
-    high: float
-    """Upper end."""
-    unit: str
-    null: float
-    """Value at which the effect does nothing."""
-    at_bound: bool = False
-    """Whether it has run to a bound that is not the null value."""
-
-    @property
-    def excludes_null(self) -> bool:
-        """Whether the interval excludes the null value; a limit that is infinite by default is excluded if finite."""
-        return bool(np.isfinite(self.high)) if np.isinf(self.null) else not self.low <= self.null <= self.high
 
 
 @dataclass(frozen=True)

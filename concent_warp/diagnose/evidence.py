@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import covariance
-from concent_warp.diagnose.diagnosis import Detectable, Finding, FittedParameter
+from concent_warp.diagnose.diagnosis import Detectable, Finding
 from concent_warp.diagnose.search import Candidate, Node, Screened
-from concent_warp.diagnose.settle import law_errors
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
+from concent_warp.fit.effects.prediction import Prediction
 
 SAME = 0.02
 """Errors that differ by less than this share are taken for the same."""

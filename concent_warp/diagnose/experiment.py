@@ -20,9 +20,9 @@ from concent_warp.diagnose.motions import Bench, Motion
 from concent_warp.diagnose.motions_bodies import body_motions
 from concent_warp.diagnose.motions_drives import drive_motions
 from concent_warp.errors import ConcentError
-from concent_warp.fit.observation import Reading, Source, Window, start_spread
-from concent_warp.fit.observe import channel_noises, keeps_close
-from concent_warp.fit.prediction import Prediction, Trial, turn
+from concent_warp.fit.effects.observation import Reading, Source, Window, start_spread
+from concent_warp.fit.effects.observe import channel_noises, keeps_close
+from concent_warp.fit.effects.prediction import Prediction, Trial, turn
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS

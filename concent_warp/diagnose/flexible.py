@@ -17,13 +17,13 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from concent_warp.diagnose.blocks import FOLDS, HeldOut, block_sums, sign_flip_p
 from concent_warp.diagnose.diagnosis import UnknownForceFound
 from concent_warp.diagnose.search import Node, Screened, chance, screen, with_residuals
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, free_bodies, name, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
-from concent_warp.fit.least_squares import PRIOR
+from concent_warp.fit.effects.cross_validation import FOLDS, HeldOut, block_sums, sign_flip_p
+from concent_warp.fit.effects.least_squares import PRIOR
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands

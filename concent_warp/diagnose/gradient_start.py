@@ -17,9 +17,9 @@ import numpy as np
 from concent_warp.diagnose.search import Node, Screened, remainders, total
 from concent_warp.effects.effect import Effect
 from concent_warp.errors import ConcentError
-from concent_warp.fit.factors import FactorCfg, Factors, factors
-from concent_warp.fit.least_squares import Solver
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.newton.scale_factors import FactorCfg, Factors, factors
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 

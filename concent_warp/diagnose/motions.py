@@ -16,7 +16,7 @@ import numpy as np
 
 from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
-from concent_warp.fit.observation import Source
+from concent_warp.fit.effects.observation import Source
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import commands, initial_state
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import Blocks, HeldOut, Sums, block_sums
 from concent_warp.effects.effect import Effect
-from concent_warp.fit.initial_states import ROUNDS
-from concent_warp.fit.least_squares import Fit, FitCfg, Linear, Solver, projected
-from concent_warp.fit.observation import Window
-from concent_warp.fit.prediction import Prediction
-from concent_warp.fit.robust import HUBER, huber, huber_limit, huber_weight, trust
+from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
+from concent_warp.fit.effects.initial_states import ROUNDS
+from concent_warp.fit.effects.least_squares import Fit, FitCfg, Linear, Solver, projected
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.robust import HUBER, huber, huber_limit, huber_weight, trust
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
@@ -321,7 +321,7 @@ def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
 def chance(base: Node, screened: Sequence[Screened], draws: int, seed: int) -> np.ndarray:
     """Return the largest gain of all candidates on data that lack nothing, as a share of the error, shape (draws,).
 
-    See `concent_warp.diagnose.blocks` for how such data are made.
+    See `concent_warp.fit.effects.cross_validation` for how such data are made.
     """
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], size=(draws, base.blocks.count))

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.diagnose.blocks import covariance
 from concent_warp.diagnose.search import Candidate, Node, judged
-from concent_warp.fit.least_squares import Solver
-from concent_warp.fit.prediction import Prediction
+from concent_warp.fit.effects.intervals import covariance
+from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.prediction import Prediction
 
 if TYPE_CHECKING:
-    from concent_warp.effects.effect import Parameter
+    pass
 
 NEAR, FARTHER, EXTENSIONS = 2.0, 3.0, 3
 """How far to look at first, in standard deviations; how much farther then, and how often."""
@@ -38,8 +38,6 @@ WIDEST = 100.0
 """By how much a valley that never shows widens an interval."""
 ASTRAY = 0.5
 """Share of the distance over which a valley rises by the roughness, squared, that counts as variance."""
-LAW_ERROR = 0.005
-"""Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
 WIDTH_ONLY = float("inf")
 """The same where nothing is taken up any more."""
 
@@ -189,17 +187,3 @@ def parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
     columns = np.column_stack([at, at**2] if both else [at**2])
     found = np.linalg.lstsq(columns, rise, rcond=None)[0]
     return (float(found[0]), float(found[1])) if both else (0.0, float(found[0]))
-
-
-def law_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
-    """Return what is uncertain of an effect's values because simulations of one law differ, one standard deviation.
-
-    A share of the effect's size, the largest difference of a parameter from its null value in units of its scale: the
-    others are told no better than that. It is no property of the data: the fit of a law that acts in steps of time to
-    data from another simulation of the same law is off by about this much (type B: Guide to the Expression of
-    Uncertainty in Measurement, 2008, section 4.3).
-    """
-    scale = np.array([p.scale for p in parameters])
-    null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
-    finite = np.where(np.isfinite(values), values, null)
-    return LAW_ERROR * scale * float(np.abs((finite - null) / scale).max())

@@ -21,7 +21,7 @@ from concent_warp.errors import ConcentError
 from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
-    from concent_warp.fit.observation import Window
+    from concent_warp.fit.effects.observation import Window
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 

@@ -20,7 +20,7 @@ from concent_warp.simulate.replay import initial_state
 from concent_warp.simulate.select import make_engine
 
 if TYPE_CHECKING:
-    from concent_warp.fit.geometry import FitResult
+    from concent_warp.fit.geometry.search import FitResult
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration
 

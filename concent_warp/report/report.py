@@ -22,7 +22,7 @@ from concent_warp.report.tables import demonstration_table, error_table, provena
 from concent_warp.report.where import noise_words, place_list, shown_demonstrations
 
 if TYPE_CHECKING:
-    from concent_warp.fit.geometry import FitResult
+    from concent_warp.fit.geometry.search import FitResult
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 

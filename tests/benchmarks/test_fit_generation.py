@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg, Search, cut
+from concent_warp.fit.fit_geometry import FitCfg, cut
+from concent_warp.fit.geometry.evolution import EvolutionCfg
+from concent_warp.fit.geometry.search import Search
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.warp_engine import WarpEngine
 

@@ -1,8 +1,8 @@
 import pytest
 
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg
-from concent_warp.fit.gradient import GradientCfg
+from concent_warp.fit.fit_geometry import FitCfg
+from concent_warp.fit.geometry.evolution import EvolutionCfg
+from concent_warp.fit.newton.descent import GradientCfg
 
 
 def test_slopes_of_settling_are_those_of_central_differences(script):

@@ -6,7 +6,7 @@ from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from tests.cli.conftest import XML
-from tests.fit.swinging import DAMPING, swung
+from tests.scenes.swinging import DAMPING, swung
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from concent_warp.diagnose.diagnosis import Diagnosis
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel
-from tests.fit.swinging import DAMPING, NOISE, swing_scene, swung
+from tests.scenes.swinging import DAMPING, NOISE, swing_scene, swung
 
 FEW = ["--effects", "joint_damping", "armature", "--jobs", "1"]
 

@@ -5,8 +5,8 @@ from concent_warp.effects.registry import effect_class, effects
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from tests.fit.swinging import swing_scene
-from tests.fit.tossing import EDGE, toss_scene
+from tests.scenes.swinging import swing_scene
+from tests.scenes.tossing import EDGE, toss_scene
 
 
 def swing():

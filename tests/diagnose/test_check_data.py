@@ -5,7 +5,7 @@ import pytest
 
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.recording.recording import Channel
-from tests.fit.swinging import swung
+from tests.scenes.swinging import swung
 
 
 def spoiled(change):

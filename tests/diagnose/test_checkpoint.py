@@ -10,7 +10,7 @@ from concent_warp.diagnose.search import Screened
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
 from tests.diagnose.same_results import assert_same
-from tests.fit.swinging import drawing, swung
+from tests.scenes.swinging import drawing, swung
 
 CFG = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
 

@@ -10,7 +10,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 from tests.diagnose.same_results import assert_same
-from tests.fit.swinging import DAMPING, NOISE, drawing, swing_scene, swung
+from tests.scenes.swinging import DAMPING, NOISE, drawing, swing_scene, swung
 
 FEW = ("joint_damping", "joint_friction", "armature", "actuator_gain", "sensor_bias")
 CFG = DiagnosisCfg(effects=FEW, jobs=1, explain=False)

@@ -5,7 +5,7 @@ import pytest
 
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
 from tests.diagnose.same_results import assert_same
-from tests.fit.swinging import drawing, swung
+from tests.scenes.swinging import drawing, swung
 
 distributed = pytest.importorskip("distributed")
 

@@ -9,7 +9,7 @@ import pytest
 
 from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
 from concent_warp.diagnose.diagnosis import VERDICTS
-from tests.fit.swinging import drawing, swung
+from tests.scenes.swinging import drawing, swung
 
 PAGE = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text()
 

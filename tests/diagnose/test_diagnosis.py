@@ -4,18 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.diagnosis import (
-    VERDICTS,
-    Detectable,
-    Diagnosis,
-    Finding,
-    FittedParameter,
-    joined,
-    number,
-)
+from concent_warp.diagnose.diagnosis import VERDICTS, Detectable, Diagnosis, Finding, joined, number
+from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from tests.fit.swinging import swing_scene
+from tests.scenes.swinging import swing_scene
 
 FRICTION = FittedParameter("torque[hinge]", 0.03, 0.029, 0.031, "N m", 0.0)
 LIMIT = FittedParameter("limit", 2.0, 1.9, np.inf, "N m", np.inf)

@@ -8,7 +8,7 @@ from concent_warp.effects.library.contact import SlidingFriction, TorsionalFrict
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.effects.library.measurement import SensorBias
 from concent_warp.effects.library.world import GravityTilt
-from concent_warp.fit.observe import channel_noises
+from concent_warp.fit.effects.observe import channel_noises
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

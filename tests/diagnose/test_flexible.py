@@ -6,14 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.blocks import cut_blocks
 from concent_warp.diagnose.candidates import candidates
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.diagnose.flexible import LEAST, best_force, forces, unknown_force
 from concent_warp.diagnose.search import extended, fit_candidate, node, screen
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce
-from concent_warp.fit.observe import observe
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

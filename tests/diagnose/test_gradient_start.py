@@ -12,7 +12,7 @@ from concent_warp.diagnose.search import fit_candidate, screen
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
 from concent_warp.effects.library.objects import Inertia, Mass
 from concent_warp.errors import ModelError
-from concent_warp.fit.factors import Factors
+from concent_warp.fit.newton.scale_factors import Factors
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

@@ -1,11 +1,11 @@
 import pytest
 
-from concent_warp.diagnose.blocks import cut_blocks
 from concent_warp.diagnose.checkpoint import CheckpointedProcedure
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.diagnose.search import extended, fit_candidate, node, polish_candidate, screen, without
 from concent_warp.effects.registry import effect_class
-from tests.fit.swinging import DAMPING, drawing, swung, windows_of
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.blocks import cut_blocks
 from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.diagnose.diagnosis import Finding
 from concent_warp.diagnose.evidence import alike
@@ -17,9 +16,10 @@ from concent_warp.diagnose.search import (
     screen,
 )
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.least_squares import Solver
-from concent_warp.fit.prediction import Prediction
-from tests.fit.swinging import DAMPING, drawing, swung, windows_of
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.prediction import Prediction
+from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 
 NAMES = ("joint_damping", "joint_friction", "armature")
 

@@ -3,15 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnose.blocks import covariance, cut_blocks
 from concent_warp.diagnose.search import fit_candidate, judged, node, screen
 from concent_warp.diagnose.settle import (
     ASTRAY,
     FARTHER,
-    LAW_ERROR,
     NEAR,
     WIDEST,
-    law_errors,
     look,
     parabola,
     roughness,
@@ -22,7 +19,9 @@ from concent_warp.diagnose.settle import (
 )
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.registry import effect_class
-from tests.fit.swinging import DAMPING, drawing, swung, windows_of
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.intervals import LAW_ERROR, covariance, law_errors
+from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 
 
 @pytest.fixture(scope="module")

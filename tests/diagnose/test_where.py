@@ -8,7 +8,7 @@ from concent_warp.diagnose import where as module
 from concent_warp.diagnose.locate import locate
 from concent_warp.diagnose.where import located, where, with_starts
 from concent_warp.errors import RecordingError
-from concent_warp.fit.observe import observe
+from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError, RecordingError
-from concent_warp.fit.checkpoint import Checkpoint
-from concent_warp.fit.evolution import EvolutionCfg
-from concent_warp.fit.geometry import FitCfg, FitResult, Progress, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+from concent_warp.fit.geometry.checkpoint import Checkpoint
+from concent_warp.fit.geometry.evolution import EvolutionCfg
+from concent_warp.fit.geometry.search import FitResult, Progress
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
@@ -138,7 +139,7 @@ def test_a_model_without_spheres_is_refused(drop, swollen):
 
 def test_the_true_geometry_scores_best(drop, swollen):
     from concent_warp.estimation.object_tracks import whole
-    from concent_warp.fit.objective import Candidates, Objective
+    from concent_warp.fit.geometry.objective import Candidates, Objective
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 
     halves = HALF + np.array([-0.002, 0.0, 0.002])

@@ -5,7 +5,7 @@ import pytest
 from concent_warp.compare.compare import compare
 from concent_warp.compare.no_contact import without_object_contact
 from concent_warp.events.extract import extract
-from concent_warp.fit.geometry import FitResult
+from concent_warp.fit.geometry.search import FitResult
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.report.report import write_report

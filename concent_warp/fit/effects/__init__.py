@@ -1,0 +1,1 @@
+"""Effect parameters and initial states by robust least squares."""

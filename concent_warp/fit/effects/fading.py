@@ -1,0 +1,88 @@
+"""Errors of an initial state that motion forgets: only the time until then is simulated.
+
+Drives pull joints back to where they are commanded to be, and a body that rests finds back to rest: after a moment a
+simulation from a slightly different state goes the way of the first one. Where it is seen to, the rest of a long window
+is taken from there. What does not fade is simulated to the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from concent_warp.fit.effects.prediction import Course, Prediction, Trial
+
+AFTER = 1.0
+"""Time after which an error has to have faded [s]."""
+LONG = 3.0
+"""Length of a window from which on it is worth a try [s]."""
+FADED = 1e-3
+"""Share of an error that may be left, in units of the state's spread."""
+WATCHED = (0.75, 0.85, 0.95, 1.0)
+"""When that is looked at, as shares of the time."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """A simulation that others are close to."""
+
+    trial: Trial
+    residual: np.ndarray
+    """Its residuals, shape (count,)."""
+
+
+def is_long(prediction: Prediction, window: int) -> bool:
+    """Return whether a window is long enough for errors to fade in it."""
+    w = prediction.windows[window]
+    return w.end - w.start >= LONG
+
+
+def residuals_near(
+    prediction: Prediction, known: Mapping[int, Known], trials: Sequence[Trial], hoped: Sequence[bool]
+) -> tuple[list[np.ndarray], list[bool]]:
+    """Return the residuals of trials that differ from known ones of their windows by the initial state only.
+
+    Args:
+        prediction: What simulates.
+        known: The known ones, by window.
+        trials: The trials.
+        hoped: For which of them it is tried whether the difference fades.
+
+    Returns:
+        The residuals, and for which trials the difference has faded.
+    """
+    found: list[np.ndarray | None] = [None] * len(trials)
+    short = [i for i, hope in enumerate(hoped) if hope]
+    windows = sorted({trials[i].window for i in short})
+    courses = prediction.courses([*(known[w].trial for w in windows), *(trials[i] for i in short)], AFTER)
+    first = dict(zip(windows, courses, strict=False))
+    begun = {w: prediction.observed(w, first[w].reader, known[w].trial.values) for w in windows}
+    for i, course in zip(short, courses[len(windows) :], strict=True):
+        w, trial = trials[i].window, trials[i]
+        if has_faded(prediction, trial, known[w].trial, course, first[w]):
+            window = prediction.windows[w]
+            change = prediction.observed(w, course.reader, trial.values) - begun[w]
+            found[i] = known[w].residual + np.where(window.clock - window.start <= AFTER, change, 0.0)
+    rest = [i for i, residual in enumerate(found) if residual is None]
+    for i, residual in zip(rest, prediction.residuals([trials[i] for i in rest]), strict=True):
+        found[i] = residual
+    return [r for r in found if r is not None], [i not in set(rest) for i in range(len(trials))]
+
+
+def has_faded(prediction: Prediction, trial: Trial, other: Trial, course: Course, first: Course) -> bool:
+    """Return whether a simulation has found to the way of another one."""
+    m, spread = prediction.compiled, prediction.windows[trial.window].spread
+    none = np.zeros_like(spread)
+    away = (none if trial.offset is None else trial.offset) - (none if other.offset is None else other.offset)
+    allowed = FADED * float(np.abs(away / spread).max())
+    position = np.empty(m.nv)
+    for share in WATCHED:
+        k = round(share * (len(course.qpos) - 1))
+        mujoco.mj_differentiatePos(m, position, 1.0, first.qpos[k], course.qpos[k])
+        off = np.concatenate([position, course.qvel[k] - first.qvel[k]]) / spread
+        if not np.abs(off).max() <= allowed:  # so that NaN has not
+            return False
+    return True

@@ -1,0 +1,257 @@
+"""The fit of all parameters of a model's effects, with intervals and with what is doubtful about it in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from concent_warp.errors import ModelError
+from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
+from concent_warp.fit.effects.initial_states import start_cost, start_step
+from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
+from concent_warp.fit.effects.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observe import observe
+from concent_warp.fit.effects.prediction import Prediction, Trial
+from concent_warp.fit.effects.robust import HUBER, huber, huber_limit
+from concent_warp.model import Model
+from concent_warp.recording.recording import Recording
+from concent_warp.simulate.select import EngineName
+
+UNKNOWN = 0.5
+"""A parameter whose standard deviation is this share of its weak prior's was not measured."""
+ALIKE = 0.98
+"""Correlation of two parameters from which on the data say little of each by itself."""
+AT_NOISE = 1.05
+"""Residual over noise below which there is nothing to be explained, and chance decides which of two is smaller."""
+NORMAL = 1.96
+"""Standard deviations of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """Residual over noise of one channel, root mean square, rows beyond four times the noise weighed down."""
+
+    channel: str
+    before: float
+    """With the values that the model came with."""
+    after: float
+    """With the fitted ones."""
+
+
+@dataclass(frozen=True)
+class FittedEffects:
+    """A model whose effects were fitted."""
+
+    model: Model
+    """The model with the values and their 95 % intervals."""
+    parameters: tuple[tuple[FittedParameter, ...], ...]
+    """The same by effect, in the order of the model's effects."""
+    before: float
+    """Residual over noise with the values that the model came with; initial states are fitted before and after."""
+    after: float
+    """With the fitted ones."""
+    channels: tuple[ChannelError, ...]
+    converged: bool
+    remarks: tuple[str, ...]
+    """What is doubtful, a sentence each."""
+
+    @property
+    def fall(self) -> float:
+        """Share of the squared residual that the fit takes away."""
+        return 1.0 - (self.after / max(self.before, 1e-12)) ** 2
+
+
+def fit_effects(
+    model: Model,
+    recording: Recording,
+    progress: Callable[[float, str], None] | None = None,
+    *,
+    cfg: FitCfg | None = None,
+    window: float | None = None,
+    engine: EngineName = "mujoco",
+    seed: int = 0,
+) -> FittedEffects:
+    """Fit all parameters of a model's effects together with the initial states.
+
+    Parameters that stand at their null value and name values worth a trial start from the best of these.
+
+    Args:
+        model: The model with effects, at the values to start from.
+        recording: What was commanded and measured.
+        progress: Called with the share done, 0..1, and what is being done.
+        cfg: Settings of the fit.
+        window: Length of a window [s]; by default as long as the motion allows.
+        engine: Which engine simulates.
+        seed: Of the disturbances that tell how long windows may be.
+
+    Raises:
+        ModelError: The model has no effects, or does not stay finite on the recording.
+        RecordingError: There is too little to fit to, or it does not fit the model.
+        EngineError: The model cannot be simulated.
+    """
+    if not model.effects:
+        raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
+    said = progress or silent
+    said(0.0, "cutting windows")
+    windows = observe(model, recording, length=window, engine=engine, seed=seed)
+    solver = Solver(Prediction(model, (), windows, engine=engine), cfg)
+    check_finite(solver.p, model.scene.source)
+    said(0.1, "initial states")
+    start = solver.p.start
+    offsets, starts = solver.refine_starts(start, [np.zeros(len(w.spread)) for w in windows])
+    given = rest(solver, start, offsets, starts)
+    said(0.3, "trial values")
+    chosen = best_start(solver, start, offsets, starts)
+    fit = solver.fit(chosen, offsets, starts, lambda share: said(0.3 + 0.5 * share, "fitting"))
+    said(0.8, "fitting again")
+    fit = solver.polish(fit)
+    pieces = projected(fit)
+    found = [piece.residual for piece in pieces]
+    said(1.0, "done")
+    parameters, correlation = fitted_parameters(solver, fit, pieces, windows)
+    remarks = doubts(solver, fit, parameters, correlation)
+    before, after = noise_ratio(given), noise_ratio(found)
+    if after > max(before, AT_NOISE):
+        remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
+    return FittedEffects(
+        solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
+        tuple(tuple(parameters[part]) for part in solver.p.split),
+        before,
+        after,
+        by_channel(windows, given, found),
+        fit.converged,
+        tuple(remarks),
+    )
+
+
+def silent(share: float, text: str) -> None:
+    """Say nothing of progress."""
+    del share, text
+
+
+def check_finite(prediction: Prediction, source: str) -> None:
+    """Check that a model stays finite over the measured times of most windows.
+
+    Raises:
+        ModelError: It does not in more than half of them.
+    """
+    readers = prediction.readers([Trial(w, prediction.start) for w in range(len(prediction.windows))])
+    lost = [
+        not all(np.isfinite(reader(r.channel, r.time)).all() for r in window.readings)
+        for window, reader in zip(prediction.windows, readers, strict=True)
+    ]
+    if np.mean(lost) > 0.5:
+        raise ModelError(
+            "the model does not stay finite on this recording",
+            where=source,
+            fix="check time step, units and initial state, for instance with `concent compare`",
+        )
+
+
+def rest(
+    solver: Solver, values: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the residuals at some values with the initial states eliminated, one (n,) a window."""
+    residuals = solver.p.residuals(solver.trials(values, offsets))
+    limit = huber_limit(residuals)
+    return [r + a @ start_step(r, a, o, limit, 0.0) for r, a, o in zip(residuals, starts, offsets, strict=True)]
+
+
+TELLING = 1.0
+"""By how much a trial value must lower the cost, half a sum of squares in units of noise, to be set out from."""
+
+
+def best_start(
+    solver: Solver, given: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the values from which a fit is to start, shape (P,): those given, or some that parameters name."""
+    parameters = solver.p.parameters
+    trials = [np.where(np.isfinite(given), given, solver.high)]
+    for k, parameter in enumerate(parameters):
+        if given[k] == parameter.null:
+            for value in parameter.scan:
+                moved = trials[0].copy()
+                moved[k] = value
+                trials.append(moved)
+    if len(trials) == 1:
+        return trials[0]
+    residuals = [rest(solver, values, offsets, starts) for values in trials]
+    limit = huber_limit(residuals[0])
+    costs = [sum(start_cost(r, np.zeros(1), limit) for r in of_trial) for of_trial in residuals]
+    best = int(np.argmin(costs))
+    return trials[best] if costs[best] < costs[0] - TELLING else trials[0]
+
+
+def fitted_parameters(
+    solver: Solver, fit: Fit, pieces: Sequence[Linear], windows: Sequence[Window]
+) -> tuple[list[FittedParameter], np.ndarray]:
+    """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
+
+    The intervals are those of the linear fit with the law's own error, see `law_errors`.
+    """
+    blocks = cut_blocks(windows)
+    limit = huber_limit([piece.residual for piece in pieces])
+    covered = covariance(block_sums(pieces, blocks, limit), blocks)
+    std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
+    law = np.zeros(len(std))
+    for part in solver.p.split:
+        if part.stop > part.start:
+            law[part] = law_errors(solver.p.parameters[part], fit.values[part])
+    reaches = NORMAL * np.hypot(std * solver.scale, law)
+    found = []
+    for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
+        value = float(fitted)
+        low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
+        untold = high - low > 2 * NORMAL * UNKNOWN * PRIOR * q.scale
+        if np.isinf(q.null) and (high >= q.high or untold):  # a limit that is never reached may as well not be there
+            high = q.null
+        at_bound = value in (q.low, q.high) and q.null not in (value, high)
+        found.append(FittedParameter(q.name, value, low, high, q.unit, q.null, at_bound))
+    return found, covered / np.outer(std, std)
+
+
+def doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], correlation: np.ndarray) -> list[str]:
+    """Return what is doubtful about a fit, a sentence each."""
+    found = []
+    if not fit.converged:
+        found.append("The fit has not converged: take its values with care, or start from better ones.")
+    unknown = set()
+    for k, (q, prior) in enumerate(zip(parameters, solver.p.parameters, strict=True)):
+        if q.at_bound:
+            found.append(f"{q.name} ended on its bound, {q.value:g} {q.unit}: what is missing may be something else.")
+        width = q.high - q.low
+        if width > 2 * NORMAL * UNKNOWN * PRIOR * prior.scale or width >= 0.99 * (prior.high - prior.low):
+            unknown.add(k)
+            found.append(f"The recording says next to nothing about {q.name}.")
+    for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
+        if not any(q.excludes_null for q in parameters[part]) and not set(range(len(parameters))[part]) <= unknown:
+            found.append(f"{effect.name} may be absent: within its interval it does nothing.")
+    for k in range(len(parameters)):
+        for j in range(k):
+            if abs(correlation[k, j]) > ALIKE and not {k, j} & unknown:
+                found.append(
+                    f"{parameters[j].name} and {parameters[k].name} act so alike in this recording that it tells "
+                    f"little of each by itself (correlation {correlation[k, j]:.3f})."
+                )
+    return found
+
+
+def noise_ratio(residuals: Sequence[np.ndarray]) -> float:
+    """Return the root mean square of residuals in units of noise, rows beyond `HUBER` times it weighed down."""
+    return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), HUBER))))
+
+
+def by_channel(
+    windows: Sequence[Window], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
+) -> tuple[ChannelError, ...]:
+    """Return the residual over noise of each channel, largest first."""
+    names = dict.fromkeys(r.channel for w in windows for r in w.readings)
+    found = []
+    for name in names:
+        rows = [(k, r.rows) for k, w in enumerate(windows) for r in w.readings if r.channel == name]
+        first, last = (noise_ratio([residuals[k][s] for k, s in rows]) for residuals in (before, after))
+        found.append(ChannelError(name, first, last))
+    return tuple(sorted(found, key=lambda c: -c.before))

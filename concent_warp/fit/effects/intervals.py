@@ -1,0 +1,69 @@
+"""How sharply data determine the parameters of effects: covariance, and what the form of an effect leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from concent_warp.effects.effect import Parameter
+from concent_warp.fit.effects.cross_validation import Blocks, Sums
+from concent_warp.fit.effects.least_squares import PRIOR
+
+LAW_ERROR = 0.005
+"""Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter of an effect, fitted."""
+
+    name: str
+    value: float
+    low: float
+    """Lower end of the 95 % interval."""
+    high: float
+    """Upper end."""
+    unit: str
+    null: float
+    """Value at which the effect does nothing."""
+    at_bound: bool = False
+    """Whether it has run to a bound that is not the null value."""
+
+    @property
+    def excludes_null(self) -> bool:
+        """Whether the interval excludes the null value; a limit that is infinite by default is excluded if finite."""
+        return bool(np.isfinite(self.high)) if np.isinf(self.null) else not self.low <= self.null <= self.high
+
+
+def covariance(sums: Sums, blocks: Blocks) -> np.ndarray:
+    """Return the covariance of the parameters, in units of their scale, robust to correlation within blocks (P, P).
+
+    H^-1 (sum_b u_b u_b') H^-1 B / (B - P), the sandwich of Liang and Zeger, Biometrika 73, 1986, but not below H^-1,
+    what independent noise of the stated size would leave.
+    """
+    size = sums.slope.shape[1]
+    inverse = np.linalg.pinv(sums.normal.sum(axis=0) + np.eye(size) / PRIOR**2, hermitian=True)
+    scores = sums.slope - sums.slope.mean(axis=0)
+    correction = blocks.count / max(blocks.count - size, 1)
+    robust = inverse @ (scores.T @ scores) @ inverse * correction
+    wider = np.sqrt(np.maximum(np.diag(robust), np.diag(inverse)))
+    spread = np.sqrt(np.maximum(np.diag(robust), 1e-300))
+    found = robust * np.outer(wider / spread, wider / spread)
+    np.fill_diagonal(found, wider**2)  # also of parameters that nothing depends on, whose scores are all zero
+    return found
+
+
+def law_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
+    """Return what is uncertain of an effect's values because simulations of one law differ, one standard deviation.
+
+    A share of the effect's size, the largest difference of a parameter from its null value in units of its scale: the
+    others are told no better than that. It is no property of the data: the fit of a law that acts in steps of time to
+    data from another simulation of the same law is off by about this much (type B: Guide to the Expression of
+    Uncertainty in Measurement, 2008, section 4.3).
+    """
+    scale = np.array([p.scale for p in parameters])
+    null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
+    finite = np.where(np.isfinite(values), values, null)
+    return LAW_ERROR * scale * float(np.abs((finite - null) / scale).max())

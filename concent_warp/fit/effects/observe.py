@@ -1,0 +1,176 @@
+"""The cutting of recordings into windows that a simulation can follow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.compare.residuals import kind_and_unit
+from concent_warp.errors import RecordingError
+from concent_warp.estimation.noise import pooled_noise
+from concent_warp.estimation.windows import Measured
+from concent_warp.fit.effects.observation import FEWEST, START_NOISE, Source, Window, first_time, start_spread
+from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.replay import commands
+from concent_warp.simulate.select import EngineName, make_engine
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Demonstration, Recording
+
+PROBES = 6
+"""Pairs of simulations from slightly different states."""
+CURVED = 3.0
+"""A window ends when what errors of its start do is no longer in proportion to them: when what opposite errors do
+differs by this many times the noise."""
+CALM = 2.0
+"""Scatter of the samples about a smooth motion, over its median, below which a window may start."""
+SHORTEST = 0.12
+"""Shortest window [s]."""
+LONGEST = 20.0
+"""Longest window [s]."""
+DEFAULT_STD = {"rad": 1e-3, "m": 1e-3, "rad/s": 1e-2, "m/s": 1e-2}
+"""Noise of channels that tell nothing of it, by unit."""
+
+
+def channel_noises(model: Model, recording: Recording) -> dict[str, float]:
+    """Return the noise of each channel that the model's sensors predict, standard deviation of a component.
+
+    Raises:
+        RecordingError: A channel has another dimension than its sensor, or no channel can be compared at all.
+    """
+    m = model.compile()
+    found: dict[str, float] = {}
+    names = dict.fromkeys(name for d in recording.demonstrations for name in d.measured)
+    known = {m.sensor(i).name for i in range(m.nsensor)}
+    for name in names:
+        if name not in known:
+            raise RecordingError(
+                f"a measurement of a sensor {name!r} that the model lacks",
+                where=recording.source,
+                expected=f"one of {sorted(known)}",
+            )
+        row = m.sensor(name).id
+        channels = [d.measured[name] for d in recording.demonstrations if name in d.measured]
+        if any(c.value.shape[1] != m.sensor_dim[row] for c in channels):
+            raise RecordingError(
+                f"sensor {name!r} measures another number of values than the model's",
+                where=recording.source,
+                expected=int(m.sensor_dim[row]),
+                found=[c.value.shape[1] for c in channels],
+            )
+        if sum(int(np.isfinite(c.value).all(axis=1).sum()) for c in channels) < 2:
+            continue
+        kind, unit = kind_and_unit(m, row)
+        std = pooled_noise(channels, kind).std
+        found[name] = std if np.isfinite(std) and std > 0 else DEFAULT_STD.get(unit, 1e-2)
+    count = sum(
+        int(np.isfinite(d.measured[name].value).sum())
+        for name in found
+        for d in recording.demonstrations
+        if name in d.measured
+    )
+    if count < FEWEST:
+        raise RecordingError(
+            "too little was measured to compare a model with",
+            where=recording.source,
+            expected=f"at least {FEWEST} finite values in channels that the model's sensors predict",
+            found=count,
+        )
+    return found
+
+
+def observe(
+    model: Model,
+    recording: Recording,
+    *,
+    length: float | None = None,
+    noise: Mapping[str, float] | None = None,
+    engine: EngineName = "mujoco",
+    seed: int = 0,
+) -> list[Window]:
+    """Return the windows of all demonstrations of a recording.
+
+    Args:
+        model: The model that is to follow them.
+        recording: What was commanded and measured.
+        length: Length of a window [s]; by default as long as the model's motion keeps close to where it started.
+        noise: Standard deviation of a component of each channel; by default stated or estimated.
+        engine: Which engine simulates.
+        seed: Of the disturbances that tell how fast differences grow.
+
+    Raises:
+        RecordingError: There is too little to compare.
+    """
+    source = Source(model, recording, noise or channel_noises(model, recording))
+    windows: list[Window] = []
+    for number, d in enumerate(recording.demonstrations):
+        channels = [c for c in source.noise if c in d.measured]
+        last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
+        start = 0.0 if d.qpos is not None or d.action else first_time(d, channels)
+        measured = source.measured(d)
+        while start < last - 1e-6:
+            end = last
+            if measured is not None:
+                reach = length if length is not None else keeps_close(source, d, start, last, engine, seed)
+                end = last if last - start - reach < SHORTEST else calmest(measured, start, reach)
+            if (window := source.window(number, start, end)) is not None:
+                windows.append(window)
+            start = end
+    if not windows:
+        raise RecordingError("nothing was measured that a model could be compared with", where=recording.source)
+    return windows
+
+
+def keeps_close(source: Source, d: Demonstration, start: float, last: float, engine: EngineName, seed: int) -> float:
+    """Return for how long [s] what errors of a start do to the motion stays in proportion to them."""
+    m = source.model.compile()
+    span = min(last - start, LONGEST)
+    steps = max(int(np.ceil(span / m.opt.timestep)), 1)
+    qpos, qvel = source.state(d, start)
+    noise = {c: source.noise[c] for c in source.noise if c in d.measured}
+    spread = start_spread(m, noise) / START_NOISE
+    rng = np.random.default_rng(seed)
+    n = 2 * PROBES + 1
+    positions, velocities = np.tile(qpos, (n, 1)), np.tile(qvel, (n, 1))
+    for i in range(1, n, 2):
+        offset = rng.normal(size=2 * m.nv) * spread
+        for row, sign in ((i, 1.0), (i + 1, -1.0)):
+            mujoco.mj_integratePos(m, positions[row], sign * offset[: m.nv], 1.0)
+            velocities[row] += sign * offset[m.nv :]
+    every = max(int(0.01 / m.opt.timestep), 1)
+    record = np.arange(0, steps + 1, every)
+    simulator = make_engine(engine, source.model)
+    ctrl = commands(m, d, steps, start)
+    rollout = simulator.run(Variants(n, qpos=positions, qvel=velocities), ctrl, record=record, bodies=[]).numpy()
+    curved = np.zeros(len(record))
+    for name, std in noise.items():
+        row = m.sensor(name).id
+        address, dim = m.sensor_adr[row], m.sensor_dim[row]
+        value = rollout.sensordata[:, :, address : address + dim]
+        if dim == 4:
+            value = np.where((value * value[:1]).sum(axis=2, keepdims=True) < 0, -value, value)
+        second = np.linalg.norm(value[1::2] + value[2::2] - 2 * value[:1], axis=2) / 2
+        size = (2.0 if dim == 4 else 1.0) / (std * np.sqrt(dim))
+        with np.errstate(invalid="ignore"):  # between two draws that diverge: inf - inf
+            bend = np.quantile(size * second, 0.8, axis=0)
+        curved = np.maximum(curved, np.nan_to_num(bend, nan=np.inf))
+    wild = np.flatnonzero(curved > CURVED)
+    reach = span if not len(wild) else float(record[wild[0]] * m.opt.timestep)
+    return float(np.clip(reach, SHORTEST, span))
+
+
+def calmest(measured: Measured, start: float, reach: float) -> float:
+    """Return where a reach had better end [s]: late, and not in an impact, where no velocity is to be had."""
+    times = start + np.linspace(reach, 0.35 * reach, 27)
+    rough = measured.roughness(times)
+    calm = np.flatnonzero(rough < CALM)
+    return float(times[calm[0] if len(calm) else rough.argmin()])
+
+
+def demonstrations_of(windows: Sequence[Window]) -> list[int]:
+    """Return the demonstrations that windows are of, each once."""
+    return sorted({w.number for w in windows})

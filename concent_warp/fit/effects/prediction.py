@@ -1,0 +1,281 @@
+"""What a model predicts for windows of a recording, as a function of its effects' parameters and of initial states."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, written
+from concent_warp.simulate.engine import Engine, Variants
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, commands
+from concent_warp.simulate.select import EngineName, make_engine
+
+if TYPE_CHECKING:
+    from concent_warp.fit.effects.observation import Window
+    from concent_warp.model import Model
+
+LOST = 1e3
+"""Residual, in units of noise, of what is not predicted because the simulation has diverged."""
+BEYOND = 0.05
+"""How far predictions are continued in a straight line before and after a window [s]."""
+MEMORY = 2**25
+"""Size of the simulations that are kept in case they are asked for again [bytes]."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One simulation: a window, from a state off the measured one, with values of the parameters."""
+
+    window: int
+    values: np.ndarray
+    """Shape (P,)."""
+    offset: np.ndarray | None = None
+    """Difference of the initial state, positions then velocities, shape (2 nv,); None for none."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a simulation went through."""
+
+    reader: Reader
+    """What the model's instruments read; times count from the window's start."""
+    qpos: np.ndarray
+    """Shape (K + 1, nq)."""
+    qvel: np.ndarray
+    """Shape (K + 1, nv)."""
+    size: int
+    """Of what the instruments read [bytes]."""
+
+
+class Prediction:
+    """Predicted measurements of a model with some effects.
+
+    The parameters are those of the effects that the model has, then those of the effects in question, P in all.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        effects: Sequence[Effect],
+        windows: Sequence[Window],
+        *,
+        engine: EngineName = "mujoco",
+        threads: int | None = None,
+    ) -> None:
+        """Prepare to simulate.
+
+        Args:
+            model: The model, whose effects take part with variable values.
+            effects: Effects that it does not have.
+            windows: What is predicted.
+            engine: Which engine simulates.
+            threads: Simulations at a time, for C MuJoCo; by default one for each CPU.
+        """
+        self.windows = list(windows)
+        self.effects: tuple[Effect, ...] = (*(a.effect for a in model.effects), *effects)
+        self._base = replace(model, effects=())
+        plain = self._base.compile()
+        owned = [e.effect.parameters(plain) for e in model.effects]
+        # Null values follow from the model without the effect: what it has already counts.
+        current = model.compile()
+        fresh = [e.parameters(current) for e in effects]
+        self.parameters: tuple[Parameter, ...] = tuple(p for group in (*owned, *fresh) for p in group)
+        ends = np.cumsum([0, *(len(group) for group in (*owned, *fresh))])
+        self.split = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+        self.start = np.array(
+            [v for a in model.effects for v in a.values] + [p.null for group in fresh for p in group], dtype=float
+        )
+        self.owned = sum(len(group) for group in owned)
+        self._engine_name: EngineName = engine
+        self._threads = threads
+        self._engines: dict[tuple[float, ...], tuple[Engine, mujoco.MjModel]] = {}
+        self._edits = [i for i, e in enumerate(self.effects) if e.edits]
+        self.measured_only = np.zeros(len(self.parameters), dtype=bool)
+        for e, part in zip(self.effects, self.split, strict=True):
+            pure = e.measures and not e.edits and not e.commands and type(e).write is Effect.write
+            self.measured_only[part] = pure
+        self._kept: dict[tuple[int, bytes, bytes], tuple[Reader, int]] = {}
+        self.simulated = 0
+        """Simulated time so far [s]."""
+
+    @property
+    def compiled(self) -> mujoco.MjModel:
+        """The compiled model at the start values, prepared for the effects."""
+        return self._engine(self.start)[0].compiled
+
+    def only(self, windows: Sequence[int]) -> Prediction:
+        """Return the prediction of some of the windows, with a memory of its own."""
+        found = copy(self)
+        found.windows, found._kept = [self.windows[w] for w in windows], {}
+        return found
+
+    def model(self, values: np.ndarray, intervals: Sequence[tuple[float, float]] = ()) -> Model:
+        """Return the model with all effects at some values, shape (P,), and their intervals."""
+        added = []
+        for e, part in zip(self.effects, self.split, strict=True):
+            added.append(AddedEffect(e, tuple(float(v) for v in values[part]), tuple(intervals[part])))
+        return replace(self._base, effects=tuple(added))
+
+    def _engine(self, values: np.ndarray) -> tuple[Engine, mujoco.MjModel]:
+        """Return the engine for the values that enter the MJCF, and the model before effects write their fields."""
+        key = tuple(float(v) for i in self._edits for v in values[self.split[i]])
+        if key not in self._engines:
+            if len(self._engines) > 8:
+                self._engines.pop(next(iter(self._engines)))
+            model = self.model(values)
+            limited = self._threads is not None and self._engine_name == "mujoco"
+            engine: Engine = (
+                MujocoEngine(model, threads=self._threads) if limited else make_engine(self._engine_name, model)
+            )
+            self._engines[key] = engine, model.spec().compile()
+        return self._engines[key]
+
+    def readers(self, trials: Sequence[Trial]) -> list[Reader]:
+        """Simulate, and return what the model's instruments read in each trial; times count from the window's start.
+
+        Effects of measurement are applied on top, by `observed`. What was simulated lately is not simulated again.
+        """
+        keys = [self._key(trial) for trial in trials]
+        new = {key: i for i, key in enumerate(keys) if key not in self._kept}
+        fresh = dict(zip(new, self.courses([trials[i] for i in new.values()]), strict=True))
+        found = [fresh[key].reader if key in fresh else self._kept[key][0] for key in keys]
+        self._kept |= {key: (course.reader, course.size) for key, course in fresh.items()}
+        size = sum(size for _, size in self._kept.values())
+        while size > MEMORY:
+            size -= self._kept.pop(next(iter(self._kept)))[1]
+        return found
+
+    def _key(self, trial: Trial) -> tuple[int, bytes, bytes]:
+        """Return what a simulation depends on."""
+        offset = b"" if trial.offset is None else trial.offset.tobytes()
+        return trial.window, trial.values[~self.measured_only].tobytes(), offset
+
+    def courses(self, trials: Sequence[Trial], time: float | None = None) -> list[Course]:
+        """Simulate trials, each to the end of its window or for some time [s] only."""
+        courses: list[Course | None] = [None] * len(trials)
+        groups: dict[tuple[tuple[float, ...], int], list[int]] = {}
+        for i, trial in enumerate(trials):
+            key = tuple(float(v) for e in self._edits for v in trial.values[self.split[e]])
+            groups.setdefault((key, self._steps(trial.window, time)), []).append(i)
+        for (_, steps), members in groups.items():
+            engine, bare = self._engine(trials[members[0]].values)
+            simulated = self._simulate(engine, bare, [trials[i] for i in members], steps)
+            for i, course in zip(members, simulated, strict=True):
+                courses[i] = course
+        return [c for c in courses if c is not None]
+
+    def _steps(self, window: int, time: float | None) -> int:
+        """Return how many steps cover a window, or its first part of some time [s]."""
+        w = self.windows[window]
+        span = w.end - w.start if time is None else min(time, w.end - w.start)
+        return max(int(np.ceil(span / self._base.scene.model.opt.timestep - 1e-9)), 1)
+
+    def _simulate(self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[Trial], steps: int) -> list[Course]:
+        """Simulate trials of equal length in one engine."""
+        m, n = engine.compiled, len(trials)
+        values = np.array([t.values for t in trials])
+        qpos, qvel, ctrl = np.empty((n, m.nq)), np.empty((n, m.nv)), np.empty((n, steps, m.nu))
+        plain = {}
+        for i, trial in enumerate(trials):
+            w = self.windows[trial.window]
+            qpos[i], qvel[i] = w.qpos, w.qvel
+            if trial.offset is not None:
+                mujoco.mj_integratePos(m, qpos[i], trial.offset[: m.nv], 1.0)
+                qvel[i] += trial.offset[m.nv :]
+            if trial.window not in plain:
+                plain[trial.window] = self._commands(m, w, steps)
+            ctrl[i] = self._acting(m, plain[trial.window], values[i], steps)
+        fields = written(bare, self.effects, values, self.split)
+        laws = [
+            (law, values[:, part])
+            for e, part in zip(self.effects, self.split, strict=True)
+            if (law := e.law(m)) is not None
+        ]
+        variants = Variants(n, qpos=qpos, qvel=qvel, fields=fields, laws=laws)
+        rollout = engine.run(variants, ctrl, bodies=[]).numpy()
+        self.simulated += n * steps * m.opt.timestep
+        courses = []
+        for qpos, qvel, read in zip(rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
+            own = read.copy()  # not a part of the array of all, which would live as long
+            courses.append(Course(SensorReader(m, rollout.time, own), qpos, qvel, own.nbytes))
+        return courses
+
+    def _commands(self, m: mujoco.MjModel, w: Window, steps: int) -> np.ndarray:
+        """Return the commands of a window and of the time before it that effects reach back to, shape (H + K, nu)."""
+        before = self._before(m)
+        return commands(m, w.demonstration, before + steps, w.start - before * m.opt.timestep)
+
+    def _before(self, m: mujoco.MjModel) -> int:
+        """Return how many steps effects reach back."""
+        return int(np.ceil(max((e.history for e in self.effects), default=0.0) / m.opt.timestep))
+
+    def _acting(self, m: mujoco.MjModel, plain: np.ndarray, values: np.ndarray, steps: int) -> np.ndarray:
+        """Return the commands that act, shape (K, nu)."""
+        ctrl = plain
+        for e, part in zip(self.effects, self.split, strict=True):
+            if e.commands:
+                ctrl = e.command(m, ctrl, values[part])
+        return ctrl[len(ctrl) - steps :]
+
+    def observed(self, window: int, reader: Reader, values: np.ndarray) -> np.ndarray:
+        """Return residuals in units of noise, measured less predicted, of a window as instruments read it, (count,)."""
+        w, m = self.windows[window], self._base.scene.model
+        read: Reader = lambda sensor, time: reader(sensor, time - w.start)  # noqa: E731
+        for e, part in zip(self.effects, self.split, strict=True):
+            if e.measures:
+                read = e.measure(m, read, values[part])
+        residual = np.empty(w.count)
+        for r in w.readings:
+            predicted = read(r.channel, r.time + w.start)
+            value = turn(predicted, r.value) if r.orientation else r.value - predicted
+            residual[r.rows] = np.nan_to_num(value / r.std, nan=LOST, posinf=LOST, neginf=-LOST).ravel()
+        return np.clip(residual, -LOST, LOST)
+
+    def residuals(self, trials: Sequence[Trial]) -> list[np.ndarray]:
+        """Return the residuals of each trial, see `observed`."""
+        readers = self.readers(trials)
+        return [self.observed(t.window, r, t.values) for t, r in zip(trials, readers, strict=True)]
+
+
+class SensorReader:
+    """Predicted sensor values at any time, linear between records, a straight line a little beyond them."""
+
+    def __init__(self, m: mujoco.MjModel, time: np.ndarray, sensordata: np.ndarray) -> None:
+        """Hold records at `time` (R,) [s], `sensordata` (R, nsensordata)."""
+        self._m, self._time, self._data = m, time, sensordata
+
+    def __call__(self, sensor: str, time: np.ndarray) -> np.ndarray:
+        """Return the values of a sensor at times (T,) [s], shape (T, dim)."""
+        row = self._m.sensor(sensor).id
+        address, dim = self._m.sensor_adr[row], self._m.sensor_dim[row]
+        value = self._data[:, address : address + dim]
+        if len(self._time) < 2:
+            return np.repeat(value[:1], len(time), axis=0)
+        now = np.clip(time, self._time[0] - BEYOND, self._time[-1] + BEYOND)
+        step = self._time[1] - self._time[0]
+        lower = np.clip(((now - self._time[0]) / step + 1e-9).astype(int), 0, len(self._time) - 2)
+        weight = ((now - self._time[lower]) / step)[:, None]
+        low, high = value[lower], value[lower + 1]
+        if int(self._m.sensor_type[row]) in map(int, UNIT_QUATERNION_SENSORS):
+            high = np.where((low * high).sum(axis=1, keepdims=True) < 0, -high, high)
+            mixed = (1 - weight) * low + weight * high
+            return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+        return (1 - weight) * low + weight * high
+
+
+def turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors [rad] from `start` to `end`, quaternions wxyz (T, 4), shape (T, 3); NaN for NaN."""
+    vector = np.full((len(start), 3), np.nan)
+    valid = np.isfinite(start).all(axis=1)
+    if valid.any():
+        first = Rotation.from_quat(start[valid], scalar_first=True)
+        vector[valid] = (first.inv() * Rotation.from_quat(end[valid], scalar_first=True)).as_rotvec()
+    return vector

@@ -1,0 +1,131 @@
+"""Fit contact geometry to recordings: the search of the paper's equation 1, optionally from a gradient start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from concent_warp.errors import ModelError, RecordingError
+from concent_warp.estimation.object_tracks import Segment, whole
+from concent_warp.estimation.windows import hold_out, windows
+from concent_warp.fit.geometry.checkpoint import Checkpoint
+from concent_warp.fit.geometry.search import FitResult, Progress, Search, SearchCfg
+from concent_warp.fit.newton.descent import GradientCfg
+from concent_warp.fit.newton.warm_start import Warming
+from concent_warp.model import Model
+from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.simulate.select import EngineName
+
+Method = Literal["es", "gradient", "gradient+es"]
+"""Evolution strategy; gradients through Newton; gradients that seed the evolution strategy."""
+
+
+@dataclass(frozen=True)
+class FitCfg(SearchCfg):
+    """Settings of a fit of contact geometry."""
+
+    gradient: GradientCfg = field(default_factory=GradientCfg)
+    """Settings of the gradients, for the methods that use them."""
+
+
+def fit_geometry(
+    model: Model,
+    recording: Recording,
+    cfg: FitCfg,
+    *,
+    demonstrations: Sequence[str] | None = None,
+    segments: Sequence[Segment] | None = None,
+    method: Method = "es",
+    engine: EngineName = "auto",
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> FitResult:
+    """Move the spheres of a model so that replaying a recording reproduces the observed motion.
+
+    Args:
+        model: Model with a starting contact geometry.
+        recording: What was commanded and observed.
+        cfg: Settings.
+        demonstrations: Names of the demonstrations to fit; all by default.
+        segments: Stretches to simulate instead of whole demonstrations.
+        method: Evolution strategy, gradients through Newton, or the latter as a start for the former. Where gradients
+            do not help, the evolution strategy is taken in any case; `FitResult.gradients` says so.
+        engine: "mujoco", "warp" or "auto".
+        checkpoint: File that holds the state of the fit after each generation; that of the gradients lies beside it.
+        resume: Go on from the checkpoint, to the same result as without the interruption.
+        progress: Called after each generation.
+
+    Raises:
+        ModelError: The model has no contact geometry, or the checkpoint belongs to another fit.
+        RecordingError: The recording does not observe any movable object.
+    """
+    if model.geometry is None:
+        raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
+    shown: list[Demonstration] = []
+    if segments is None:
+        names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
+        chosen = [recording[name] for name in names]
+        shown = chosen if cfg.window is None else []
+        segments = cut(model, chosen, cfg)
+    search = Search(model, list(segments), cfg, engine)
+    if method != "es":
+        warm_start(search, method, shown, cfg.gradient, checkpoint, resume, progress)
+    if resume and checkpoint is not None and checkpoint.is_file():
+        search.restore(Checkpoint.load(checkpoint))
+    while search.stopped is None:
+        search.step()
+        if checkpoint is not None:
+            search.checkpoint().save(checkpoint)
+        if progress is not None:
+            progress(search.progress())
+    return search.result()
+
+
+def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> list[Segment]:
+    """Return whole demonstrations as segments, or windows of them where the settings ask for that.
+
+    Raises:
+        RecordingError: Nothing is observed, or no window shows contact.
+    """
+    assert model.geometry is not None
+    bodies = model.geometry.bodies
+    if cfg.window is None:
+        return [whole(model.scene, d, bodies) for d in demonstrations]
+    groups = [windows(model.scene, d, bodies, cfg.window, cfg.window_stride) for d in demonstrations]
+    if not any(groups):
+        raise RecordingError(
+            "no window shows contact", expected=f"contact within {cfg.window:g} s", fix="fit longer windows, or without"
+        )
+    return hold_out(groups, cfg.held_out)
+
+
+def warm_start(
+    search: Search,
+    method: Method,
+    demonstrations: Sequence[Demonstration],
+    cfg: GradientCfg,
+    checkpoint: Path | None,
+    resume: bool,
+    progress: Callable[[Progress], None] | None,
+) -> None:
+    """Begin with gradients, see `fit_geometry`; without help from them nothing changes but the count."""
+
+    def show(iteration: int, lowest: float, left: float) -> None:
+        if progress is not None:
+            count = cfg.iterations
+            progress(Progress(iteration, count, lowest, lowest, left, search.simulations, "gradient step"))
+
+    flat = search.evolution.mean.copy()
+    warming = Warming(search, demonstrations, cfg)
+    file = None if checkpoint is None else checkpoint.with_suffix(".descent.npz")
+    search.gradients = found = warming.run(file, resume, show)
+    search.evolution.mean = found.mean if found.helped else flat
+    if found.helped:
+        survey = search.survey([*search.draw(), *search.held_out])
+        search.note(survey)
+        if method == "gradient":
+            search.stopped = "gradient descent done"
+            search.history += [search.entry(warming.survey, 0.0), search.entry(survey, 0.0)]

@@ -1,0 +1,1 @@
+"""The evolution strategy over sphere positions (paper, appendix A)."""

@@ -1,0 +1,1 @@
+"""Gradients of the contact geometry through Newton."""

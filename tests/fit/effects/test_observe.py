@@ -1,0 +1,120 @@
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from concent_warp.errors import RecordingError
+from concent_warp.fit.effects.observation import RATE_TIME, START_NOISE, Source, start_spread
+from concent_warp.fit.effects.observe import calmest, channel_noises, keeps_close, observe
+from concent_warp.model import Model
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.scene import Scene
+from tests.scenes.swinging import NOISE, drawing, swing_scene, swung, windows_of
+from tests.scenes.tossing import EDGE, toss_scene, tosses
+
+
+def with_channels(recording, **measured):
+    (d,) = recording.demonstrations
+    return replace(recording, demonstrations=(replace(d, measured=measured),))
+
+
+def test_windows_follow_one_another_and_hold_every_sample_once():
+    recording = swung()
+    windows = windows_of(recording, 0.5)
+    assert [w.start for w in windows][1:] == [w.end for w in windows][:-1]
+    assert windows[0].start == 0.0
+    assert windows[-1].end == pytest.approx(2.0)
+    assert all(0.35 * 0.5 <= w.end - w.start <= 0.5 + 0.12 for w in windows)
+    samples = np.concatenate([w.start + r.time for w in windows for r in w.readings])
+    known = recording.demonstrations[0].measured["angle"].time
+    np.testing.assert_allclose(np.unique(samples.round(9)), known.round(9))
+
+
+def test_a_motion_that_forgets_its_start_is_one_window_and_one_with_impacts_is_several():
+    assert len(windows_of(swung())) == 1
+    tossed = tosses(1)
+    assert len(observe(Model(Scene(toss_scene(EDGE))), tossed)) > 2
+
+
+def test_the_state_at_the_start_of_a_window_is_the_measured_one():
+    recording = swung(damping=0.0)
+    later = windows_of(recording, 0.5)[1]
+    m = mujoco.MjModel.from_xml_string(recording.scene)
+    d = mujoco.MjData(m)
+    d.qpos[0] = 0.3
+    action = recording.demonstrations[0].action["servo"]
+    while d.time < later.start - 1e-9:
+        d.ctrl[0] = action.value[np.searchsorted(action.time, d.time + 1e-9, side="right") - 1]
+        mujoco.mj_step(m, d)
+    assert abs(later.qpos[0] - d.qpos[0]) < START_NOISE * NOISE
+    assert later.qvel[0] == pytest.approx(d.qvel[0], rel=0.1)  # a command changes there, and with it the acceleration
+
+
+def test_motion_from_the_top_keeps_close_to_its_start_for_a_shorter_time():
+    xml = swing_scene(kp=1e-6)
+    time = 0.01 * np.arange(200)
+    reach = []
+    for angle in (0.05, np.pi - 0.001):
+        d = Demonstration(
+            "demo_0",
+            qpos=np.array([angle]),
+            qvel=np.zeros(1),
+            action={"servo": Channel(np.zeros(1), np.zeros(1))},
+            measured={"angle": Channel(time, 0 * time[:, None])},
+        )
+        model = Model(Scene(xml))
+        source = Source(model, Recording(xml, (d,)), {"angle": NOISE})
+        reach.append(keeps_close(source, d, 0.0, 1.99, "mujoco", 0))
+    assert reach[0] == pytest.approx(1.99)
+    assert reach[1] < 1.5
+
+
+def test_a_window_ends_late_but_before_an_impact():
+    class Rough:
+        def roughness(self, times):
+            return np.where(times > 0.8, 10.0, 1.0)
+
+    found = calmest(Rough(), 0.0, 1.0)  # pyright: ignore[reportArgumentType]
+    assert 0.75 < found <= 0.8
+
+
+def test_an_initial_state_is_as_uncertain_as_what_was_seen_of_it():
+    m = mujoco.MjModel.from_xml_string(swing_scene())
+    np.testing.assert_allclose(start_spread(m, {"angle": NOISE}), [3 * NOISE, 3 * NOISE / RATE_TIME])
+    unseen = start_spread(m, {})
+    cube = mujoco.MjModel.from_xml_string(toss_scene(EDGE))
+    seen = start_spread(cube, {"position": 1e-4, "orientation": 2e-3})
+    np.testing.assert_allclose(seen[:6], [3e-4] * 3 + [6e-3] * 3)
+    assert unseen.tolist() == [1e-3, 1e-2]
+
+
+def test_stated_noise_is_used_and_other_noise_is_estimated():
+    recording = swung()
+    assert channel_noises(drawing(recording), recording) == {"angle": NOISE}
+    channel = replace(recording.demonstrations[0].measured["angle"], noise_std=None)
+    silent = with_channels(recording, angle=channel)
+    assert channel_noises(drawing(recording), silent)["angle"] == pytest.approx(NOISE, rel=0.5)
+
+
+def test_a_channel_that_the_model_cannot_predict_is_named():
+    recording = swung(quaternion=True)
+    with pytest.raises(RecordingError, match="'turned' that the model lacks"):
+        channel_noises(Model(Scene(swing_scene())), recording)
+
+
+def test_a_channel_of_another_size_than_its_sensor_is_named():
+    recording = swung()
+    channel = recording.demonstrations[0].measured["angle"]
+    wide = with_channels(recording, angle=replace(channel, value=np.tile(channel.value, (1, 2))))
+    with pytest.raises(RecordingError, match="another number of values"):
+        channel_noises(drawing(recording), wide)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_a_few_samples_are_too_little(count):
+    recording = swung()
+    channel = recording.demonstrations[0].measured["angle"]
+    few = {"angle": Channel(channel.time[:count], channel.value[:count], NOISE)} if count else {}
+    with pytest.raises(RecordingError, match="too little was measured"):
+        observe(drawing(recording), with_channels(recording, **few))
