@@ -9,7 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.compare.residuals import rotation_between
+from concent_warp.estimation.rotations import rotation_between
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.simulate.engine import Variants

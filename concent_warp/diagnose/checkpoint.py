@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from concent_warp.diagnose.diagnose import Diagnosis, DiagnosisCfg, Procedure, Progress, silent
-from concent_warp.diagnose.search import Candidate, Node, Screened
-from concent_warp.diagnose.settle import Look
+from concent_warp.diagnose.search.profile_likelihood import Look
+from concent_warp.diagnose.search.steps import Candidate, Node, Screened
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError

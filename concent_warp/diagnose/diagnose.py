@@ -14,14 +14,15 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from concent_warp.diagnose.candidates import candidates, label
 from concent_warp.diagnose.check_data import check_data
 from concent_warp.diagnose.diagnosis import Detectable, Diagnosis, Finding, Verdict
-from concent_warp.diagnose.evidence import SAME, alike, detectable_size, fitted_parameters, removed
-from concent_warp.diagnose.experiment import suggest
-from concent_warp.diagnose.flexible import unknown_force
-from concent_warp.diagnose.gradient_start import GradientStarts
-from concent_warp.diagnose.search import (
+from concent_warp.diagnose.experiment.suggest import suggest
+from concent_warp.diagnose.failures import where
+from concent_warp.diagnose.search.candidates import candidates, label
+from concent_warp.diagnose.search.evidence import SAME, alike, detectable_size, fitted_parameters, removed
+from concent_warp.diagnose.search.gradient_start import GradientStarts
+from concent_warp.diagnose.search.profile_likelihood import Look, settled
+from concent_warp.diagnose.search.steps import (
     Candidate,
     Node,
     Screened,
@@ -36,8 +37,7 @@ from concent_warp.diagnose.search import (
     strengthened,
     without,
 )
-from concent_warp.diagnose.settle import Look, settled
-from concent_warp.diagnose.where import where
+from concent_warp.diagnose.search.unknown_force import unknown_force
 from concent_warp.estimation.noise import UNDERESTIMATE
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, cut_blocks, sign_flip_p
 from concent_warp.fit.effects.fit import check_finite

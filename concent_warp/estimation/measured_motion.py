@@ -13,9 +13,10 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.compare.residuals import same_sign
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.noise import Kind, channel_noise
+from concent_warp.estimation.noise import channel_noise
+from concent_warp.estimation.rotations import same_sign
+from concent_warp.estimation.sensors import Kind
 from concent_warp.estimation.smoothing_spline import Smooth, smooth
 from concent_warp.simulate.replay import commands, initial_state, interpolate, replay, step_count
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from concent_warp.estimation.rotations import turns
+from concent_warp.estimation.sensors import Kind
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Channel
 
-Kind = Literal["position", "orientation", "joint", "points", "other"]
-"""What a channel measures."""
 Source = Literal["stated", "rest", "differences", "resolution", "points", "unknown"]
 """Where a noise figure is from."""
 UNDERESTIMATE = 1.8
@@ -148,16 +148,6 @@ def centred(window: np.ndarray, kind: Kind) -> np.ndarray:
     """Return readings (n, dim) less their mean; of orientations rotation vectors [rad], shape (n, 3)."""
     value = turns(np.broadcast_to(window[0], window.shape), window) if kind == "orientation" else window
     return value - value.mean(axis=0)
-
-
-def turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors [rad], shape (n, 3), from `start` to `end`, quaternions wxyz (n, 4)."""
-    lengths = np.linalg.norm(start, axis=1) * np.linalg.norm(end, axis=1)
-    vectors = np.zeros((len(start), 3))
-    valid = lengths > 0
-    first, second = (Rotation.from_quat(q[valid], scalar_first=True) for q in (start, end))
-    vectors[valid] = (first.inv() * second).as_rotvec()
-    return vectors
 
 
 def resolution(pieces: Sequence[np.ndarray]) -> float:

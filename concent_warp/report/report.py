@@ -58,7 +58,7 @@ def write_report(
         overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
         settings: ``command``, ``versions`` and ``settings`` to show.
         diagnosis: JSON object of a diagnosis (`concent_warp.report.diagnosis`).
-        location: JSON object of a location (`concent_warp.diagnose.location.Location.to_json`).
+        location: JSON object of a location (`concent_warp.diagnose.forces.result.Location.to_json`).
     """
     events, overlap = events or {}, overlap or {}
     shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}

@@ -9,7 +9,7 @@ from concent_warp.compare.compare import compare
 from concent_warp.compare.phases import Phase
 from concent_warp.compare.residuals import Residual
 from concent_warp.compare.worst_spans import LEAST, channel_places, ranked, smoothed, worst_places
-from concent_warp.estimation.noise import Kind
+from concent_warp.estimation.sensors import Kind
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene

@@ -6,7 +6,7 @@ import pytest
 from concent_warp.diagnose import diagnose as procedure
 from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint, load, save
 from concent_warp.diagnose.diagnose import DiagnosisCfg
-from concent_warp.diagnose.search import Screened
+from concent_warp.diagnose.search.steps import Screened
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
 from tests.diagnose.same_results import assert_same

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.compare.residuals import kind_and_unit
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import pooled_noise
+from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.estimation.windows import Measured
 from concent_warp.fit.effects.observation import FEWEST, START_NOISE, Source, Window, first_time, start_spread
 from concent_warp.simulate.engine import Variants

@@ -1,0 +1,1 @@
+"""The next recording that best separates the remaining hypotheses."""

@@ -1,0 +1,178 @@
+"""Motions that could be recorded next: what a person or the robot would do, and how models are simulated doing it.
+
+Speeds, commands and places stay within what the present recording has shown to be possible. The motions of drives are
+in `joint_motions`, those of objects in `object_motions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.select import POSES, free_bodies
+from concent_warp.errors import RecordingError
+from concent_warp.fit.effects.observation import Source
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.simulate.replay import commands, initial_state
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+
+Change = Callable[["Model"], "Model"]
+"""What is different about the set-up: given the model of the present one, returns that of the other."""
+RATE = 100.0
+"""Commands a second."""
+LONGEST = 8.0
+"""Longest motion [s]."""
+INSTANTS = 40
+"""Instants of a demonstration at which speeds are looked at."""
+EXTRA = 0.5
+"""A payload or a heavier object has this share of the body's mass more."""
+
+PAYLOAD_RADIUS = 0.01
+"""[m]."""
+
+
+def as_it_is(model: Model) -> Model:
+    """Leave the set-up as it is, see `Change`."""
+    return model
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Something that could be done and recorded."""
+
+    name: str
+    """Which entry of the menu."""
+    text: str
+    """What to do, in words."""
+    duration: float
+    """[s]."""
+    qpos: np.ndarray
+    """Start, shape (nq,)."""
+    qvel: np.ndarray
+    """Shape (nv,)."""
+    action: Mapping[str, Channel] = field(default_factory=dict)
+    """Commands by actuator."""
+    away: tuple[str, ...] = ()
+    """Bodies that are out of the way, so that nothing of them is measured."""
+    change: Change = as_it_is
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the present recording shows of what can be done."""
+
+    model: Model
+    recording: Recording
+    noise: Mapping[str, float]
+    """Standard deviation of a component of each channel."""
+
+    @cached_property
+    def m(self) -> mujoco.MjModel:
+        """The compiled scene."""
+        return self.model.compile()
+
+    @cached_property
+    def source(self) -> Source:
+        """The recording as the model reads it."""
+        return Source(self.model, self.recording, self.noise)
+
+    @cached_property
+    def starts(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """State at the start of each demonstration."""
+        return [self.state(d, 0.0) for d in self.recording.demonstrations]
+
+    @cached_property
+    def states(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """States at some instants of all demonstrations."""
+        found = list(self.starts)
+        for d in self.recording.demonstrations:
+            if (measured := self.source.measured(d)) is not None:
+                found += [measured.state(t) for t in np.linspace(0, d.duration, INSTANTS + 2)[1:-1]]
+        return found
+
+    def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the measured state of a demonstration, as far as it is known."""
+        try:
+            return self.source.state(d, time)
+        except RecordingError:
+            return initial_state(self.m, d)
+
+    @cached_property
+    def period(self) -> dict[str, float]:
+        """Time between samples of each channel [s]."""
+        found = {}
+        for name in self.noise:
+            steps = [
+                np.diff(d.measured[name].time) for d in self.recording.demonstrations if len(read(d, name).time) > 1
+            ]
+            found[name] = float(np.median(np.concatenate(steps))) if steps else 0.01
+        return found
+
+    @cached_property
+    def bodies(self) -> list[int]:
+        """Free bodies whose pose is measured."""
+        poses = [c for c in self.noise if int(self.m.sensor_type[self.m.sensor(c).id]) in POSES]
+        return [b for b in free_bodies(self.m) if b in {self.body_of(c) for c in poses}]
+
+    def body_of(self, channel: str) -> int:
+        """Return the body that a channel is about, -1 for a channel about something else."""
+        row = self.m.sensor(channel).id
+        kind, target = int(self.m.sensor_objtype[row]), int(self.m.sensor_objid[row])
+        if kind == int(mujoco.mjtObj.mjOBJ_SITE):
+            return int(self.m.site_bodyid[target])
+        return target if kind in (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY)) else -1
+
+    def channels(self, away: Collection[str]) -> list[str]:
+        """Return the channels that are measured while some bodies are away."""
+        gone = {self.m.body(name).id for name in away}
+        return [c for c in self.noise if self.body_of(c) not in gone]
+
+    @cached_property
+    def longest(self) -> Demonstration:
+        """The demonstration that lasts longest."""
+        return max(self.recording.demonstrations, key=lambda d: d.duration)
+
+    def holding(self, d: Demonstration) -> dict[str, Channel]:
+        """Return commands that keep a demonstration's first ones."""
+        first = commands(self.m, d, 1)[0]
+        return {self.m.actuator(i).name: Channel(np.zeros(1), first[i : i + 1]) for i in range(self.m.nu)}
+
+
+def read(d: Demonstration, channel: str) -> Channel:
+    """Return a channel of a demonstration, empty where it has none."""
+    return d.measured.get(channel, Channel(np.zeros(0), np.zeros((0, 1))))
+
+
+def heavier(body: str) -> Change:
+    """Return what fastens a payload to a body, at its centre of mass."""
+
+    def change(model: Model) -> Model:
+        from concent_warp.scene.scene import Scene
+
+        m, spec = model.scene.model, model.scene.spec()
+        row = m.body(body).id
+        spec.body(body).add_body(name=f"{body}_payload", pos=m.body_ipos[row]).add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[PAYLOAD_RADIUS, 0, 0],
+            mass=EXTRA * float(m.body_mass[row]),
+            contype=0,
+            conaffinity=0,
+        )
+        return replace(model, scene=Scene.from_spec(spec, model.scene.source))
+
+    return change
+
+
+def slope_turned(model: Model) -> Model:
+    """Return the model with the table's slope the other way round, see `Change`."""
+    turned = tuple(
+        replace(a, values=tuple(-v for v in a.values)) if a.effect.name == "gravity_tilt" else a for a in model.effects
+    )
+    return replace(model, effects=turned)

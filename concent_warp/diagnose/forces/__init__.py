@@ -1,0 +1,1 @@
+"""Unexplained forces by joint and by body."""
