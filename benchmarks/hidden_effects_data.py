@@ -21,11 +21,11 @@ from hidden_effects_residual import ratios
 
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
-from concent_warp.reality.hidden import INSIDE, hidden
-from concent_warp.reality.hidden_drives import strain
-from concent_warp.reality.hidden_sizes import MAGNITUDES, SIZES, Size
-from concent_warp.reality.rig import record_rig
-from concent_warp.reality.rigs import RIGS
+from concent_warp.reality.hidden.drives import strain
+from concent_warp.reality.hidden.registry import INSIDE, hidden
+from concent_warp.reality.hidden.sizes import MAGNITUDES, SIZES, Size
+from concent_warp.reality.rigs.registry import RIGS
+from concent_warp.reality.rigs.rig import record_rig
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from concent_warp.render.splat_views import FILE, SplatViews
 
-from concent_warp.reality.footage import FootageCfg, developed
-from concent_warp.reality.laboratory import light
-from concent_warp.reality.photographs import PhotographsCfg, photographs
+from concent_warp.reality.appearance.surroundings import light
 from concent_warp.reality.record import RealityCfg, record
+from concent_warp.reality.sensors.footage import FootageCfg, developed
+from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
 

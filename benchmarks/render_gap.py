@@ -28,7 +28,7 @@ from pages import machine
 from render_footage import CAMERAS, EMPTY, HELD, OBJECTS, footage, photographed
 
 from concent_warp.cli.entry import main as concent
-from concent_warp.reality.photographs import PhotographsCfg
+from concent_warp.reality.sensors.photographs import PhotographsCfg
 from concent_warp.recording.recording import Recording
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from concent_warp.render.splat_views import FILE, SplatViews, read_views
 from measurements import Measurements
 from pages import FOLDER, machine, machine_line, table, write_page
 
-from concent_warp.reality.photographs import PhotographsCfg, photographs
+from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 

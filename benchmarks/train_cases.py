@@ -23,7 +23,7 @@ from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
-from concent_warp.reality.hidden_in_task import TaskWorld, wanted
+from concent_warp.reality.hidden.in_task import TaskWorld, wanted
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording

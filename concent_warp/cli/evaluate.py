@@ -12,7 +12,7 @@ import numpy as np
 from concent_warp.cli.given_policy import Pretrained, given_checkpoint
 from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
-from concent_warp.reality.hidden_in_task import TaskWorld, wanted
+from concent_warp.reality.hidden.in_task import TaskWorld, wanted
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from concent_warp.train.cfg import EnvironmentCfg, TrainError
@@ -162,7 +162,7 @@ def video_files(arguments: Arguments, folder: Path) -> list[Path]:
 
 def film_all(films: list[Path], reel: Reel, world: TaskWorld, task: Task, starts: InitialStates, period: float) -> None:
     """Film the episodes of a reel, which began with `starts`; their states are a period apart [s]."""
-    from concent_warp.reality.video import filmed, write_video
+    from concent_warp.reality.sensors.video import filmed, write_video
 
     bodies = tuple(task.compiled.body(i).name for i in task.objects)
     with progress_bar("videos") as progress:

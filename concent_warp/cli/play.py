@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from concent_warp.cli import evaluate
 from concent_warp.cli.given_policy import Pretrained, given_checkpoint
 from concent_warp.cli.terminal import quiet_warp, say
-from concent_warp.reality.hidden_in_task import wanted
+from concent_warp.reality.hidden.in_task import wanted
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from concent_warp.train.cfg import TrainError

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from concent_warp.reality.camera import CAMERA, film
-from concent_warp.reality.expert import ExpertCfg, plan
-from concent_warp.reality.footage import FootageCfg, footage
-from concent_warp.reality.inverse_kinematics import solve_path
+from concent_warp.reality.expert.inverse_kinematics import solve_path
+from concent_warp.reality.expert.plan import ExpertCfg, plan
+from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
 from concent_warp.reality.run import Log, settle, simulate
-from concent_warp.reality.sensing import SensingCfg, measure, sampled
-from concent_warp.reality.steering import aligned, arm_joints, deflection, finger_joints
+from concent_warp.reality.sensors.camera import CAMERA, film
+from concent_warp.reality.sensors.footage import FootageCfg, footage
+from concent_warp.reality.sensors.sensing import SensingCfg, measure, sampled
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene

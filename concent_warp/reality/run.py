@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from concent_warp.reality.sensing import SLACK, SensingCfg, seen, visible_points
+from concent_warp.reality.sensors.sensing import SLACK, SensingCfg, seen, visible_points
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.scene.scene import Scene
 

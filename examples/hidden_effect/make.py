@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from concent_warp.reality.hidden import hidden
-from concent_warp.reality.rig import Trial, record_rig
-from concent_warp.reality.rig_pendulum import PENDULUM
-from concent_warp.reality.signals import glide, hold, joined, sweep
+from concent_warp.reality.hidden.registry import hidden
+from concent_warp.reality.rigs.pendulum import PENDULUM
+from concent_warp.reality.rigs.rig import Trial, record_rig
+from concent_warp.reality.rigs.signals import glide, hold, joined, sweep
 from concent_warp.recording.formats.hdf5 import write_hdf5
 
 FRICTION = 0.03

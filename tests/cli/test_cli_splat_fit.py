@@ -6,7 +6,7 @@ from concent_warp.render.splat_views import SplatViews
 from concent_warp.render.splats import Splats
 
 from concent_warp.cli import main
-from concent_warp.reality.photographs import PhotographsCfg, photographs
+from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.reality.camera import edges, film
-from concent_warp.reality.sensing import SLACK, SensingCfg, seen
+from concent_warp.reality.sensors.camera import edges, film
+from concent_warp.reality.sensors.sensing import SLACK, SensingCfg, seen
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 SCENE = ShapeSorterCfg().build()

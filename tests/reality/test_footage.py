@@ -6,8 +6,8 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.perception.point_tracking import chosen_stream
-from concent_warp.reality.footage import FootageCfg, developed, footage
 from concent_warp.reality.record import RealityCfg
+from concent_warp.reality.sensors.footage import FootageCfg, developed, footage
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.scene.cameras import add_cameras

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from concent_warp.reality.run import Log, settle, simulate
-from concent_warp.reality.sensing import SensingCfg
+from concent_warp.reality.sensors.sensing import SensingCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 

@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.hidden import EVERY, INSIDE, hidden
-from concent_warp.reality.hidden_case import Hidden, drives
-from concent_warp.reality.hidden_drives import Late, Sluggish
-from concent_warp.reality.hidden_sizes import MAGNITUDES
-from concent_warp.reality.rig import Rig, Trial, perform, record_rig
-from concent_warp.reality.rigs import RIGS
+from concent_warp.reality.hidden.drives import Late, Sluggish
+from concent_warp.reality.hidden.hidden_effect import Hidden, drives
+from concent_warp.reality.hidden.registry import EVERY, INSIDE, hidden
+from concent_warp.reality.hidden.sizes import MAGNITUDES
+from concent_warp.reality.rigs.registry import RIGS
+from concent_warp.reality.rigs.rig import Rig, Trial, perform, record_rig
 
 PENDULUM = RIGS["pendulum"]
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from concent_warp.reality.hidden import hidden
-from concent_warp.reality.rig import Trial, perform, record_rig
-from concent_warp.reality.rigs import RIGS
+from concent_warp.reality.hidden.registry import hidden
+from concent_warp.reality.rigs.registry import RIGS
+from concent_warp.reality.rigs.rig import Trial, perform, record_rig
 
 SLIDE, DROP, SPIN = RIGS["slide"], RIGS["drop"], RIGS["spin"]
 FLAT = [0.01 - 1e-5, 1, 0, 0, 0]

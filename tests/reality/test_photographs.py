@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.reality.photographs import PhotographsCfg, photographs
+from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 

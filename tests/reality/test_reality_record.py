@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.camera import CAMERA
-from concent_warp.reality.hidden_in_task import TaskWorld
+from concent_warp.reality.hidden.in_task import TaskWorld
 from concent_warp.reality.record import RealityCfg, record
+from concent_warp.reality.sensors.camera import CAMERA
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.recording.recording import Demonstration
 from concent_warp.recording.validation.validate import validate

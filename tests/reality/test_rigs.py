@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.hidden import hidden
-from concent_warp.reality.instruments import Instrument
-from concent_warp.reality.rig import perform, record_rig
-from concent_warp.reality.rigs import RIGS
+from concent_warp.reality.hidden.registry import hidden
+from concent_warp.reality.rigs.registry import RIGS
+from concent_warp.reality.rigs.rig import perform, record_rig
+from concent_warp.reality.sensors.instruments import Instrument
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.validation.validate import validate
 

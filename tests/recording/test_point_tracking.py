@@ -9,8 +9,8 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.perception.point_tracking import TrackingCfg, track_points
 from concent_warp.perception.rigid_motion import inverse, moved
-from concent_warp.reality.camera import film
 from concent_warp.reality.record import RealityCfg, record
+from concent_warp.reality.sensors.camera import film
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene

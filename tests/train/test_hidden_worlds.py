@@ -9,8 +9,8 @@ from concent_warp.train.physics import Actor, MujocoPhysics
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError
-from concent_warp.reality.hidden_in_task import MET, TaskWorld, pads, wanted
-from concent_warp.reality.rig_grasp import SCENE
+from concent_warp.reality.hidden.in_task import MET, TaskWorld, pads, wanted
+from concent_warp.reality.rigs.grasp import SCENE
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
 

@@ -1,0 +1,1 @@
+"""What Reality looks like."""

@@ -1,0 +1,1 @@
+"""Hidden effects of Reality, by means of their own."""

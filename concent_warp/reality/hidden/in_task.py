@@ -1,0 +1,154 @@
+"""Hidden effects in the world in which a policy is tried: the same as in the rigs, about a task's own scene.
+
+Left out are those that the policy would not meet: of instruments, which it does not look through (wrong zeros of joints
+among them), of a table on which the object of a rig slides, of air about shapes that are drawn, and what adds bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import ConcentError
+from concent_warp.reality.hidden.drives import DRIVES
+from concent_warp.reality.hidden.gears import GEARS
+from concent_warp.reality.hidden.hidden_effect import Hidden
+from concent_warp.reality.hidden.joints import JOINTS
+from concent_warp.reality.hidden.objects import OBJECTS
+from concent_warp.reality.hidden.registry import hidden
+from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.world import WorldCfg
+from concent_warp.scene.scene import Scene
+
+MET: tuple[str, ...] = (
+    *JOINTS,
+    *(name for name in DRIVES if name != "joint_offset"),
+    *GEARS,
+    *OBJECTS,
+    *("grip_force", "pad_friction", "gravity_tilt", "cogging", "cable", "warming", "dropout"),
+)
+"""Effects that can be hidden."""
+
+
+@dataclass(frozen=True)
+class TaskWorld:
+    """The stand-in world of a task's scene, with effects hidden in it."""
+
+    scene: Scene
+    """The drawing."""
+    physics: WorldCfg
+    body: str
+    """The object that is handled, which effects on a body act on."""
+    grippers: tuple[str, ...] = ()
+    """Actuators that hold it."""
+    wanted: tuple[tuple[str, float], ...] = ()
+    """Names of the hidden effects with their magnitudes, in the unit of their main parameter."""
+
+    def __post_init__(self) -> None:
+        names = [name for name, _ in self.wanted]
+        if "pad_friction" in names and not pads(self.scene.model, self.grippers):
+            raise ConcentError(
+                "pad_friction cannot be hidden: no geom of the fingers has a name", where=self.scene.source
+            )
+
+    def rig(self) -> Rig:
+        """Return what the effects are made for."""
+        m = self.scene.model
+        return Rig(
+            "task",
+            self.scene,
+            unplanned,
+            WorldPhysics(timestep=self.physics.timestep),
+            body=self.body,
+            grippers=tuple(name for name in self.grippers if name in actuators(m)),
+            pads=pads(m, self.grippers),
+        )
+
+    def hidden(self) -> tuple[Hidden, ...]:
+        """Return the effects, made anew: many have a state, so that each world needs its own."""
+        rig = self.rig()
+        return tuple(hidden(name, magnitude, rig) for name, magnitude in self.wanted)
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return the world with the effects in it."""
+        drawing, rest = self.scene.spec(), []
+        for one in self.hidden():
+            # The world turns boxes into chamfered ones: what an object is has to be said before.
+            if one.name in OBJECTS and one.effect.edit is not None:
+                one.effect.edit(drawing)
+            else:
+                rest.append(one.effect)
+        scene = self.scene
+        if len(rest) < len(self.wanted):
+            scene = Scene.from_spec(drawing, source=scene.source)
+        return self.physics.build(scene, tuple(rest))
+
+    def compile(self) -> mujoco.MjModel:
+        """Return the compiled world.
+
+        Raises:
+            ConcentError: A magnitude makes no world.
+        """
+        try:
+            return self.spec().compile()
+        except (ValueError, ZeroDivisionError, mujoco.FatalError) as error:
+            found = f"{', '.join(f'{name}={value:g}' for name, value in self.wanted)}: {' '.join(str(error).split())}"
+            raise ConcentError("the stand-in world cannot be built", found=found) from None
+
+
+def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Return names and magnitudes of effects written as ``name=value``.
+
+    Raises:
+        ConcentError: One is written otherwise, is not there, or is given twice.
+    """
+    found: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise ConcentError(
+                "a hidden effect is not right", expected="name=value, as in joint_friction=1.2", found=repr(text)
+            )
+        if name not in MET:
+            raise ConcentError(f"no effect {name!r} can be hidden", expected=f"one of {', '.join(MET)}")
+        if name in found:
+            raise ConcentError("an effect is hidden twice", found=name)
+        found[name] = value
+    return tuple(found.items())
+
+
+def unplanned(rng: np.random.Generator, k: int) -> Trial:
+    """No motion is planned: the policy moves."""
+    del rng, k
+    raise NotImplementedError("a policy moves the world of a task")
+
+
+def actuators(m: mujoco.MjModel) -> list[str]:
+    """Return the names of a model's actuators."""
+    return [m.actuator(a).name for a in range(m.nu)]
+
+
+def pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
+    """Return the named geoms that can touch and whose bodies the grippers move."""
+    joints: set[int] = set()
+    for name in set(grippers) & set(actuators(m)):
+        a = m.actuator(name).id
+        target = int(m.actuator_trnid[a, 0])
+        if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
+            wraps = range(m.tendon_adr[target], m.tendon_adr[target] + m.tendon_num[target])
+            joints |= {int(m.wrap_objid[w]) for w in wraps if m.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
+        else:
+            joints.add(target)
+    for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        pair = {int(m.eq_obj1id[e]), int(m.eq_obj2id[e])}
+        joints |= pair if pair & joints else set()
+    bodies = {int(m.jnt_bodyid[j]) for j in joints}
+    geoms = [g for g in range(m.ngeom) if int(m.geom_bodyid[g]) in bodies and m.geom_contype[g]]
+    return tuple(m.geom(g).name for g in geoms if m.geom(g).name)

@@ -1,0 +1,103 @@
+"""Hidden effects of the instruments: what is written is not what there was to see."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.reality.hidden.hidden_effect import Builder, Hidden, each
+from concent_warp.reality.rigs.rig import Rig
+from concent_warp.reality.world import HiddenEffect
+
+SENSOR = mujoco.mjtSensor
+POSES = (SENSOR.mjSENS_FRAMEPOS, SENSOR.mjSENS_FRAMEQUAT)
+Written = tuple[np.ndarray, np.ndarray]
+"""Times (T,) [s] and values (T, dim)."""
+
+
+def channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
+    """Return the sensors of some kinds."""
+    m = rig.scene.model
+    return tuple(m.sensor(i).name for i in range(m.nsensor) if SENSOR(int(m.sensor_type[i])) in kinds)
+
+
+def clocked(rig: Rig) -> tuple[str, ...]:
+    """Return the channels whose clock may be wrong: the tracker's where an object is tracked, else the encoders'."""
+    return channels(rig, *POSES) if rig.body_tracked else channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+
+
+def time_base(rig: Rig, magnitude: float) -> Hidden:
+    """A clock that runs fast by a share [-]."""
+    wrong = clocked(rig)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        return (time * (1 + magnitude) if name in wrong else time), value
+
+    return Hidden("time_base", HiddenEffect("time_base", measure=measure), {"scale": magnitude}, wrong)
+
+
+def latency(rig: Rig, magnitude: float) -> Hidden:
+    """Readings are stamped too late [s]; those older than the recording are lost."""
+    wrong = clocked(rig)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        return (time + magnitude if name in wrong else time), value
+
+    return Hidden("latency", HiddenEffect("latency", measure=measure), {"delay": magnitude}, wrong)
+
+
+def length_scale(rig: Rig, magnitude: float) -> Hidden:
+    """Positions too large by a share [-]."""
+    wrong = channels(rig, SENSOR.mjSENS_FRAMEPOS)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        return time, value * (1 + magnitude) if name in wrong else value
+
+    return Hidden("length_scale", HiddenEffect("length_scale", measure=measure), {"scale": magnitude}, wrong)
+
+
+def frame_offset(rig: Rig, magnitude: float) -> Hidden:
+    """The tracker stands elsewhere than calibrated: shifted [m] along x, -y and half along z, and turned."""
+    shift = magnitude * np.array([1.0, -1.0, 0.5])
+    turn = magnitude * 3.0 * np.array([1.0, 0.5, -1.0])
+    rotation = Rotation.from_rotvec(turn)
+    wrong = channels(rig, *POSES)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        if name not in wrong:
+            return time, value
+        if value.shape[1] == 3:
+            return time, rotation.apply(value) + shift
+        return time, (rotation * Rotation.from_quat(value, scalar_first=True)).as_quat(scalar_first=True)
+
+    axes: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
+    truth: dict[str, float] = dict(zip(axes, map(float, (*shift, *turn)), strict=True))
+    return Hidden("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
+
+
+def sensor_bias(rig: Rig, magnitude: float) -> Hidden:
+    """Encoders read too much by a constant [rad or m]."""
+    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        return time, value + magnitude if name in wrong else value
+
+    truth = each("bias", wrong, np.full(len(wrong), magnitude))
+    return Hidden("sensor_bias", HiddenEffect("sensor_bias", measure=measure), truth, wrong)
+
+
+def sensor_gain(rig: Rig, magnitude: float) -> Hidden:
+    """Encoders read too much by a share [-]."""
+    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+
+    def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
+        return time, value * (1 + magnitude) if name in wrong else value
+
+    truth = each("scale", wrong, np.full(len(wrong), magnitude))
+    return Hidden("sensor_gain", HiddenEffect("sensor_gain", measure=measure), truth, wrong)
+
+
+MEASUREMENT: dict[str, Builder] = {
+    f.__name__: f for f in (time_base, latency, length_scale, frame_offset, sensor_bias, sensor_gain)
+}

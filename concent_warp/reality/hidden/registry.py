@@ -1,0 +1,35 @@
+"""Every hidden effect by name.
+
+Each is made by means of its own, so that finding it is not reading the same code backwards.
+"""
+
+from __future__ import annotations
+
+from concent_warp.reality.hidden.contact import CONTACT
+from concent_warp.reality.hidden.drives import DRIVES
+from concent_warp.reality.hidden.gears import GEARS
+from concent_warp.reality.hidden.hidden_effect import Builder, Hidden
+from concent_warp.reality.hidden.joints import JOINTS
+from concent_warp.reality.hidden.measurement import MEASUREMENT
+from concent_warp.reality.hidden.objects import OBJECTS
+from concent_warp.reality.hidden.outside import OUTSIDE
+from concent_warp.reality.hidden.surroundings import WORLD
+from concent_warp.reality.rigs.rig import Rig
+
+INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **GEARS, **OBJECTS, **CONTACT, **WORLD, **MEASUREMENT}
+"""Effects that a library of effects has, by canonical name."""
+EVERY: dict[str, Builder] = {**INSIDE, **OUTSIDE}
+
+
+def hidden(name: str, magnitude: float, rig: Rig) -> Hidden:
+    """Return an effect to be hidden in a rig.
+
+    Args:
+        name: Canonical name, or one of `OUTSIDE`.
+        magnitude: Value of its main parameter, in the parameter's unit.
+        rig: Where.
+
+    Raises:
+        KeyError: There is no such effect.
+    """
+    return EVERY[name](rig, magnitude)

@@ -1,0 +1,1 @@
+"""Small experiments in Reality."""

@@ -1,0 +1,69 @@
+"""A block is launched over a table at several speeds, turned by 0, 90 and 180 degrees, until friction stops it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.sliding_friction import frictionless, rub
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.shape_sorter import yaw_quaternion
+
+HALF = (0.08, 0.06, 0.01)
+"""Half sizes of the block [m]."""
+FRICTION = 0.3
+SPEEDS = (1.0, 0.7, 0.9, 0.6, 0.8, 0.5)
+"""Of the six throws [m/s]."""
+TURNS = (0.0, 0.0, np.pi / 2, np.pi / 2, np.pi, np.pi)
+"""Of the block before each throw [rad]."""
+XML = f"""
+<mujoco model="slide">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="3"/>
+  <worldbody>
+    <light pos="0 -0.4 1.5"/>
+    <geom name="table" type="plane" size="2 2 0.1" friction="{FRICTION} 0.005 0.0001" solref="0.006 1" priority="1"/>
+    <body name="block" pos="0 0 {HALF[2]}">
+      <freejoint name="block_joint"/>
+      <geom name="block" type="box" size="{HALF[0]} {HALF[1]} {HALF[2]}" mass="0.4" friction="{FRICTION} 0.005 0.0001"
+            solref="0.006 1"/>
+    </body>
+  </worldbody>
+  <sensor>
+    <framepos name="block_position" objtype="xbody" objname="block"/>
+    <framequat name="block_orientation" objtype="xbody" objname="block"/>
+  </sensor>
+</mujoco>
+"""
+
+
+def plan(rng: np.random.Generator, k: int) -> Trial:
+    """Launch the block in some direction; every second throw with a turn about the vertical."""
+    speed = SPEEDS[k % 6] * rng.uniform(0.9, 1.1)
+    yaw = TURNS[k % 6] + rng.normal(0, 0.05)
+    # Along the table's x, its y and between, so that a table with a grain tells.
+    heading = (k % 3) * np.pi / 4 + rng.normal(0, 0.1)
+    turning = 0.0 if k % 2 == 0 else rng.choice([-1, 1]) * rng.uniform(1.0, 2.5)
+    start = [-0.5 * speed * np.cos(heading) / 3, -0.5 * speed * np.sin(heading) / 3, HALF[2] - 1e-5]
+    return Trial(
+        speed / (FRICTION * 9.81) + 0.35,
+        qpos={"block_joint": [*start, *yaw_quaternion(yaw)]},
+        qvel={"block_joint": [speed * np.cos(heading), speed * np.sin(heading), 0, 0, 0, turning]},
+        settle=0.2,
+    )
+
+
+def glossy(spec: mujoco.MjSpec) -> None:
+    """Leave friction to `rub`."""
+    frictionless(spec, ("table", "block"))
+
+
+def coulomb(time: float, point: np.ndarray) -> np.ndarray:
+    """Return the coefficients of the drawing, everywhere and always."""
+    del time, point
+    return np.array([FRICTION, FRICTION])
+
+
+PHYSICS = WorldPhysics(edit=glossy, force=rub(coulomb, "block", "table"))
+SLIDE = Rig("slide", Scene(XML, "slide rig"), plan, PHYSICS, throws=6, start="resting", body="block", surface="table")

@@ -1,0 +1,1 @@
+"""What the instruments and cameras of Reality read."""

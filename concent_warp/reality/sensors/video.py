@@ -1,0 +1,74 @@
+"""Videos of what happened in the stand-in world, by the ray tracer of its camera: neither display nor OpenGL needed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import ConcentError
+from concent_warp.reality.sensors.camera import film
+from concent_warp.reality.sensors.sensing import SensingCfg
+
+SIZE = (240, 320)
+"""Height and width of a frame [pixels]."""
+ASIDE = (0.57, -0.43, 0.63)
+"""Where the camera stands, seen from what it looks at [m]."""
+FOVY = 22.0
+"""Vertical field of view [degrees]."""
+LAMP = (0.2, -0.4, 1.5)
+"""Where a light is put in a world that has none [m]."""
+CODECS = ("vp09", "mp4v")
+"""Codecs of the MP4, by preference: browsers play the first; the second is there wherever OpenCV is."""
+
+
+def filmed(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray, period: float) -> np.ndarray:
+    """Return frames of a motion, uint8, shape (T, H, W, 3).
+
+    Args:
+        world: The stand-in world.
+        bodies: Objects; the camera looks at the middle of where they are at first.
+        qpos: States, shape (T, nq).
+        period: Time between them [s].
+    """
+    world = world.copy()
+    if not world.lights:
+        world.worldbody.add_light(pos=list(LAMP), dir=[0, 0, -1], castshadow=True)
+    model = world.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos[0]
+    mujoco.mj_kinematics(model, data)
+    middle = np.mean([data.body(name).xpos for name in bodies], axis=0)
+    place = middle + ASIDE
+    camera = replace(
+        SensingCfg(),
+        camera_position=(float(place[0]), float(place[1]), float(place[2])),
+        camera_target=(float(middle[0]), float(middle[1]), float(middle[2])),
+        camera_fovy=FOVY,
+        image_size=SIZE,
+        rgb_std=0.0,
+    )
+    return film(camera, world, bodies, period * np.arange(len(qpos)), qpos, np.random.default_rng(0)).rgb
+
+
+def write_video(path: Path, frames: np.ndarray, rate: float) -> None:
+    """Write frames, uint8, shape (T, H, W, 3), as an MP4 at a rate [Hz], in one piece or not at all.
+
+    Raises:
+        ConcentError: OpenCV can write no MP4 here.
+    """
+    import cv2
+
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    height, width = frames.shape[1:3]
+    for codec in CODECS:
+        writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*codec), rate, (width, height))
+        if writer.isOpened():
+            for frame in frames:
+                writer.write(np.ascontiguousarray(frame[..., ::-1]))
+            writer.release()
+            partial.replace(path)
+            return
+    raise ConcentError("OpenCV cannot write this video", where=path, expected=f"a codec among {', '.join(CODECS)}")
