@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from concent_warp.render.rasterise import Rasteriser, intrinsics_of
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
+from concent_warp.render.splats.splats import Splats
 from measurements import Measurements
 from pages import FOLDER, ROOT, machine, machine_line, table, write_page
 

@@ -20,12 +20,12 @@ from typing import Any
 
 import torch
 import warp as wp
-from concent_warp.render.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
-from concent_warp.render.flow import draw
-from concent_warp.render.flow_network import FlowNetwork
-from concent_warp.render.pairs import Pairs, drawn_scene, pairs_of, to_signed
+from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
+from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow_network import FlowNetwork
+from concent_warp.render.networks.pairs import Pairs, drawn_scene, pairs_of, to_signed
+from concent_warp.render.networks.train import ENLARGE, NetworkTraining, RenderTraining, network_of
 from concent_warp.render.raw import RawCamera, Stage
-from concent_warp.render.train_networks import ENLARGE, NetworkTraining, RenderTraining, network_of
 from feature_distance import FeatureDistance, feature_distance
 from measurements import Measurements
 from pages import machine
@@ -227,7 +227,7 @@ def main() -> None:
 
 def reduced_bytes(images: torch.Tensor, size: int) -> torch.Tensor:
     """Return uint8 images (N, 3, H, W) at the size that is painted, as the networks are trained with."""
-    from concent_warp.render.super_resolution import reduced
+    from concent_warp.render.networks.super_resolution import reduced
 
     return reduced(images.float(), size).round().clamp(0, 255).to(torch.uint8)
 

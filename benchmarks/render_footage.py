@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from concent_warp.render.splat_views import FILE, SplatViews
+from concent_warp.render.splats.views import FILE, SplatViews
 
 from concent_warp.reality.appearance.surroundings import light
 from concent_warp.reality.record import RealityCfg, record

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from concent_warp.render.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
+from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 from feature_distance import feature_distance
 from measurements import Measurements
 from pages import machine
@@ -32,7 +32,7 @@ from concent_warp.reality.sensors.photographs import PhotographsCfg
 from concent_warp.recording.recording import Recording
 
 if TYPE_CHECKING:
-    from concent_warp.render.pairs import Pairs
+    from concent_warp.render.networks.pairs import Pairs
 
 QUICK = NetworkTrainCfg(steps=900, batch=8, learning_rate=1.5e-3, warm_up=20, ema=0.99)
 SMALL = RenderTrainCfg(
@@ -69,8 +69,8 @@ def fitted_splats(folder: Path, body: str, arguments: argparse.Namespace) -> Pat
 def trained(folder: Path, networks: Path, arguments: argparse.Namespace) -> None:
     """Train the networks of the footage without objects into a folder, or go on with that."""
     import warp as wp
-    from concent_warp.render.pairs import pairs_of
-    from concent_warp.render.train_networks import CHECKPOINT, RenderTraining
+    from concent_warp.render.networks.pairs import pairs_of
+    from concent_warp.render.networks.train import CHECKPOINT, RenderTraining
 
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
     pairs = pairs_of(footage(folder, EMPTY, arguments.demonstrations), CAMERAS, device=arguments.device)
@@ -99,7 +99,7 @@ def trained(folder: Path, networks: Path, arguments: argparse.Namespace) -> None
 def steps_within(seconds: float, cfg: RenderTrainCfg, pairs: Sequence[Pairs], device: str) -> tuple[int, int]:
     """Return the steps of flow and super-resolution that a time [s] allows, at most those of the settings."""
     import torch
-    from concent_warp.render.train_networks import ENLARGE, RenderTraining
+    from concent_warp.render.networks.train import ENLARGE, RenderTraining
 
     trial = RenderTraining(pairs, cfg, device=device)
     took: dict[str, float] = {}
@@ -213,7 +213,7 @@ def main() -> None:
 def painter(networks: Path, arguments: argparse.Namespace) -> Any:
     """Return the trained networks."""
     import warp as wp
-    from concent_warp.render.painter import Painter
+    from concent_warp.render.networks.painter import Painter
 
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
     return Painter.load(networks, device=where, steps=arguments.flow_steps)
@@ -223,8 +223,8 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     """Return what all ways of rendering share."""
     import warp as wp
     from concent_warp.render.cameras import Camera
-    from concent_warp.render.pairs import drawn_scene
-    from concent_warp.render.splats import Splats
+    from concent_warp.render.networks.pairs import drawn_scene
+    from concent_warp.render.splats.splats import Splats
 
     from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model

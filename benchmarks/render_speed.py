@@ -22,15 +22,15 @@ import numpy as np
 import torch
 import warp as wp
 from concent_warp.render.cameras import Camera
-from concent_warp.render.cfg import FlowNetworkCfg, SuperResolutionCfg
 from concent_warp.render.composite import HybridCamera
-from concent_warp.render.flow import draw
-from concent_warp.render.flow_network import FlowNetwork
-from concent_warp.render.painter import Painter
+from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
+from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow_network import FlowNetwork
+from concent_warp.render.networks.painter import Painter
+from concent_warp.render.networks.super_resolution import SuperResolution
 from concent_warp.render.raw import RawCamera, Stage
 from concent_warp.render.shadow_cfg import ShadowCfg
-from concent_warp.render.splats import Splats
-from concent_warp.render.super_resolution import SuperResolution
+from concent_warp.render.splats.splats import Splats
 from measurements import Measurements
 from pages import machine
 

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from concent_warp.render.splat_cfg import SplatFitCfg
-from concent_warp.render.splat_fit import SplatFit
-from concent_warp.render.splat_start import visual_hull
-from concent_warp.render.splat_views import FILE, SplatViews, read_views
+from concent_warp.render.splats.cfg import SplatFitCfg
+from concent_warp.render.splats.fit import SplatFit
+from concent_warp.render.splats.initial import visual_hull
+from concent_warp.render.splats.views import FILE, SplatViews, read_views
 from measurements import Measurements
 from pages import FOLDER, machine, machine_line, table, write_page
 

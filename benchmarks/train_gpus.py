@@ -21,7 +21,7 @@ from statistics import median
 from typing import Literal
 
 import tyro
-from concent_warp.train.curve import read_curve
+from concent_warp.train.learning.metrics import read_curve
 from measurements import Measurements, Row
 from pages import machine, machine_line, read_data, table, write_data, write_page
 

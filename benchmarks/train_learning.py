@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 import tyro
 from concent_warp.train.cfg import TrainCfg
-from concent_warp.train.curve import CURVE
+from concent_warp.train.learning.metrics import CURVE
 from concent_warp.train.run import Run, train
 from pages import machine
 from train_cases import CASES, Case, material
@@ -85,8 +85,8 @@ def folder_of(args: Args, case: str, seed: int) -> Path:
 def train_one(args: Args, name: str, seed: int) -> None:
     """Train a case with a seed, and try the policy in simulation."""
     begun = time.monotonic()
-    from concent_warp.train.ppo import CHECKPOINT, Round, load_checkpoint
-    from concent_warp.train.shipped import ship
+    from concent_warp.train.learning.ppo import CHECKPOINT, Round, load_checkpoint
+    from concent_warp.train.policy.pretrained import ship
 
     from concent_warp.cli.terminal import quiet_warp
     from concent_warp.simulate.warp_engine import preferred_device
@@ -169,9 +169,9 @@ def with_stage(run: Run, stage: str) -> Run:
 
 def simulated(run: Run, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
     """Return what the policy without exploration does in simulation, from states that training has not seen."""
-    from concent_warp.train.evaluate import evaluate
-    from concent_warp.train.ppo import Trainer, load_checkpoint
-    from concent_warp.train.worlds import make_environment
+    from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.learning.ppo import Trainer, load_checkpoint
+    from concent_warp.train.policy.evaluate import evaluate
 
     task = run.task()
     states = run.evaluation_states(task, args.episodes, run.cfg.seed)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from concent_warp.train.curve import read_curve
+from concent_warp.train.learning.metrics import read_curve
 from pages import FOLDER, machine_line, read_data, table, write_data, write_page
 from train_cases import CASES
 from train_learning import RESULT, changed

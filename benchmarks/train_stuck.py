@@ -20,12 +20,12 @@ import numpy as np
 import torch
 import tyro
 from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
-from concent_warp.train.environment import Environment
-from concent_warp.train.evaluate import Policy
-from concent_warp.train.ppo import CHECKPOINT, Trainer, load_checkpoint
-from concent_warp.train.resets import InitialStates
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.policy.evaluate import Policy
+from concent_warp.train.resets.sample import InitialStates
 from concent_warp.train.run import Run
-from concent_warp.train.worlds import make_environment
 from pages import machine, machine_line, read_data, table, write_data, write_page
 from train_learning import changed
 

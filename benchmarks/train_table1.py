@@ -18,11 +18,11 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from concent_warp.train.environment import Environment
-from concent_warp.train.evaluate import evaluate, wilson
-from concent_warp.train.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.policy.evaluate import evaluate, wilson
 from concent_warp.train.run import Run
-from concent_warp.train.task import Task
+from concent_warp.train.task.task import Task
 from joblib import Parallel, delayed
 from measurements import Measurements, Row
 from pages import machine, machine_line, read_data, table, write_data, write_page

@@ -23,12 +23,12 @@ import numpy as np
 import torch
 import tyro
 from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
-from concent_warp.train.environment import Environment
-from concent_warp.train.ppo import Trainer
-from concent_warp.train.resets import InitialStates, draw_states
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import buffers, make_environment
+from concent_warp.train.learning.ppo import Trainer
+from concent_warp.train.resets.sample import InitialStates, draw_states
 from concent_warp.train.run import Run
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import buffers, make_environment
+from concent_warp.train.task.task import Task
 from measurements import Measurements, Row
 from pages import machine
 from train_throughput_parts import (

@@ -12,8 +12,8 @@ from typing import Any
 import mujoco_warp as mjw
 import torch
 import warp as wp
-from concent_warp.train.environment import Environment
-from concent_warp.train.physics import Graph, WarpPhysics
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.physics import Graph, WarpPhysics
 
 PARTS = ("command", "physics", "distances", "judge", "poses and pairs", "observe")
 """Parts of a step, as `Environment.parts` returns them."""

@@ -14,14 +14,14 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
-from concent_warp.render.painter import Painter
-from concent_warp.render.pairs import carrier_pose
-from concent_warp.render.rasterise import Rasteriser
+from concent_warp.render.networks.painter import Painter
+from concent_warp.render.networks.pairs import carrier_pose
 from concent_warp.render.raw import RawCamera, Stage, body_id
 from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
+from concent_warp.render.splats.rasterise import Rasteriser
 
 if TYPE_CHECKING:
-    from concent_warp.render.splats import Splats
+    from concent_warp.render.splats.splats import Splats
 
 
 @dataclass(frozen=True)

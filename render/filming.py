@@ -11,7 +11,7 @@ from concent_warp.render.composite import HybridCamera
 from concent_warp.render.dataset.layout import DatasetWriter, EpisodeWriter
 from concent_warp.render.dataset.video import VideoWriter
 from concent_warp.render.figure import Album
-from concent_warp.render.pairs import to_bytes
+from concent_warp.render.networks.pairs import to_bytes
 
 FILMS = "films"
 """Folder of the videos to look at, in that of the data set."""

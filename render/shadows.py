@@ -11,9 +11,9 @@ import math
 from collections.abc import Sequence
 
 import torch
-from concent_warp.render.rasterise import Rasteriser
 from concent_warp.render.shadow_cfg import ShadowCfg
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.rasterise import Rasteriser
+from concent_warp.render.splats.splats import Splats
 
 
 class Shadows:

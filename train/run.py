@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from concent_warp.train.cfg import SETTINGS, TrainCfg, TrainError, plain
-from concent_warp.train.ppo import CHECKPOINT, Report, Round, Trainer
-from concent_warp.train.ranks import Ranks
-from concent_warp.train.resets import InitialStates, draw_states
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.ppo import CHECKPOINT, Report, Round, Trainer
+from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.task.task import Task
 
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence

@@ -18,11 +18,11 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from concent_warp.train.cfg import EnvironmentCfg, TrainError
 
 if TYPE_CHECKING:
-    from concent_warp.train.environment import Environment
-    from concent_warp.train.evaluate import Evaluation
-    from concent_warp.train.resets import InitialStates
+    from concent_warp.train.environment.environment import Environment
+    from concent_warp.train.policy.evaluate import Evaluation
+    from concent_warp.train.resets.sample import InitialStates
     from concent_warp.train.run import Run as TrainedRun
-    from concent_warp.train.task import Task
+    from concent_warp.train.task.task import Task
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     quiet_warp()
     import torch
 
-    from concent_warp.train.evaluate import evaluate
-    from concent_warp.train.ppo import Trainer, load_checkpoint
+    from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.learning.ppo import Trainer, load_checkpoint
+    from concent_warp.train.policy.evaluate import evaluate
     from concent_warp.train.run import Run
-    from concent_warp.train.worlds import make_environment
 
     if arguments.episodes < 1:
         raise TrainError("the number of episodes is not right", expected="at least 1", found=arguments.episodes)
@@ -180,8 +180,8 @@ def film_all(films: list[Path], reel: Reel, world: TaskWorld, task: Task, starts
 
 def real_environment(task: Task, cfg: EnvironmentCfg, states: InitialStates, arguments: Arguments) -> Environment:
     """Return the stand-in world with the policy's senses and commands, its block to come to rest in the hole."""
-    from concent_warp.train.environment import Environment
-    from concent_warp.train.physics import Actor, MujocoPhysics
+    from concent_warp.train.environment.environment import Environment
+    from concent_warp.train.environment.physics import Actor, MujocoPhysics
 
     world = task_world(task, cfg, arguments)
     model = world.compile()

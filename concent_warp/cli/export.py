@@ -33,9 +33,9 @@ class Arguments:
 def run(arguments: Arguments) -> dict[str, Any]:
     """Export and return the metadata."""
     quiet_warp()
-    from concent_warp.train.export import export
-    from concent_warp.train.ppo import CHECKPOINT
-    from concent_warp.train.shipped import ship
+    from concent_warp.train.learning.ppo import CHECKPOINT
+    from concent_warp.train.policy.export import export
+    from concent_warp.train.policy.pretrained import ship
 
     path = arguments.run / CHECKPOINT if arguments.run.is_dir() else arguments.run
     if arguments.as_pretrained:

@@ -43,8 +43,8 @@ def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
     Raises:
         TrainError: Neither or both are given, or there is no such policy, folder or file.
     """
-    from concent_warp.train.ppo import CHECKPOINT
-    from concent_warp.train.shipped import shipped
+    from concent_warp.train.learning.ppo import CHECKPOINT
+    from concent_warp.train.policy.pretrained import shipped
 
     if (checkpoint is None) == (pretrained is None):
         raise TrainError(

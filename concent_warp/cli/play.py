@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from concent_warp.report.live import LiveView
-    from concent_warp.train.play import Moment, Player
+    from concent_warp.train.policy.play import Moment, Player
 
 PAUSE = 1.0
 """How long the last moment of an episode stays, at normal speed [s]."""
@@ -98,10 +98,10 @@ def prepared(arguments: Arguments) -> tuple[Player, mujoco.MjModel]:
     """Return the policy in its world, and the model to draw."""
     import torch
 
-    from concent_warp.train.play import Player
-    from concent_warp.train.ppo import Trainer, load_checkpoint
+    from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.learning.ppo import Trainer, load_checkpoint
+    from concent_warp.train.policy.play import Player
     from concent_warp.train.run import Run
-    from concent_warp.train.worlds import make_environment
 
     if wanted(arguments.hide) and arguments.world == "simulation":
         raise TrainError("effects are hidden in the stand-in world alone", fix="add --world reality")

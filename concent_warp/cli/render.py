@@ -141,10 +141,10 @@ def film_policy(arguments: Arguments) -> Filming:
     """Film the episodes of a policy."""
     import torch
 
-    from concent_warp.train.episodes import start, steps
-    from concent_warp.train.ppo import Trainer, load_checkpoint
+    from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.learning.ppo import Trainer, load_checkpoint
+    from concent_warp.train.policy.episodes import start, steps
     from concent_warp.train.run import Run
-    from concent_warp.train.worlds import make_environment
 
     path = given_checkpoint(arguments.checkpoint, arguments.pretrained)
     made = Run.load(path.parent)
@@ -241,8 +241,8 @@ def hybrid_camera(arguments: Arguments, given: Model, worlds: int) -> tuple[Hybr
     from concent_warp.model import Model
     from concent_warp.render.cameras import place_cameras
     from concent_warp.render.composite import HybridCamera
-    from concent_warp.render.painter import Painter
-    from concent_warp.render.splats import Splats
+    from concent_warp.render.networks.painter import Painter
+    from concent_warp.render.splats.splats import Splats
     from concent_warp.scene.cameras import with_cameras
     from concent_warp.simulate.warp_engine import preferred_device
 

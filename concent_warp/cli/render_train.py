@@ -11,10 +11,10 @@ import tyro
 from concent_warp.cli.run_folder import resuming_command, run_folder, write_settings
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
-from concent_warp.render.cfg import RenderTrainCfg
+from concent_warp.render.networks.cfg import RenderTrainCfg
 
 if TYPE_CHECKING:
-    from concent_warp.render.train_networks import RenderTraining
+    from concent_warp.render.networks.train import RenderTraining
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def run(arguments: Arguments) -> RenderTraining:
     quiet_warp()
     import warp as wp
 
-    from concent_warp.render.pairs import pairs_of
-    from concent_warp.render.train_networks import CHECKPOINT, RenderTraining
+    from concent_warp.render.networks.pairs import pairs_of
+    from concent_warp.render.networks.train import CHECKPOINT, RenderTraining
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = arguments.device or preferred_device()

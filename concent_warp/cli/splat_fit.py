@@ -14,13 +14,13 @@ from concent_warp.cli.run_folder import CHECKPOINT, resuming_command, run_folder
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
 from concent_warp.model import write_text
-from concent_warp.render.splat_cfg import SplatFitCfg
+from concent_warp.render.splats.cfg import SplatFitCfg
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from concent_warp.render.splat_fit import Score, SplatFit
-    from concent_warp.render.splat_views import SplatViews
+    from concent_warp.render.splats.fit import Score, SplatFit
+    from concent_warp.render.splats.views import SplatViews
 
 SPLATS, SCORES, PICTURE = "splats.ply", "scores.json", "held_out.png"
 MOST_PICTURES = 6
@@ -57,7 +57,7 @@ class Arguments:
 def run(arguments: Arguments) -> list[Score]:
     """Fit and write the run folder."""
     quiet_warp()
-    from concent_warp.render.splat_views import read_views
+    from concent_warp.render.splats.views import read_views
 
     views = read_views(arguments.images).shrunk(arguments.longest)
     source = arguments.images if arguments.images.is_dir() else arguments.images.parent
@@ -78,7 +78,7 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
     import numpy as np
     import torch
 
-    from concent_warp.render.splat_fit import SplatFit
+    from concent_warp.render.splats.fit import SplatFit
 
     cfg = arguments.fit
     device = arguments.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
@@ -104,7 +104,7 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
 
 def start(arguments: Arguments, views: SplatViews, rng: np.random.Generator) -> np.ndarray:
     """Return the points to start from [m], shape (n, 3)."""
-    from concent_warp.render.splat_start import read_start, visual_hull
+    from concent_warp.render.splats.initial import read_start, visual_hull
 
     if arguments.points is None:
         return visual_hull(views, arguments.fit.start, rng)

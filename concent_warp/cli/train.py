@@ -17,8 +17,8 @@ from concent_warp.recording.load import load_recording
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
-    from concent_warp.train.ppo import Round
-    from concent_warp.train.ranks import Ranks
+    from concent_warp.train.learning.distributed import Ranks
+    from concent_warp.train.learning.ppo import Round
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Arguments:
 def run(arguments: Arguments) -> Round | None:
     """Train and write the run folder, one of several processes where torchrun started them."""
     quiet_warp()
-    from concent_warp.train.ppo import CHECKPOINT, load_checkpoint
-    from concent_warp.train.ranks import Ranks
+    from concent_warp.train.learning.distributed import Ranks
+    from concent_warp.train.learning.ppo import CHECKPOINT, load_checkpoint
 
     ranks = Ranks.here()
     begin_with = None if arguments.begin_with is None else given_checkpoint(arguments.begin_with, None)

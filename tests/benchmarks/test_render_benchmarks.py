@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from concent_warp.render.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
+from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from tests.render import small_arm

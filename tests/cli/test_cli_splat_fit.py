@@ -2,8 +2,8 @@ import json
 
 import cv2
 import pytest
-from concent_warp.render.splat_views import SplatViews
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.splats import Splats
+from concent_warp.render.splats.views import SplatViews
 
 from concent_warp.cli import main
 from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs

@@ -2,9 +2,9 @@
 
 import numpy as np
 import torch
-from concent_warp.render.rasterise import Rasteriser, intrinsics_of
-from concent_warp.render.splat_views import SplatViews
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
+from concent_warp.render.splats.splats import Splats
+from concent_warp.render.splats.views import SplatViews
 
 STILL = torch.tensor([[[0.0, 0, 0, 1, 0, 0, 0]]])
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from concent_warp.render.cameras import Camera
 from concent_warp.render.raw import RawCamera, Stage
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.splats import Splats
 
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, Recording
 from concent_warp.scene.scene import Scene

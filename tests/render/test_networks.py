@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.render.cameras import Camera
-from concent_warp.render.cfg import AugmentCfg, FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
-from concent_warp.render.flow import draw, flow_loss
-from concent_warp.render.flow_network import FlowNetwork
-from concent_warp.render.painter import Painter
-from concent_warp.render.pairs import Pairs, columns, frames_before
-from concent_warp.render.super_resolution import SuperResolution, enlarged, reduced
-from concent_warp.render.train_networks import RenderTraining
+from concent_warp.render.networks.cfg import (
+    AugmentCfg,
+    FlowNetworkCfg,
+    NetworkTrainCfg,
+    RenderTrainCfg,
+    SuperResolutionCfg,
+)
+from concent_warp.render.networks.flow import draw, flow_loss
+from concent_warp.render.networks.flow_network import FlowNetwork
+from concent_warp.render.networks.painter import Painter
+from concent_warp.render.networks.pairs import Pairs, columns, frames_before
+from concent_warp.render.networks.super_resolution import SuperResolution, enlarged, reduced
+from concent_warp.render.networks.train import RenderTraining
 
 from concent_warp.errors import RenderError
 

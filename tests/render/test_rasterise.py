@@ -1,8 +1,8 @@
 import pytest
 import torch
 import warp as wp
-from concent_warp.render.rasterise import Rasteriser, intrinsics_of
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
+from concent_warp.render.splats.splats import Splats
 
 from concent_warp.errors import RenderError
 

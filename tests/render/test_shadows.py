@@ -2,9 +2,9 @@ import math
 
 import pytest
 import torch
-from concent_warp.render.rasterise import intrinsics_of
 from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.rasterise import intrinsics_of
+from concent_warp.render.splats.splats import Splats
 
 from concent_warp.errors import RenderError
 

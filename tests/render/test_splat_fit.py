@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from concent_warp.render.splat_cfg import RatesCfg, SplatFitCfg
-from concent_warp.render.splat_fit import SplatFit, turned
-from concent_warp.render.splat_start import read_start, visual_hull
-from concent_warp.render.splats import Splats
+from concent_warp.render.splats.cfg import RatesCfg, SplatFitCfg
+from concent_warp.render.splats.fit import SplatFit, turned
+from concent_warp.render.splats.initial import read_start, visual_hull
+from concent_warp.render.splats.splats import Splats
 from photographed import ball, cameras, photographed
 
 from concent_warp.errors import RenderError, SceneError

@@ -3,7 +3,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from concent_warp.render.splat_views import FILE, read_views
+from concent_warp.render.splats.views import FILE, read_views
 from photographed import photographed
 
 from concent_warp.errors import RenderError

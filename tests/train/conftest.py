@@ -1,9 +1,9 @@
 import pytest
 import torch
-from concent_warp.train.environment import Environment
-from concent_warp.train.resets import InitialStates, draw_states
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_environment
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.task.task import Task
 from small_insertion import SETTINGS, make_task
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
-from concent_warp.train.ppo import Trainer
-from concent_warp.train.ranks import Ranks
-from concent_warp.train.resets import draw_states
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.ppo import Trainer
+from concent_warp.train.resets.sample import draw_states
 from concent_warp.train.run import Run, train
-from concent_warp.train.worlds import make_environment
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model, make_task
 
 from concent_warp.recording.recording import Recording

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
-from concent_warp.train.task import Task
+from concent_warp.train.task.task import Task
 
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import TrainError
-from concent_warp.train.chain import worst_distance
-from concent_warp.train.environment import TERMS, Environment
-from concent_warp.train.evaluate import evaluate
-from concent_warp.train.movable import movable
-from concent_warp.train.resets import InitialStates, draw_states
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_environment, make_physics
+from concent_warp.train.environment.environment import TERMS, Environment
+from concent_warp.train.environment.worlds import make_environment, make_physics
+from concent_warp.train.policy.evaluate import evaluate
+from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.task.movable import movable
+from concent_warp.train.task.stages import worst_distance
+from concent_warp.train.task.task import Task
 from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 
 WORLDS = 6

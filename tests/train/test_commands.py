@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import RandomisationCfg, TrainError
-from concent_warp.train.commands import Follower, Following
-from concent_warp.train.effects import effects_of_worlds
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_environment, make_physics
+from concent_warp.train.environment.commands import Follower, Following
+from concent_warp.train.environment.effects import effects_of_worlds
+from concent_warp.train.environment.worlds import make_environment, make_physics
+from concent_warp.train.task.task import Task
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect, Parameter

@@ -2,7 +2,7 @@
 
 import json
 
-from concent_warp.train.curve import CURVE, curve, read_curve
+from concent_warp.train.learning.metrics import CURVE, curve, read_curve
 
 
 def point(iteration: int) -> dict[str, float]:

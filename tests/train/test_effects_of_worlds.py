@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.effects import drawn, effects_of_worlds
-from concent_warp.train.randomisation import drawn_fields
-from concent_warp.train.task import Task
-from concent_warp.train.worlds import make_physics
+from concent_warp.train.environment.effects import drawn, effects_of_worlds
+from concent_warp.train.environment.randomisation import drawn_fields
+from concent_warp.train.environment.worlds import make_physics
+from concent_warp.train.task.task import Task
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import TrainCfg, TrainError
-from concent_warp.train.environment import TERMS, Environment
-from concent_warp.train.physics import WarpPhysics, compiled_or_plain
-from concent_warp.train.randomisation import drawn_fields
-from concent_warp.train.worlds import make_environment, make_physics
+from concent_warp.train.environment.environment import TERMS, Environment
+from concent_warp.train.environment.physics import WarpPhysics, compiled_or_plain
+from concent_warp.train.environment.randomisation import drawn_fields
+from concent_warp.train.environment.worlds import make_environment, make_physics
 from small_insertion import SETTINGS
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.physics import Actor, MujocoPhysics
+from concent_warp.train.environment.physics import Actor, MujocoPhysics
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError

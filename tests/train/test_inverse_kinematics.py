@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 from concent_warp.train.cfg import ActionCfg
-from concent_warp.train.inverse_kinematics import reach
-from concent_warp.train.inverse_kinematics_batch import reach_many, tool_chain
-from concent_warp.train.robot import Robot
+from concent_warp.train.resets.inverse_kinematics import reach
+from concent_warp.train.resets.inverse_kinematics_batch import reach_many, tool_chain
+from concent_warp.train.task.robot import Robot
 
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 

@@ -1,5 +1,5 @@
 import torch
-from concent_warp.train.normalisation import LARGEST, BoundedNormalization
+from concent_warp.train.learning.normalisation import LARGEST, BoundedNormalization
 
 
 def test_observations_far_out_are_bounded_and_usual_ones_as_rsl_rl_has_them():

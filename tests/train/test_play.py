@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.environment import Environment
-from concent_warp.train.play import Player
-from concent_warp.train.worlds import make_environment
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.policy.play import Player
 from small_insertion import SETTINGS
 
 

@@ -10,8 +10,8 @@ import onnx
 import pytest
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
-from concent_warp.train.export import export
-from concent_warp.train.ppo import CHECKPOINT
+from concent_warp.train.learning.ppo import CHECKPOINT
+from concent_warp.train.policy.export import export
 from concent_warp.train.run import Run, train
 from onnx.reference import ReferenceEvaluator
 from small_insertion import SETTINGS, make_demonstration, make_model
@@ -80,7 +80,7 @@ def test_metadata_says_what_the_numbers_are(trained, tmp_path):
 
 def test_commands_follow_from_metadata_alone(trained, tmp_path):
     """What the metadata says of an action is what the environment does with it."""
-    from concent_warp.train.worlds import make_environment
+    from concent_warp.train.environment.worlds import make_environment
 
     folder, _, _ = trained
     said = export(folder / CHECKPOINT, tmp_path / "policy.onnx")

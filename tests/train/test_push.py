@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import TrainCfg, TrainError
-from concent_warp.train.environment import Environment
-from concent_warp.train.physics import MujocoPhysics, WarpPhysics
-from concent_warp.train.worlds import make_environment
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.physics import MujocoPhysics, WarpPhysics
+from concent_warp.train.environment.worlds import make_environment
 from small_insertion import SETTINGS
 
 from concent_warp.effects.registry import effect_class

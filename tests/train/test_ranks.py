@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from concent_warp.train.cfg import TrainError
-from concent_warp.train.ppo import CHECKPOINT
-from concent_warp.train.ranks import Ranks
+from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.run import train
 from several_processes import make_run, updated
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
-from concent_warp.train.distribution import SquashedGaussian
-from concent_warp.train.environment import TERMS
-from concent_warp.train.reward import disturbance, effort, engineered
-from concent_warp.train.rotation import angle, inverse, multiply, rotate, two_columns
+from concent_warp.train.environment.environment import TERMS
+from concent_warp.train.environment.reward import disturbance, effort, engineered
+from concent_warp.train.environment.rotation import angle, inverse, multiply, rotate, two_columns
+from concent_warp.train.learning.distribution import SquashedGaussian
 
 
 def quaternions(rng: np.random.Generator, *shape: int) -> np.ndarray:

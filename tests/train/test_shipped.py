@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import TrainError
-from concent_warp.train.observation import Layout
-from concent_warp.train.ppo import CHECKPOINT
+from concent_warp.train.environment.observation import Layout
+from concent_warp.train.learning.ppo import CHECKPOINT
+from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, ship, shipped
 from concent_warp.train.run import Run, train
-from concent_warp.train.shipped import FOLDER, ORIGIN, names, ship, shipped
 from several_processes import make_run
 
 from concent_warp.cli import main

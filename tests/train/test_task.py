@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg, TrainError
-from concent_warp.train.environment import Environment
-from concent_warp.train.observation import Layout
-from concent_warp.train.physics import MujocoPhysics
-from concent_warp.train.resets import draw_states
-from concent_warp.train.slots import choose
-from concent_warp.train.task import Task
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.observation import Layout
+from concent_warp.train.environment.physics import MujocoPhysics
+from concent_warp.train.resets.sample import draw_states
+from concent_warp.train.task.slots import choose
+from concent_warp.train.task.task import Task
 from small_insertion import SETTINGS, make_demonstration, make_model, make_task
 
 from concent_warp.model import Model

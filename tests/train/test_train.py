@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
-from concent_warp.train.curve import CURVE, read_curve
-from concent_warp.train.environment import Environment
-from concent_warp.train.evaluate import evaluate, wilson
-from concent_warp.train.export import export
-from concent_warp.train.ppo import CHECKPOINT, OFFENCE, Round
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.metrics import CURVE, read_curve
+from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round
+from concent_warp.train.policy.evaluate import evaluate, wilson
+from concent_warp.train.policy.export import export
 from concent_warp.train.run import Run, train
-from concent_warp.train.worlds import make_environment
 from small_insertion import SETTINGS, make_demonstration, make_model
 
 from concent_warp.cli import main

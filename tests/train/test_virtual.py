@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from concent_warp.train.cfg import CollisionCfg
-from concent_warp.train.virtual import surface_points, within
-from concent_warp.train.worlds import make_environment
+from concent_warp.train.environment.vcp import surface_points, within
+from concent_warp.train.environment.worlds import make_environment
 from small_insertion import SETTINGS
 
 from concent_warp.scene.shapes.solid import Box

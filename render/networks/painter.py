@@ -1,0 +1,123 @@
+"""Robot and background as the real camera sees them: the trained networks at work, frame after frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from concent_warp.render.cameras import Camera
+from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
+from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow_network import FlowNetwork
+from concent_warp.render.networks.super_resolution import SuperResolution, reduced
+from concent_warp.render.networks.train import CHECKPOINT, ENLARGE, load_checkpoint, network_of
+
+from concent_warp.errors import RenderError
+
+
+class Painter:
+    """Paints the frames of W worlds by C cameras; each frame follows from the one painted before."""
+
+    def __init__(
+        self,
+        networks: dict[str, FlowNetwork],
+        references: dict[str, torch.Tensor],
+        cameras: dict[str, Camera],
+        enlarge: SuperResolution,
+        *,
+        steps: int = 4,
+        seed: int = 0,
+        half: bool = False,
+    ) -> None:
+        """Take networks into use.
+
+        Args:
+            networks: Flow by camera.
+            references: Mean image of each camera, shape (3, S, S), with which painting begins.
+            cameras: Where they are.
+            enlarge: Super-resolution.
+            steps: Steps of the flow, fewer are quicker.
+            seed: Seed of the noise.
+            half: Multiply in bfloat16, which is quicker on a GPU.
+        """
+        self.networks, self.references, self.cameras, self.enlarge = networks, references, cameras, enlarge
+        self.device, self.steps, self.half = next(enlarge.parameters()).device, steps, half
+        self.size = next(iter(networks.values())).cfg.size
+        self._generator = torch.Generator(self.device).manual_seed(seed)
+        self._previous: dict[str, torch.Tensor] = {}
+
+    @staticmethod
+    def load(folder: Path, *, device: str = "cpu", steps: int = 4, seed: int = 0, half: bool = False) -> Painter:
+        """Read what `concent render-train` wrote to a folder, the running means of the weights.
+
+        Raises:
+            RenderError: There is nothing of the kind.
+        """
+        path = folder / CHECKPOINT if folder.is_dir() else folder
+        state = load_checkpoint(path, device)
+        cfg, sizes = state["cfg"], state["cfg"]["network"]
+        base = FlowNetworkCfg(**sizes)
+        networks, references, cameras = {}, {}, {}
+        for described, reference in zip(state["cameras"], state["references"], strict=True):
+            camera = Camera(**described)
+            network = FlowNetwork(network_of(base, camera))
+            network.load_state_dict(averaged(state["trainings"][camera.name]["mean"]))
+            networks[camera.name], references[camera.name] = network.to(device).eval(), reference.to(device)
+            cameras[camera.name] = camera
+        enlarge = SuperResolution(SuperResolutionCfg(**cfg["super_resolution"]))
+        enlarge.load_state_dict(averaged(state["trainings"][ENLARGE]["mean"]))
+        return Painter(networks, references, cameras, enlarge.to(device).eval(), steps=steps, seed=seed, half=half)
+
+    def begin(self, worlds: int, which: torch.Tensor | None = None) -> None:
+        """Begin episodes in W worlds, or in those of a mask (W,) bool alone."""
+        for name, reference in self.references.items():
+            fresh = reference.expand(worlds, -1, -1, -1)
+            before = self._previous.get(name)
+            if which is None or before is None:
+                self._previous[name] = fresh.clone()
+            else:
+                self._previous[name] = torch.where(which[:, None, None, None], fresh, before)
+
+    @torch.no_grad()
+    def paint(self, cameras: Sequence[str], simulated: torch.Tensor, poses: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return the next frames, colours 0..1, shape (W, C, H, W', 3).
+
+        Args:
+            cameras: Names of the C cameras.
+            simulated: The simulation's colours without the objects, 0..1, shape (W, C, H, W', 3).
+            poses: Poses of the bodies that carry them, shape (W, 9) each.
+
+        Raises:
+            RenderError: There is no network for a camera, or images are not of the size that these paint.
+        """
+        if missing := [name for name in cameras if name not in self.networks]:
+            raise RenderError(
+                "no network was trained for this camera", expected=f"some of {list(self.networks)}", found=missing
+            )
+        if tuple(simulated.shape[2:4]) != (4 * self.size, 4 * self.size):
+            raise RenderError(
+                "the networks paint images of another size", expected=4 * self.size, found=tuple(simulated.shape[2:4])
+            )
+        frames = []
+        for c, name in enumerate(cameras):
+            seen = reduced(simulated[:, c].permute(0, 3, 1, 2).to(self.device), self.size)
+            # Rounded as the images are that were learnt from.
+            seen = (255 * seen).round() / 127.5 - 1
+            network = self.networks[name]
+            pose = poses[c].to(self.device) if network.cfg.posed else None
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
+                drawn = draw(network, seen, self._previous[name], pose, steps=self.steps, generator=self._generator)
+                large = self.enlarge(drawn).float()
+            self._previous[name] = drawn
+            frames.append(((large + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1))
+        return torch.stack(frames, dim=1)
+
+    def small(self, camera: str) -> torch.Tensor:
+        """Return what the flow painted last, before super-resolution, in -1..1, shape (W, 3, S, S)."""
+        return self._previous[camera]
+
+
+def averaged(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the weights of the model that an `AveragedModel` keeps."""
+    return {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}

@@ -1,0 +1,445 @@
+"""The vectorised environment, as rsl-rl wants one: everything on the device, and no wait for it in a step.
+
+A step: commands from the action; the simulator; distances of pairs and virtual collisions; rewards, ends of episodes
+and new initial states where episodes ended; poses and distances of what is there now; observation. On CUDA each part
+is a captured graph.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any, cast
+
+import numpy as np
+import torch
+import warp as wp
+from concent_warp.kernels.contact_pairs import ContactPairs
+from concent_warp.train.cfg import EnvironmentCfg, TrainError
+from concent_warp.train.environment.observation import BaseObservation, Layout
+from concent_warp.train.environment.physics import Graph, Physics, captured
+from concent_warp.train.environment.reward import disturbance, effort, engineered, relative_pose
+from concent_warp.train.environment.rotation import inverse, rotate
+from concent_warp.train.environment.vcp import virtual_collision
+from concent_warp.train.resets.sample import InitialStates
+from concent_warp.train.task.task import Task
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
+"""Terms of the reward, in the order of `Environment.terms`."""
+SPEED = 1e4
+"""Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
+EXTENT = 1e4
+"""Generalised position beyond which it does [rad or m]."""
+EPISODES = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
+CHAINS = ("chains", "chain success")
+"""Sums over episodes that started with all stages to come; how many met each stage's target follows."""
+
+
+class Environment(VecEnv):
+    """N worlds of a task.
+
+    Where stages are chained, each world has a stage, whose target event observation and reward follow. It moves on when
+    the target's pairs have been together for some steps, and its episode ends when object 1 has come to rest in place.
+    """
+
+    def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: InitialStates) -> None:
+        """Make the environment and start all worlds.
+
+        Args:
+            task: What is trained.
+            cfg: Its settings.
+            physics: The worlds, with the bodies, joints, actuators and sites of the task's model.
+            states: Initial states.
+        """
+        self.task, self.physics, self.layout = task, physics, Layout.of(task)
+        self.num_envs, self.num_actions, self.device = physics.worlds, task.robot.actions, physics.device
+        self.control_step = cfg.decimation * task.replay.timestep
+        """Time between actions [s]."""
+        self.max_episode_length = max(1, round(cfg.seconds / self.control_step))
+        self.cfg = asdict(cfg)
+        self._settings, self._states = cfg, states
+        self._make_tables()
+        self._make_buffers()
+        self._base = BaseObservation(task, physics, cfg.observation.noise)
+        warp_device = wp.device_from_torch(self.device)
+        with wp.ScopedDevice(warp_device):
+            stage = wp.from_torch(self.stage)
+            self._observation = wp.zeros((self.num_envs, self.layout.size), dtype=float)
+            self._pairs = ContactPairs(
+                task.table,
+                *physics.poses(),
+                stage,
+                amplitude=(cfg.reward.far[0], cfg.reward.near[0]),
+                sigma=(cfg.reward.far[1], cfg.reward.near[1]),
+                features=cast(wp.array, self._observation[:, self.layout.base :]),
+            )
+            self._virtual = virtual_collision(task, physics, stage, cfg.virtual) if cfg.collision == "vcp" else None
+            self._measure()
+            capture = cfg.capture != "none"
+            self._measured = Graph(self._measure, warp_device, capture)
+            self._paired = Graph(self._pairs.launch, warp_device, capture)
+            pairs, virtual = self._pairs, self._virtual
+            self._distance, self._worst = wp.to_torch(pairs.distance), wp.to_torch(pairs.worst_distance)
+            self._reach, self._finite = wp.to_torch(pairs.reach), wp.to_torch(pairs.finite)
+            self._worst_pair = wp.to_torch(pairs.worst)
+            self._severe = None if virtual is None else wp.to_torch(virtual.severe)
+            self._penalty = self._none if virtual is None else wp.to_torch(virtual.reward)
+        wp.synchronize_device(warp_device)
+        self.observation = wp.to_torch(self._observation)
+        """The observation, shape (N, layout.size); overwritten by the next step."""
+        whole = cfg.capture == "step" and self.device.startswith("cuda")
+        parts = (self._apply_action, self._judge_step, self._read_base)
+        self._command, self._judge, self._observe = (captured(part, whole, fuse=cfg.fuse) for part in parts)
+        self.reset()
+
+    def _make_tables(self) -> None:
+        """Put on the device what does not change."""
+        task, cfg, m = self.task, self._settings, self.task.compiled
+        robot = task.robot
+
+        def real(values: Any) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
+
+        def index(values: Any) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.long, device=self.device)
+
+        self._arm, self._arm_qpos, self._arm_dof = index(robot.actuator), index(robot.qpos), index(robot.dof)
+        self._gripper = index(robot.gripper)
+        self._step, self._lead = real(robot.step), real(robot.lead)
+        ranges = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-np.inf, np.inf])
+        self._range = real(ranges)
+        self._objects = index(list(task.objects))
+        tool, stages = int(m.site_bodyid[robot.tool]), range(len(task.held))
+        self._frames = index([[tool if holds else 0 for holds in task.holds(s)] for s in stages])
+        keeps = np.array([task.keeps(s) for s in stages])
+        self._watched = torch.as_tensor(task.held & keeps[:, None], device=self.device)
+        self._place = None if task.place is None else real(task.place)
+        self._success, self._dropped, self._lost = cfg.success, cfg.dropped, cfg.lost
+        self._rest = max(1, round(cfg.chain.rest / self.control_step))
+        self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
+        force, torque = cfg.randomisation.push
+        self._push = real([force] * 3 + [torque] * 3) if force or torque else None
+        pool = self._states
+        self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
+        self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
+
+    def _make_buffers(self) -> None:
+        """Allocate what lives as long as the environment; graphs refer to it."""
+        n, device, m = self.num_envs, self.device, self.task.compiled
+        self.action = torch.zeros(n, self.num_actions, device=device)
+        self.reward = torch.zeros(n, device=device)
+        self.done = torch.zeros(n, dtype=torch.bool, device=device)
+        self.time_out = torch.zeros(n, dtype=torch.bool, device=device)
+        self.failure = torch.zeros(n, 3, dtype=torch.bool, device=device)
+        """Whether the last step ended in a drop, a severe virtual collision or divergence, shape (N, 3)."""
+        self.success = torch.zeros(n, dtype=torch.bool, device=device)
+        """Whether object 1 was in place at the end of the last step."""
+        self.reached = torch.zeros(n, dtype=torch.int32, device=device)
+        """How many stage targets had been met, in their order, by the end of the last step, earlier stages included."""
+        self.stage = torch.full((n,), self.task.first, dtype=torch.int32, device=device)
+        """Stage of each world."""
+        self._begun = torch.zeros(n, dtype=torch.bool, device=device)
+        self._most = torch.zeros_like(self.stage)
+        self._near = torch.zeros_like(self.stage)
+        self._resting = torch.zeros_like(self.stage)
+        self.terms = torch.zeros(n, len(TERMS), device=device)
+        """Weighted terms of the last reward before it is scaled, shape (N, len(TERMS))."""
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
+        self._return = torch.zeros(n, device=device)
+        chained = [self.task.events.stages[s].name for s in self.task.chained]
+        self._names = (*TERMS, "steps", *EPISODES, *CHAINS, *(f"met {name}" for name in chained), "overflow")
+        self._sums = torch.zeros(len(self._names), dtype=torch.float64, device=device)
+        self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
+        objects = len(self.task.objects)
+        self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
+        self._offence = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
+        self._offended = torch.zeros((), dtype=torch.bool, device=device)
+        self._none = torch.zeros(n, device=device)
+        self._skill = torch.zeros((), device=device)
+        self._pushing = torch.ones((), device=device)
+
+    def reset(self) -> None:
+        """Start an episode in every world for training, at random places of it, so that they do not end all at once."""
+        self._pushing.fill_(1)
+        with torch.no_grad():
+            self._start(torch.ones_like(self.done))
+            self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
+            self._return.zero_()
+            for value in (self._sums, self._skill, self._offended):
+                value.zero_()
+            self.refresh()
+
+    def start_from(self, rows: Sequence[int]) -> None:
+        """Start an episode in every world from the states of these rows, one each; from here on nothing is pushed."""
+        self._pushing.zero_()
+        index = torch.as_tensor(np.asarray(rows), device=self.device)
+        with torch.no_grad():
+            self._start(torch.ones_like(self.done), index)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute poses, distances and the observation that follow from the present state."""
+        with torch.no_grad():
+            self.physics.place()
+            self._paired.launch()
+            self._observe()
+
+    def get_observations(self) -> TensorDict:
+        """Return the observation of the present state; a copy, for rsl-rl keeps it through the next step."""
+        return TensorDict({"policy": self.observation.clone()}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Act for one step; see `rsl_rl.env.VecEnv.step`."""
+        with torch.no_grad():
+            self.action.copy_(actions)
+            self._command()
+            self.physics.advance()
+            self._measured.launch()
+            self._judge()
+            reward, done, time_out = self.reward.clone(), self.done.clone(), self.time_out.clone()
+            means = self.terms.mean(dim=0)
+            self.refresh()
+        log = {f"/reward/{name}": value for name, value in zip(TERMS, means.unbind(), strict=True)}
+        return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
+
+    def read_log(self, total: Callable[[torch.Tensor], torch.Tensor] | None = None) -> dict[str, float]:
+        """Return means since the last call, and start anew; this waits for the device.
+
+        Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
+        episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
+        were too small. Where stages are chained, `success` and `met <stage>` are shares of the ended episodes that
+        started with all stages to come, and `success of all` is that of all.
+
+        Args:
+            total: Adds the sums of other processes to those of this one; the worlds of this one alone by default.
+        """
+        values = self._sums.clone() if total is None else total(self._sums.clone())
+        sums = dict(zip(self._names, values.tolist(), strict=True))
+        self._sums.zero_()
+        per = dict.fromkeys((*TERMS, "overflow"), "steps")
+        per |= {name: "chains" for name in self._names if name.startswith(("met ", "chain "))}
+        means = {name: value / max(sums[per.get(name, "episodes")], 1.0) for name, value in sums.items()}
+        chained = {name: means.pop(name) for name in self._names if name == "chains" or per.get(name) == "chains"}
+        if self.task.demonstrated is not None:
+            success, means["success of all"] = chained.pop("chain success"), means["success"]
+            means |= {**chained, "success": success, "chains": sums["chains"]}
+        return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
+
+    def offending_state(self) -> dict[str, np.ndarray] | None:
+        """Return the state at the start of the step in which a world first diverged, None if none has.
+
+        It consists of "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, where objects stand that do not move,
+        "mocap_pos" (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the number of the "world", shape ().
+        """
+        if not bool(self._offended):
+            return None
+        m, values = self.task.compiled, self._offence.cpu().numpy()
+        shapes = {"qpos": (m.nq,), "qvel": (m.nv,), "ctrl": (m.nu,), "mocap_pos": (m.nmocap, 3)}
+        shapes |= {"mocap_quat": (m.nmocap, 4), "world": ()}
+        parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
+        return {name: part.reshape(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return everything that the future depends on besides the random number generators."""
+        return {name: value.clone() for name, value in self._state().items()}
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
+        """Bring back what `state` returned.
+
+        Raises:
+            TrainError: It is of an environment that had less of a state.
+        """
+        parts = self._state()
+        if missing := sorted(set(parts) - set(state)):
+            raise TrainError("the checkpoint lacks a part of the environment's state", expected=missing)
+        for name, value in parts.items():
+            value.copy_(state[name])
+        self.refresh()
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that `state` returns copies of."""
+        p = self.physics
+        parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
+        parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
+        parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
+        parts |= {"most": self._most, "near": self._near, "resting": self._resting, "skill": self._skill}
+        return parts | p.memory
+
+    def parts(self) -> tuple[Callable[[], None], ...]:
+        """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
+        pairs of what is there now, observation.
+        """
+
+        def poses_and_pairs() -> None:
+            self.physics.place()
+            self._paired.launch()
+
+        return (
+            self._command, self.physics.advance, self._measured.launch, self._judge, poses_and_pairs, self._observe,
+        )  # fmt: skip
+
+    def place(self) -> torch.Tensor:
+        """Return where object 1 is in the frame of object 2 [m], shape (N, 3)."""
+        position, quaternion = self.physics.position, self.physics.quaternion
+        first, second = self.task.objects[:2]
+        return rotate(inverse(quaternion[:, second]), position[:, first] - position[:, second])
+
+    def _apply_action(self) -> None:
+        """Turn the action into commands, and note what is compared with afterwards."""
+        p = self.physics
+        action = self.action.clamp_(-1, 1)
+        for copy, value in zip(self._before, (p.qpos, p.qvel, p.ctrl), strict=True):
+            copy.copy_(value)
+        for copy, value in zip(self._pose_before, self._object_poses(), strict=True):
+            copy.copy_(value)
+        joints = len(self._arm)
+        moved = p.ctrl[:, self._arm] + action[:, :joints] * self._step[:joints]
+        at = p.qpos[:, self._arm_qpos].float()
+        moved = torch.clamp(moved, at - self._lead, at + self._lead)
+        p.ctrl[:, self._arm] = moved.clamp(self._range[self._arm, 0], self._range[self._arm, 1])
+        if len(self._gripper):
+            opened = p.ctrl[:, self._gripper] + action[:, joints:] * self._step[joints:]
+            p.ctrl[:, self._gripper] = opened.clamp(self._range[self._gripper, 0], self._range[self._gripper, 1])
+        if self._push is not None:
+            self._push_object(self._push)
+
+    def _push_object(self, deviation: torch.Tensor) -> None:
+        """Have forces and torques of these standard deviations (6,) act on object 1 in some worlds that hold it."""
+        held = self._frames[self.stage.long(), 0] > 0
+        hit = held & (torch.rand(self.num_envs, device=self.device) < self._settings.randomisation.push_share)
+        wrench = torch.randn(self.num_envs, 6, device=self.device) * deviation * self._pushing
+        self.physics.wrench[:, self.task.objects[0]] = wrench * hit[:, None]
+
+    def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the objects' poses, in the hand for those that the stage holds: (N, O, 3) [m] and (N, O, 4)."""
+        position, quaternion = self.physics.position, self.physics.quaternion
+        frame = self._frames[self.stage.long()]
+        return relative_pose(
+            position[:, self._objects],
+            quaternion[:, self._objects],
+            position[self._worlds, frame],
+            quaternion[self._worlds, frame],
+        )
+
+    def _measure(self) -> None:
+        """Launch what tells distances."""
+        self._pairs.launch()
+        if self._virtual is not None:
+            self._virtual.launch()
+
+    def _judge_step(self) -> None:
+        """Reward the step, let worlds move on, end episodes, and start new ones in their worlds."""
+        p, cfg, stage = self.physics, self._settings.reward, self.stage.long()
+        sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
+        # The simulators put a command of their own in the place of one that is not finite.
+        sane &= p.ctrl.isfinite().all(dim=1)
+        diverged = ~sane
+        dropped = ((self._distance > self._dropped) & self._watched[stage]).any(dim=1) & sane
+        if len(self._objects) > 1:
+            dropped |= (torch.linalg.vector_norm(self.place(), dim=1) > self._lost) & sane
+        severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
+        failed = diverged | dropped | severe
+        self.failure.copy_(torch.stack([dropped, severe & ~dropped, diverged], dim=1))
+        if self._place is None:
+            self.success.copy_((self._worst < self._success) & sane)
+        else:
+            self.success.copy_(((self.place() - self._place).abs() < self._success).all(dim=1))
+        lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
+        arm = effort(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
+        disturb = disturbance(cfg, self._pose_before, self._object_poses())
+        weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
+        weighted += [cfg.regularisation * t for t in (*arm, disturb)]
+        strictness = cfg.lenience + (1 - cfg.lenience) * self._skill.square()
+        weighted += [cfg.vcp * strictness * self._penalty, self._none]
+        terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
+        terms[:, -1] = -cfg.failure * strictness * failed
+        self.terms.copy_(terms)
+        self.reward.copy_(cfg.scale / len(self.task.chained) * terms.sum(dim=1))
+
+        self._move_on(sane & ~failed)
+        self.episode_length_buf += 1
+        self._return += self.reward
+        finished = (self.episode_length_buf >= self.max_episode_length) | (self._resting >= self._rest)
+        self.time_out.copy_(finished & ~failed)
+        self.done.copy_(failed | self.time_out)
+        self._note_offence(diverged)
+        self._count(terms)
+        self._start(self.done)
+
+    def _reaching(self) -> torch.Tensor:
+        """Return the reaching reward of the worlds' stages, shape (N,)."""
+        cfg, chained = self._settings.reward, self.task.demonstrated is not None
+        reach = self._reach.sum(dim=1)
+        if chained:
+            reach = reach + (self._worst_pair >= 0) * cfg.wide[0] * torch.exp(-self._worst / cfg.wide[1])
+        if cfg.kind != "engineered":
+            return reach
+        designed = engineered(cfg.engineered, self.place())
+        return torch.where(self.stage == self.task.stage, designed, reach) if chained else designed
+
+    def _move_on(self, fine: torch.Tensor) -> None:
+        """Bring worlds whose target is met to their next stage, and count for how long object 1 has been in place.
+
+        Args:
+            fine: Where nothing has failed, shape (N,) bool.
+        """
+        chain = self._settings.chain
+        near = (self._worst_pair >= 0) & (self._worst < chain.tolerance) & fine
+        self._near.copy_(torch.where(near, self._near + 1, 0))
+        met = self._near >= chain.hold
+        self._most.copy_(torch.maximum(self._most, self.stage - self.task.first + met))
+        self.reached.copy_(self._most)
+        onward = met & (self.stage < self.task.stage)
+        self.stage += onward
+        self._near.masked_fill_(onward, 0)
+        if self.task.demonstrated is not None:
+            self._resting.copy_(torch.where(self.success & fine, self._resting + 1, 0))
+
+    def _count(self, terms: torch.Tensor) -> None:
+        """Add a step to the sums of the log."""
+        p, ended = self.physics, self.done.double()
+        succeeded, chains = self.success & self.time_out, self.done & self._begun
+        # Of as many episodes as there are worlds, those before count by 1 / e.
+        keep = torch.exp(-ended.sum() / self.num_envs)
+        share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
+        self._skill.copy_(torch.lerp(share, self._skill.double(), keep))
+        counts = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
+        sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
+        sums += [count.double().sum() for count in counts]
+        sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum()]
+        sums += [chains.double().sum(), (chains & succeeded).double().sum()]
+        sums += [(chains & (self.reached > k)).double().sum() for k in range(len(self.task.chained))]
+        sums.append(((p.overflow & p.dropping) != 0).double().sum())
+        self._sums += torch.stack(sums)
+        p.overflow.zero_()
+
+    def _note_offence(self, diverged: torch.Tensor) -> None:
+        """Keep the state before the step of the first world that diverged."""
+        world = diverged.to(torch.uint8).argmax()
+        parts = [*self._before, *self.physics.mocap, self._worlds]
+        state = torch.cat([values.index_select(0, world[None]).flatten().double() for values in parts])
+        first = diverged.any() & ~self._offended
+        self._offence.copy_(torch.where(first, state, self._offence))
+        self._offended.logical_or_(first)
+
+    def _start(self, where: torch.Tensor, rows: torch.Tensor | None = None) -> None:
+        """Start episodes in the worlds of a mask (N,) bool, from initial states drawn anew or of these rows (N,)."""
+        p = self.physics
+        if rows is None:
+            rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
+        states = (p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage, self._begun)
+        for state, pool in zip(states, self._pool, strict=True):
+            mask = where.view(-1, *[1] * (state.ndim - 1))
+            state.copy_(torch.where(mask, pool[rows].to(state.dtype), state))
+        p.warmstart.copy_(torch.where(where[:, None], 0.0, p.warmstart))
+        self._most.copy_(torch.where(where, self.stage - self.task.first, self._most))
+        for counter in (self._near, self._resting, self.episode_length_buf, self._return):
+            counter.masked_fill_(where, 0)
+        p.begin(where)
+
+    def _read_base(self) -> None:
+        """Write robot and objects to the observation; the slots are there already."""
+        self.observation[:, : self.layout.base] = self._base.read()

@@ -1,0 +1,91 @@
+"""What differs between the worlds of a training beyond a model's effects: factors on physics, and late commands.
+
+A policy that has met a range of frictions, masses, stiffnesses and delays depends on none of them being exactly right.
+Everything is drawn once for each world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from concent_warp.train.cfg import RandomisationCfg
+from concent_warp.train.environment.commands import Following
+from concent_warp.train.task.task import Task
+
+ONE, NONE = (1.0, 1.0), (0.0, 0.0)
+"""Ranges in which a factor, or a time, changes nothing."""
+
+
+def drawn_fields(
+    task: Task,
+    worlds: int,
+    cfg: RandomisationCfg,
+    seed: int,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
+    """Return the values of the model fields that differ between worlds, shape (N, ...) each.
+
+    Args:
+        task: The task.
+        worlds: N.
+        cfg: Ranges of the factors.
+        seed: Seed of what is drawn.
+        fields: Values that differ already; the factors are on top of them.
+    """
+    m = task.compiled
+    rng = np.random.default_rng([seed, 2])
+    found = dict(fields or {})
+
+    def scaled(name: str, factor: np.ndarray, *, rows: np.ndarray | slice = slice(None), column: int | None = None):
+        given, value = found.get(name), getattr(m, name)
+        values = np.tile(value, (worlds, *[1] * value.ndim)) if given is None else given.copy()
+        where = (slice(None), rows) if column is None else (slice(None), rows, column)
+        values[where] *= factor.reshape(worlds, *[1] * (values[where].ndim - 1))
+        found[name] = values
+
+    robot = np.isin(m.geom_bodyid, moved_by_robot(task))
+    for extent, rows in ((cfg.friction, np.flatnonzero(~robot)), (cfg.grip, np.flatnonzero(robot))):
+        if extent != ONE:
+            scaled("geom_friction", rng.uniform(*extent, worlds), rows=rows, column=0)
+    if cfg.stiffness != ONE:
+        factor = rng.uniform(*cfg.stiffness, worlds)
+        scaled("actuator_gainprm", factor, column=0)
+        scaled("actuator_biasprm", factor, column=1)
+    if cfg.damping != ONE:
+        scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
+    if cfg.joint_friction != NONE:
+        actuator, dof = task.robot.actuator, task.robot.dof
+        strongest = np.where(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator, 1], np.inf)
+        share = np.ones(len(dof)) if np.isinf(strongest).any() else strongest / strongest.max()
+        loss = found.get("dof_frictionloss", np.tile(m.dof_frictionloss, (worlds, 1))).copy()
+        loss[:, dof] += rng.uniform(*cfg.joint_friction, (worlds, 1)) * share
+        found["dof_frictionloss"] = loss
+    if cfg.mass != ONE:
+        factor, bodies = rng.uniform(*cfg.mass, worlds), np.array(task.objects)
+        scaled("body_mass", factor, rows=bodies)
+        scaled("body_inertia", factor, rows=bodies)
+    return found
+
+
+def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> Following:
+    """Return the delay and the lag of the arm's commands in N worlds."""
+    rng = np.random.default_rng([seed, 4])
+    times = []
+    for extent in (cfg.delay, cfg.lag):
+        values = np.zeros((worlds, task.compiled.nu))
+        if extent != NONE:
+            values[:, task.robot.actuator] = rng.uniform(*extent, (worlds, 1))
+        times.append(values)
+    return Following(times[0], (times[1],))
+
+
+def moved_by_robot(task: Task) -> list[int]:
+    """Return the ids of the bodies that the robot's joints move."""
+    m: mujoco.MjModel = task.compiled
+    moved = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
+    for body in range(m.nbody):  # parents come before their children
+        if int(m.body_parentid[body]) in moved:
+            moved.add(body)
+    return sorted(moved)

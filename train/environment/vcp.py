@@ -1,0 +1,150 @@
+"""Which spheres left out of the physics must keep clear of which surfaces (paper, section 3.2.2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
+from concent_warp.train.cfg import CollisionCfg
+from concent_warp.train.environment.physics import Physics
+from concent_warp.train.task.task import Task
+
+from concent_warp.scene.shapes.surface import Surface
+from concent_warp.scene.spheres.inset import inset
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
+
+if TYPE_CHECKING:
+    import trimesh
+
+CANDIDATES = 20_000
+"""Surface points to choose from."""
+
+
+def virtual_collision(task: Task, physics: Physics, stage: object, cfg: CollisionCfg) -> VirtualCollision | None:
+    """Return the penalty of a task's left-out spheres, None where there are none.
+
+    Each object's left-out spheres keep clear of the surfaces of all other objects and of the robot's links. Points of
+    its own surface keep out of the other objects: spheres round off edges, and what slides over such an edge in the
+    simulation would catch on a sharp one. The margin band does not count between an object and what the stage's target
+    event has it touch.
+
+    Args:
+        task: The task.
+        physics: The worlds.
+        stage: Stage of each world, int32 Warp array, shape (N,).
+        cfg: Margins and weights.
+    """
+    geometry, m = task.model.geometry, task.compiled
+    assert geometry is not None
+    sets, points = [], []
+    stages = task.table.used.shape[0]
+    for body in geometry.bodies:
+        surface = Surface.of_body(task.model.scene, body)
+        if cfg.points:
+            points.append(SphereSet(m.body(body).id, surface_points(surface, cfg), np.zeros(cfg.points)))
+        left = geometry.of(body)[~task.collidable[geometry.of(body)]]
+        if len(left):
+            covered = within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
+            sets.append(SphereSet(m.body(body).id, *covered))
+    links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
+    tool = int(m.site_bodyid[task.robot.tool])
+    links |= {i for i in range(m.nbody) if i == tool or int(m.body_parentid[i]) in links | {tool}}
+    scene = task.model.scene.model
+    targets: list[SphereSet | TargetMesh] = []
+    for body in (*task.objects, *sorted(links - set(task.objects))):
+        mesh = body_mesh(scene, body, visual=body in task.objects)
+        if mesh is not None:
+            targets.append(TargetMesh(body, *mesh))
+    reaches = {0: range(len(targets)), 1: [j for j, b in enumerate(targets) if b.body in task.objects]}
+    pairs = [
+        VirtualPair(i, j, cfg.margin, cfg.severe, tuple(gate(task, s, a.body, targets[j].body) for s in range(stages)))
+        for i, a in enumerate([*sets, *points])
+        for j in reaches[i >= len(sets)]
+        if a.body != targets[j].body
+    ]
+    if not pairs:
+        return None
+    return VirtualCollision(
+        [*sets, *points],
+        targets,
+        pairs,
+        *physics.poses(),
+        stage,  # pyright: ignore[reportArgumentType]
+        stages=stages,
+        depth_weight=cfg.depth,
+        band_weight=cfg.band,
+        severe_penalty=0.0,
+        threads=cfg.threads,
+    )
+
+
+def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return spheres that stay `slack` [m] below an object's surface: centres [m], shape (n, 3), radii [m], shape (n,).
+
+    Spheres centred on the surface stand out of it by their radius, which a fit has corrected for those alone that took
+    part in contacts. The others would call collision what the demonstration did, where there is little room.
+    """
+    distance, outward = surface.distance(centre)
+    deep = np.clip(-distance, 0.0, radius)
+    inward = np.maximum(distance + np.maximum(deep, slack), 0.0)
+    return centre - inward[:, None] * outward, np.maximum(deep - slack, 0.0)
+
+
+def surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
+    """Return points spread over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
+    found, _ = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
+    return inset(surface, found[farthest_point_sampling(found, cfg.points)], cfg.slack)[0]
+
+
+def gate(task: Task, stage: int, a: int, b: int) -> float:
+    """Return 0 where a stage's target event has two bodies touch, else 1."""
+    used = task.table.used[stage]
+    touching = set(zip(task.table.body_a[stage][used], task.table.body_b[stage][used], strict=True))
+    return 0.0 if touching & {(a, b), (b, a)} else 1.0
+
+
+def body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return vertices [m] (v, 3) and faces (f, 3) of a body's shapes, body frame; None where it has none.
+
+    `visual` takes all shapes, else only those that collide.
+    """
+    parts = []
+    for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
+        if not visual and not (m.geom_contype[g] or m.geom_conaffinity[g]):
+            continue
+        shape = geom_mesh(m, g)
+        if shape is not None:
+            rotation = np.empty(9)
+            mujoco.mju_quat2Mat(rotation, m.geom_quat[g])
+            parts.append((shape.vertices @ rotation.reshape(3, 3).T + m.geom_pos[g], shape.faces))
+    if not parts:
+        return None
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [faces + start for (_, faces), start in zip(parts, first, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+
+
+def geom_mesh(m: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """Return a geom as a `trimesh.Trimesh` in its own frame, None where it is not a closed shape."""
+    import trimesh
+
+    kinds, size = mujoco.mjtGeom, m.geom_size[geom]
+    kind = kinds(m.geom_type[geom])
+    if kind == kinds.mjGEOM_BOX:
+        return trimesh.creation.box(2 * size)
+    if kind == kinds.mjGEOM_SPHERE:
+        return trimesh.creation.icosphere(2, size[0])
+    if kind == kinds.mjGEOM_CAPSULE:
+        return trimesh.creation.capsule(2 * size[1], size[0], count=(16, 16))
+    if kind == kinds.mjGEOM_CYLINDER:
+        return trimesh.creation.cylinder(size[0], 2 * size[1], sections=24)
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        return trimesh.creation.icosphere(2, 1.0).apply_scale(size)
+    if kind == kinds.mjGEOM_MESH:
+        mesh = m.mesh(m.geom_dataid[geom])
+        first, start = mesh.vertadr[0], mesh.faceadr[0]
+        vertices, faces = m.mesh_vert[first : first + mesh.vertnum[0]], m.mesh_face[start : start + mesh.facenum[0]]
+        return trimesh.Trimesh(vertices, faces, process=False)
+    return None

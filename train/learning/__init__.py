@@ -1,0 +1,1 @@
+"""PPO through rsl-rl."""

@@ -1,0 +1,1 @@
+"""A trained policy: evaluation, episodes, export, the pretrained ones."""

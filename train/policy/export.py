@@ -1,0 +1,241 @@
+"""A trained policy for elsewhere: ONNX or TorchScript, with what one needs to run it in the metadata."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
+from concent_warp.train.cfg import TrainCfg, TrainError
+from concent_warp.train.environment.observation import Layout
+from concent_warp.train.learning.normalisation import bound_observations
+from concent_warp.train.learning.ppo import load_checkpoint, network
+from concent_warp.train.run import Run
+from concent_warp.train.task.task import Task
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import nn
+
+FORMAT, VERSION = "concent-policy", 1
+METADATA = "concent"
+"""Key of the metadata in ONNX; in TorchScript it is the extra file of this name with ``.json``."""
+INPUT, OUTPUT = "observation", "action"
+OPSET = 18
+PACKAGES = ("concent-warp", "torch", "onnx", "rsl-rl-lib", "mujoco", "mujoco-warp")
+SUFFIXES = (".onnx", ".pt")
+
+
+def export(checkpoint: Path, out: Path) -> dict[str, Any]:
+    """Write a run's policy without exploration, and return its metadata.
+
+    Args:
+        checkpoint: Checkpoint in a run folder.
+        out: File to write: ``.onnx`` for ONNX, ``.pt`` for TorchScript.
+
+    Raises:
+        TrainError: The file has another ending, or the folder holds no such training.
+    """
+    if out.suffix not in SUFFIXES:
+        raise TrainError(
+            "the format of the export is not known", where=out, expected=f"a name in {' or '.join(SUFFIXES)}"
+        )
+    run = Run.load(checkpoint.parent)
+    weights = load_checkpoint(checkpoint)
+    task = run.task()
+    described = describe(run.cfg, task) | {"rounds": weights["iteration"], "steps": weights["steps"]}
+    module = policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"], checkpoint)
+    partial = out.with_name(f".{out.name}.partial")
+    write = write_onnx if out.suffix == ".onnx" else write_torchscript
+    write(module, described, partial)
+    partial.replace(out)
+    return described
+
+
+def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: dict[str, Any], where: Path) -> nn.Module:
+    """Return the policy as a module from observations (N, O), as the environment gives them, to actions (N, A)."""
+    example = TensorDict({"policy": torch.zeros(1, observations)}, batch_size=[1])
+    settings = network(cfg.ppo, actor=True)
+    del settings["class_name"]
+    actor = MLPModel(example, {"actor": ["policy"]}, "actor", actions, **settings)
+    bound_observations(actor)
+    try:
+        actor.load_state_dict(weights)
+    except RuntimeError as error:
+        raise TrainError("the checkpoint is of another network", where=where, found=str(error)[:200]) from None
+    return actor.as_jit().eval()
+
+
+def write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None:
+    """Write a policy as ONNX, weights within, for batches of any size."""
+    import onnx
+
+    example = torch.zeros(2, described["observation"]["size"])
+    quiet = contextlib.redirect_stdout(io.StringIO())  # the exporter talks, on every channel
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with quiet, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                module, (example,), input_names=[INPUT], output_names=[OUTPUT], opset_version=OPSET, dynamo=True,
+                dynamic_shapes=({0: torch.export.Dim("worlds")},), verbose=False,
+            )  # fmt: skip
+    finally:
+        logging.disable(level)
+    assert program is not None
+    model = program.model_proto
+    onnx.helper.set_model_props(model, {METADATA: json.dumps(described)})
+    onnx.checker.check_model(model)
+    path.write_bytes(model.SerializeToString())
+
+
+def write_torchscript(module: nn.Module, described: dict[str, Any], path: Path) -> None:
+    """Write a policy as TorchScript."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        traced = torch.jit.trace(module, torch.zeros(2, described["observation"]["size"]))
+        torch.jit.save(traced, str(path), _extra_files={f"{METADATA}.json": json.dumps(described)})
+
+
+def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
+    """Return what one needs to run a task's policy elsewhere, as plain data; in m, rad and s."""
+    dt = task.replay.timestep
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "stages": [task.events.stages[s].name for s in task.chained],
+        "moving on": described_chain(cfg, task),
+        "control period": cfg.environment.decimation * dt,
+        "decimation": cfg.environment.decimation,
+        "simulation step": dt,
+        "episode": cfg.environment.seconds,
+        "observation": described_observation(cfg, task),
+        "action": described_action(task),
+        "gripper": described_gripper(task),
+        "versions": {name: version(name) for name in PACKAGES},
+    }
+
+
+def described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
+    """Return names, order and meaning of the numbers that the policy takes."""
+    m, robot = task.compiled, task.robot
+    joints = [m.joint(j).name for j in robot.joint]
+    hinges = [name for name, turning in zip(joints, robot.turning, strict=True) if turning]
+    slides = [name for name, turning in zip(joints, robot.turning, strict=True) if not turning]
+    meaning: dict[str, tuple[str, list[str]]] = {
+        "joint angles": ("sines of all angles, then their cosines", hinges),
+        "joint positions": ("positions [m]", slides),
+        "joint velocities": ("velocities [rad/s or m/s]", joints),
+        "gripper opening": ("opening as measured [m], see gripper", []),
+        "gripper command": ("mean command of the gripper's actuators [m]", []),
+        "end effector": ("position [m], world frame", [m.site(robot.tool).name]),
+    }
+    for i, body in enumerate(task.objects):
+        what = "position [m], world frame, then the first two columns of the rotation matrix"
+        meaning[f"object {i + 1}"] = (what, [m.body(body).name])
+    layout = Layout.of(task)
+    parts = []
+    for name, width in layout.parts:
+        what, of = meaning.get(name, ("a contact slot, see slots", []))
+        parts.append({"name": name, "start": layout.columns(name).start, "size": width, "meaning": what, "of": of})
+    return {
+        "input": INPUT,
+        "size": layout.size,
+        "parts": parts,
+        "normalisation": "within the policy: give it the numbers as they are" if cfg.ppo.normalise else "none",
+        "slots": described_slots(task),
+    }
+
+
+def described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
+    """Return when the slots are to show the next stage, None where there is one alone."""
+    if len(task.chained) == 1:
+        return None
+    chain = cfg.environment.chain
+    return {
+        "tolerance": chain.tolerance,
+        "hold": chain.hold,
+        "meaning": "the slots show the first stage at the start, and the next one as soon as all displacements of the "
+        "stage have been shorter than tolerance [m] for hold control periods on end",
+    }
+
+
+def described_slots(task: Task) -> dict[str, Any]:
+    """Return what each contact slot is made from, in each stage."""
+    table, m = task.table, task.compiled
+    pairs = []
+    for s, k in ((stage, slot) for stage in task.chained for slot in np.flatnonzero(table.used[stage])):
+        pairs.append(
+            {
+                "stage": task.events.stages[s].name,
+                "slot": int(k),
+                "body": m.body(table.body_a[s, k]).name,
+                "point": table.point_a[s, k].tolist(),
+                "target body": m.body(table.body_b[s, k]).name,
+                "target point": table.point_b[s, k].tolist(),
+                "target normal": table.normal[s, k].tolist(),
+            }
+        )
+    return {
+        "columns": {
+            "mask": MASK, "point": POINT, "displacement": DISPLACEMENT, "direction": DIRECTION, "normal": NORMAL,
+        },
+        "meaning": "mask 1; point of the body, displacement from it to the target point, its direction, target normal: "
+        "world frame [m]; slots that are not listed for the stage are all zero",
+        "frames": "points and normals as listed are in the frames of their bodies",
+        "pairs": pairs,
+    }  # fmt: skip
+
+
+def described_action(task: Task) -> dict[str, Any]:
+    """Return what the numbers do that the policy gives."""
+    m, robot = task.compiled, task.robot
+    rows = []
+    for i, (actuator, joint) in enumerate(zip(robot.actuator, robot.joint, strict=True)):
+        row = {"name": m.actuator(actuator).name, "joint": m.joint(joint).name}
+        row |= {"unit": "rad" if robot.turning[i] else "m", "scale": float(robot.step[i])}
+        rows.append(row | {"limits": limits(task, int(actuator)), "lead": float(robot.lead[i])})
+    if len(robot.gripper):
+        names = [m.actuator(a).name for a in robot.gripper]
+        row = {"name": "gripper", "actuators": names, "unit": "m", "scale": float(robot.step[-1])}
+        rows.append(row | {"limits": limits(task, int(robot.gripper[0])), "lead": None})
+    return {
+        "output": OUTPUT,
+        "size": robot.actions,
+        "range": [-1.0, 1.0],
+        "meaning": "once a control period: command += scale * action; then the command is kept within lead of the "
+        "joint's measured position where there is a lead, then within limits; it is held until the next",
+        "parts": rows,
+    }
+
+
+def limits(task: Task, actuator: int) -> list[float] | None:
+    """Return the smallest and largest command of an actuator, None where it has no limits."""
+    m = task.compiled
+    return [float(v) for v in m.actuator_ctrlrange[actuator]] if m.actuator_ctrllimited[actuator] else None
+
+
+def described_gripper(task: Task) -> dict[str, Any] | None:
+    """Return how the gripper's number and its opening are meant, None without a gripper."""
+    m, robot = task.compiled, task.robot
+    if not len(robot.gripper):
+        return None
+    weights = {}
+    for j in range(m.njnt):
+        weight = float(robot.opening[m.jnt_qposadr[j]])
+        if weight:
+            weights[m.joint(j).name] = weight
+    return {
+        "actuators": [m.actuator(a).name for a in robot.gripper],
+        "opening": "sum of weight times joint position [m]",
+        "weights": weights,
+        "convention": "one number for all actuators: above 0 raises their commands and opens, below 0 closes",
+    }

@@ -1,0 +1,132 @@
+"""A policy at work in one world, step by step, with what there is to see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.policy.evaluate import FAILURES, Policy
+from concent_warp.train.task.task import Task
+
+from concent_warp.simulate.inputs import compile_model
+
+TOUCH = 5e-4
+"""Gap below which a sphere counts as touching something [m]."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What there is to see between two steps."""
+
+    position: np.ndarray
+    """Body origins [m], world frame, shape (nbody, 3)."""
+    quaternion: np.ndarray
+    """Body orientations, wxyz, shape (nbody, 4)."""
+    touching: np.ndarray
+    """Which spheres of the model touch another body, shape (S,) bool."""
+    stage: str
+    """Name of the stage that the policy is in."""
+    pairs: np.ndarray
+    """Contact points of its target event and the points that they are to come to [m], world frame, shape (P, 2, 3)."""
+    time: float
+    """Time since the episode began [s]."""
+
+
+class Player:
+    """One world, the first of an environment, and a policy."""
+
+    def __init__(self, environment: Environment, policy: Policy, episodes: int) -> None:
+        """Start the first of the episodes that the environment has initial states for."""
+        self.environment, self.policy = environment, policy
+        self.touches = Touches(environment.task)
+        self.ended: list[str] = []
+        """Outcomes of the episodes that have ended."""
+        self._states, self._next = episodes, 0
+        self._length = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode from the next initial state."""
+        worlds = self.environment.num_envs
+        self.environment.start_from([(self._next + k) % self._states for k in range(worlds)])
+        self._next = (self._next + 1) % self._states
+        self._length = 0
+
+    def step(self) -> str | None:
+        """Act once; return the outcome of the episode where it ends by that, and begin the next one."""
+        environment = self.environment
+        with torch.inference_mode():
+            _, _, done, _ = environment.step(self.policy(environment.get_observations()))
+        self._length += 1
+        if not bool(done[0]):
+            return None
+        failed = environment.failure[0].cpu().numpy()
+        outcome = FAILURES[int(failed.argmax())] if failed.any() else "missed"
+        outcome = "success" if bool(environment.success[0]) and not failed.any() else outcome
+        self.ended.append(outcome)
+        self.begin()
+        return outcome
+
+    def moment(self) -> Moment:
+        """Return what there is to see now."""
+        environment, task = self.environment, self.environment.task
+        position = environment.physics.position[0].cpu().numpy().astype(float)
+        quaternion = environment.physics.quaternion[0].cpu().numpy().astype(float)
+        stage = int(environment.stage[0])
+        return Moment(
+            position=position,
+            quaternion=quaternion,
+            touching=self.touches.of(environment.physics.qpos[0].cpu().numpy(), position, quaternion),
+            stage=task.events.stages[stage].name,
+            pairs=pairs(task, stage, position, quaternion),
+            time=self._length * environment.control_step,
+        )
+
+
+class Touches:
+    """Tells which spheres of a model touch something, also those that the physics leaves out."""
+
+    def __init__(self, task: Task) -> None:
+        """Compile the model with all of its spheres."""
+        self._m, sphere_geom = compile_model(task.model, None)
+        self._d = mujoco.MjData(self._m)
+        self._m.geom_margin[sphere_geom] = TOUCH
+        self._sphere = np.full(self._m.ngeom, -1)
+        self._sphere[sphere_geom] = np.arange(len(sphere_geom))
+        self._count = len(sphere_geom)
+
+    def of(self, qpos: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        """Return which spheres touch another body, shape (S,) bool.
+
+        Args:
+            qpos: Positions, shape (nq,).
+            position: Body origins [m], shape (nbody, 3); read of bodies that stand where a world has them.
+            quaternion: Body orientations, shape (nbody, 4); likewise.
+        """
+        m, d = self._m, self._d
+        d.qpos[:] = qpos
+        for body in np.flatnonzero(m.body_mocapid >= 0):
+            d.mocap_pos[m.body_mocapid[body]], d.mocap_quat[m.body_mocapid[body]] = position[body], quaternion[body]
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_collision(m, d)
+        touching = np.zeros(self._count, dtype=bool)
+        spheres = self._sphere[d.contact.geom]
+        touching[spheres[spheres >= 0]] = True
+        return touching
+
+
+def pairs(task: Task, stage: int, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """Return contact points and target points of a stage's target event [m], world frame, shape (P, 2, 3)."""
+    table = task.table
+    slots = np.flatnonzero(table.used[stage])
+    found = np.zeros((len(slots), 2, 3))
+    sides = (table.body_a[stage], table.point_a[stage]), (table.body_b[stage], table.point_b[stage])
+    for row, slot in enumerate(slots):
+        for side, (body, point) in enumerate(sides):
+            turned = np.zeros(3)
+            mujoco.mju_rotVecQuat(turned, point[slot], quaternion[body[slot]])
+            found[row, side] = position[body[slot]] + turned
+    return found

@@ -1,0 +1,1 @@
+"""Reset states along the demonstration."""

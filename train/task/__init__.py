@@ -1,0 +1,1 @@
+"""What is trained: model, demonstration, contact events, robot."""
