@@ -29,7 +29,7 @@ from concent_warp.train.run import Run
 from pages import machine, machine_line, read_data, table, write_data, write_page
 from train_learning import changed
 
-from concent_warp.cli.evaluate import Arguments, real_environment, restrained
+from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.errors import ConcentError
 

@@ -29,7 +29,7 @@ from pages import machine, machine_line, read_data, table, write_data, write_pag
 from train_cases import CASES, HIDDEN, Case, same_world
 from train_learning import POLICY, RESULT, changed
 
-from concent_warp.cli.evaluate import Arguments, real_environment, restrained
+from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
 
 NAME = "train_table1"

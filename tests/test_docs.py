@@ -81,7 +81,7 @@ def test_command_in_the_pages_is_understood(line):
         return
     assert command in COMMANDS
     if arguments:
-        module = import_module(f"concent_warp.cli.{command.replace('-', '_')}")
+        module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
         tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 

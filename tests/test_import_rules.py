@@ -55,7 +55,7 @@ def test_package_keeps_the_rules(tree):
         ("simulate.replay", "events.extract"),
         ("fit.fit_geometry", "report.report"),
         ("report.report", "ground"),
-        ("ground", "cli.demo"),
+        ("ground", "cli.commands.demo"),
         ("model", "train"),
         ("train", "render"),
         ("render", "train"),

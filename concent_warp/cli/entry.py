@@ -94,7 +94,7 @@ def run(command: str, arguments: Sequence[str]) -> int:
         from concent_warp.cli.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
-        module = import_module(f"concent_warp.cli.{command.replace('-', '_')}")
+        module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
         settings = tyro.cli(
             module.Arguments,
             args=arguments,

@@ -121,7 +121,7 @@ def test_without_a_checkpoint_an_interruption_says_what_would_have_helped(swing,
     def interrupted(*_) -> Diagnosis:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("concent_warp.cli.diagnose.diagnose", interrupted)
+    monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", interrupted)
     assert diagnose(swing / "demo.h5") == 130
     assert "--checkpoint FOLDER" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ import pytest
 from live_page import BROWSER, Page, opened
 
 from concent_warp.cli import main
-from concent_warp.cli.play import Arguments, prepared
+from concent_warp.cli.commands.play import Arguments, prepared
 
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
 

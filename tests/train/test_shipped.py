@@ -15,7 +15,7 @@ from concent_warp.train.run import Run, train
 from several_processes import make_run
 
 from concent_warp.cli import main
-from concent_warp.cli.evaluate import restrained
+from concent_warp.cli.commands.evaluate import restrained
 
 
 @pytest.fixture(scope="module")

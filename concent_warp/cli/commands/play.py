@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from concent_warp.cli import evaluate
+from concent_warp.cli.commands import evaluate
 from concent_warp.cli.given_policy import Pretrained, given_checkpoint
 from concent_warp.cli.terminal import quiet_warp, say
 from concent_warp.reality.hidden.in_task import wanted
