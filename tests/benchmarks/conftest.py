@@ -1,10 +1,9 @@
-"""Benchmarks are scripts beside one another, and import each other by name."""
+"""Benchmarks are modules of the package `benchmarks`; each is imported by the test that needs it."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -15,7 +14,6 @@ __all__ = ["drop", "script", "swollen"]
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch, root: Path) -> Callable[[str], ModuleType]:
+def script() -> Callable[[str], ModuleType]:
     """Return what imports a benchmark by its name."""
-    monkeypatch.syspath_prepend(root / "benchmarks")
     return importlib.import_module

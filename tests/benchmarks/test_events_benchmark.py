@@ -4,7 +4,7 @@ import pytest
 
 @pytest.fixture
 def events(script):
-    return script("events")
+    return script("benchmarks.events.extraction")
 
 
 def test_the_block_has_sunk_when_it_is_below_the_rim_for_the_first_time_after_it_came_there(events):

@@ -10,7 +10,7 @@ from concent_warp.simulate.warp_engine import WarpEngine
 
 @pytest.fixture
 def benchmark(script):
-    return script("fit_generation")
+    return script("benchmarks.fit.generation")
 
 
 def test_the_bare_loop_simulates_what_the_generation_does(benchmark, drop, swollen):

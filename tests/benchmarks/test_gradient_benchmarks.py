@@ -6,7 +6,7 @@ from concent_warp.fit.newton.descent import GradientCfg
 
 
 def test_slopes_of_settling_are_those_of_central_differences(script):
-    benchmark = script("gradient_check")
+    benchmark = script("benchmarks.fit.gradient_check")
     row = benchmark.check("settle", 1, 0.1, "cpu")
     assert benchmark.relative([row])[0] < 0.1
     for name in benchmark.FACTORS:
@@ -16,7 +16,7 @@ def test_slopes_of_settling_are_those_of_central_differences(script):
 
 
 def test_curves_begin_with_the_gradients_and_cost_what_they_cost(script):
-    benchmark = script("es_vs_gradient")
+    benchmark = script("benchmarks.fit.es_vs_gradient")
     fit = FitCfg(EvolutionCfg(population=4), generations=2, gradient=GradientCfg(starts=2, iterations=3))
     row = benchmark.run(benchmark.Args(fit=fit), "settle", 0, "gradient+es")
     first, *rest = row["curve"]
@@ -28,14 +28,14 @@ def test_curves_begin_with_the_gradients_and_cost_what_they_cost(script):
 
 
 def test_a_world_takes_the_same_memory_whatever_their_number(script):
-    benchmark = script("gradient_throughput")
+    benchmark = script("benchmarks.fit.gradient_throughput")
     one, four = benchmark.measure(1, "cpu", 1), benchmark.measure(4, "cpu", 1)
     assert one["bytes"] == four["bytes"] > 0
     assert four["seconds"] > 0
 
 
 def test_a_page_keeps_what_other_machines_measured_and_takes_in_all_parts(script, tmp_path, monkeypatch):
-    benchmark = script("es_vs_gradient")
+    benchmark = script("benchmarks.fit.es_vs_gradient")
     facts = benchmark.machine("cpu")
     point = {"simulations": 10, "seconds": 1.0, "fitted": 1.0, "unseen": 2.0, "loss_mm": 1.0}
 

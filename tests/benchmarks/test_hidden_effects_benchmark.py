@@ -11,7 +11,7 @@ RIVALS = ("length_scale", "time_base", "size", "gravity_tilt", "air_drag", "cont
 
 @pytest.fixture
 def data(script):
-    return script("hidden_effects_data")
+    return script("benchmarks.diagnose.hidden_effects_data")
 
 
 def named(data, name):

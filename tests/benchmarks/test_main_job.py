@@ -9,7 +9,7 @@ PARENT = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {CHILD!
 
 @pytest.fixture
 def main_job(script):
-    return script("main_job")
+    return script("benchmarks.fit.main_job")
 
 
 def test_memory_of_what_a_process_starts_counts(main_job):

@@ -49,7 +49,7 @@ def weights():
 
 
 def test_distance_of_features_is_zero_for_the_same_image_and_grows_with_noise(script, tmp_path):
-    features = script("feature_distance")
+    features = script("benchmarks.render.feature_distance")
     given = weights()
     assert "_fc.bias" not in features.needed(given)
     torch.save({name: value.half() for name, value in features.needed(given).items()}, tmp_path / "cut.pt")
@@ -63,7 +63,7 @@ def test_distance_of_features_is_zero_for_the_same_image_and_grows_with_noise(sc
 
 
 def test_packed_footage_has_the_recording_and_nearly_its_frames(script, tmp_path):
-    module = script("render_footage")
+    module = script("benchmarks.render.footage")
     recording = small_arm.recording([0, 1], 3)
     cameras = tuple(recording.demonstrations[0].image)
     module.CAMERAS, module.OBJECTS = cameras, ()
@@ -102,13 +102,13 @@ CFG = RenderTrainCfg(
 
 
 def test_steps_within_a_time_are_at_most_those_of_the_settings_and_some_at_least(script):
-    gap = script("render_gap")
+    gap = script("benchmarks.render.gap")
     assert gap.steps_within(1e6, CFG, [pairs()], "cpu") == (50, 40)
     assert gap.steps_within(0.0, CFG, [pairs()], "cpu") == (20, 20)
 
 
 def test_flow_at_the_size_of_the_images_learns_and_paints_without_enlarging(script):
-    direct = script("render_direct")
+    direct = script("benchmarks.render.direct")
     one = pairs()
     cfg = replace(CFG, network=replace(CFG.network, size=64))
     training = direct.WholeTraining(one, cfg, "cpu")
@@ -126,14 +126,14 @@ def test_flow_at_the_size_of_the_images_learns_and_paints_without_enlarging(scri
 
 
 def test_training_stops_when_its_time_is_over(script):
-    direct = script("render_direct")
+    direct = script("benchmarks.render.direct")
     training = direct.WholeTraining(pairs(), replace(CFG, network=replace(CFG.network, size=64)), "cpu")
     assert direct.learn(training, "base", 0.0)["steps"] == 1
 
 
 def test_rasteriser_benchmark_says_why_gsplat_is_not_there(script, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "gsplat", None)
-    rasteriser = script("rasteriser")
+    rasteriser = script("benchmarks.render.rasteriser")
     poses, matrix = rasteriser.cameras(1), rasteriser.intrinsics_of(15.0, 16, 16)
     row = rasteriser.against_gsplat(rasteriser.cube(10), poses, matrix, torch.zeros(1, 16, 16, 3), "cpu")
     assert "gsplat" in row.pop("gsplat_missing")

@@ -10,7 +10,7 @@ from tests.fit.conftest import DROP, HALF, corner_spheres
 
 @pytest.fixture
 def resume(script):
-    return script("resume")
+    return script("benchmarks.fit.resume")
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import trimesh
 
 @pytest.fixture
 def rl_kernels(script):
-    return script("rl_kernels")
+    return script("benchmarks.kernels.rl_kernels")
 
 
 def test_kernels_and_torch_agree_on_the_scene_that_is_timed(rl_kernels):

@@ -2,7 +2,7 @@ import pytest
 
 
 def test_models_made_with_something_else_hidden_are_not_taken(script, tmp_path):
-    cases = script("train_cases")
+    cases = script("benchmarks.train.cases")
     folder = tmp_path / "models" / cases.CASES["aware"].material(6)
     folder.mkdir(parents=True)
     cases.same_world(tmp_path, ["aware"], [6], "actuator_delay=0.1")

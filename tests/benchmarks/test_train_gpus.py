@@ -3,7 +3,7 @@ import pytest
 
 @pytest.fixture
 def train_gpus(script):
-    return script("train_gpus")
+    return script("benchmarks.train.gpus")
 
 
 def row(gpus, worlds, rate, curve):

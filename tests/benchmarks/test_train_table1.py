@@ -3,7 +3,7 @@ import pytest
 
 @pytest.fixture
 def train_table1(script):
-    return script("train_table1")
+    return script("benchmarks.train.table1")
 
 
 def row(case, seed, successes, *, hidden=(), force=1.0, settings="", seconds=61):

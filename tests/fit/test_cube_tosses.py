@@ -1,20 +1,20 @@
-"""A fit to measured tosses, in small. The figures are those of `benchmarks/fit_cube_tosses.py`."""
+"""A fit to measured tosses, in small. The figures are those of `benchmarks/fit/cube_tosses.py`."""
 
-import importlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+from benchmarks.fit import cube_tosses as benchmark
+from benchmarks.fit import cube_tosses_data as tosses
+from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+
 DATA = Path(__file__).parents[3] / "shared" / "data" / "contactnets_cube"
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured cube tosses are not at {DATA}")
-def test_a_fit_to_measured_tosses_improves_unseen_ones_and_mends_the_size(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    benchmark = importlib.import_module("fit_cube_tosses")
+def test_a_fit_to_measured_tosses_improves_unseen_ones_and_mends_the_size(tmp_path):
     document = benchmark.main(benchmark.Args(data=DATA, out=tmp_path, quick=True))
     assert len(document["results"]) == 2
     for found in document["results"]:
@@ -28,15 +28,10 @@ def test_a_fit_to_measured_tosses_improves_unseen_ones_and_mends_the_size(monkey
     assert (tmp_path / "data" / "fit_cube_tosses.png").stat().st_size < 200_000
 
 
-def test_the_standing_width_is_that_of_the_planes_on_which_a_cube_stands(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    tosses = importlib.import_module("cube_tosses")
-    geometry = importlib.import_module("concent_warp.scene.spheres.contact_geometry")
+def test_the_standing_width_is_that_of_the_planes_on_which_a_cube_stands():
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * 0.05
     sunk = np.array([[0.04, 0.01, 0.01], [-0.04, -0.01, 0.01]])
     position = np.concatenate([corners, sunk])
     n = len(position)
-    cube = geometry.ContactGeometry(
-        ("cube",), np.zeros(n, int), position, np.full(n, 0.004), np.full(n, 0.1), np.full(n, 0.1)
-    )
+    cube = ContactGeometry(("cube",), np.zeros(n, int), position, np.full(n, 0.004), np.full(n, 0.1), np.full(n, 0.1))
     np.testing.assert_allclose(tosses.standing_widths(cube), 0.108)

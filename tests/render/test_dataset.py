@@ -74,7 +74,9 @@ def test_lerobot_files_are_as_the_format_has_them(tmp_path):
 
 
 def test_lerobot_reads_every_frame(tmp_path):
-    reason = "lerobot is not installed: it wants older versions; benchmarks/dataset_lerobot.py uses one elsewhere"
+    reason = (
+        "lerobot is not installed: it wants older versions; benchmarks/render/dataset_lerobot.py uses one elsewhere"
+    )
     module: Any = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason=reason)
     writer = LeRobotWriter(tmp_path, LAYOUT)
     write(writer, range(3))

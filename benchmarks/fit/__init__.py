@@ -1,0 +1,1 @@
+"""Benchmarks of fitting contact geometry, and of the main job."""

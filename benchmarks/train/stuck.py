@@ -1,0 +1,190 @@
+"""Is it the quicker physics of the training that keeps a policy from succeeding in the stand-in world, or the model?
+
+    python -m benchmarks.train.stuck runs/a/policy runs/b/policy ...    # run folders of one stage, then the page
+
+Each policy is run from the same initial states in the physics that it was trained in, in the model's own (elliptic
+cones, its time step) and in the stand-in world. Then the states in which it failed there are put into both simulations,
+at rest, and it is run on from them for as long as an episode lasts. Nothing is drawn at random between the worlds. Of
+the states in which it got stuck the page tells how far object 1 has turned and slid in the hand, in the median.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.policy.evaluate import Policy
+from concent_warp.train.resets.sample import InitialStates
+from concent_warp.train.run import Run
+
+from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
+from benchmarks.train.learning import changed
+from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
+from concent_warp.cli.terminal import quiet_warp
+from concent_warp.errors import ConcentError
+
+NAME = "train_stuck"
+LOST = 0.05
+"""Distance of a contact pair with the robot at which the block counts as lost [m]; in the stand-in world it is held
+elsewhere."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    policies: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Run folders; none makes the page anew."""
+    episodes: int = 64
+    seed: int = 1
+    """Of the initial states."""
+    force: float = 1.0
+    """Share of the force that policies may exert, as of `concent evaluate`."""
+
+
+def measure(folder: Path, args: Args) -> dict[str, Any]:
+    """Return how a policy does in the three worlds, and from where it failed in the last of them."""
+    run = restrained(Run.load(folder), 1.0, args.force)
+    task = run.task()
+    states = run.evaluation_states(task, args.episodes, args.seed)
+    trained = replace(
+        run.cfg.environment, worlds=args.episodes, engine="mujoco", dropped=LOST, randomisation=RandomisationCfg()
+    )
+    own = replace(trained, cone="auto", stride=1)
+
+    def policy(environment: Environment) -> Policy:
+        torch.manual_seed(args.seed)
+        trainer = Trainer(environment, run.cfg)
+        trainer.algorithm.load(load_checkpoint(folder / CHECKPOINT), {"actor": True}, True)
+        return trainer.policy()
+
+    def succeeded(cfg: EnvironmentCfg, starts: InitialStates) -> np.ndarray:
+        environment = make_environment(task, cfg, starts, device="cpu")
+        return outcomes(environment, policy(environment))[0]
+
+    real = real_environment(task, trained, states, Arguments(checkpoint=folder))
+    success, failed = outcomes(real, policy(real))
+    stuck = ~success & ~failed
+    ended = {name: getattr(real.physics, name).numpy().copy() for name in ("qpos", "ctrl")}
+    starts = replace(states, **ended, qvel=np.zeros_like(states.qvel))
+    before, after = (held(real, qpos, states.mocap) for qpos in (states.qpos, ended["qpos"]))
+    cosine = (np.einsum("nij,nij->n", before[1], after[1]) - 1) / 2
+    turned, slid = np.degrees(np.arccos(cosine.clip(-1, 1))), np.linalg.norm(after[0] - before[0], axis=1)
+    found = {
+        "force": args.force,
+        "turned": float(np.median(turned[stuck])) if stuck.any() else None,
+        "slid": float(np.median(slid[stuck])) if stuck.any() else None,
+        "episodes": args.episodes,
+        "reality": int(success.sum()),
+        "stuck": int(stuck.sum()),
+        "settings": changed(json.loads(json.dumps(asdict(Run.load(folder).cfg)))),
+        "machine": machine(),
+    }
+    for name, cfg in (("training", trained), ("own", own)):
+        found[name] = int(succeeded(cfg, states).sum())
+        found[f"{name}, from stuck"] = int(succeeded(cfg, starts)[stuck].sum()) if stuck.any() else 0
+    return found
+
+
+def held(environment: Environment, qpos: np.ndarray, mocap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where object 1 is in the frame of the tool [m] (N, 3), and its rotation there (N, 3, 3).
+
+    Args:
+        environment: Whose model the positions are of.
+        qpos: Positions, shape (N, nq).
+        mocap: Poses of what stands where it is put, shape (N, nmocap, 7).
+    """
+    m, task = environment.physics.model, environment.task
+    d, site = mujoco.MjData(m), task.compiled.site(task.robot.tool).name
+    places, rotations = [], []
+    for row, poses in zip(qpos, mocap, strict=True):
+        d.qpos[:], d.mocap_pos[:], d.mocap_quat[:] = row, poses[:, :3], poses[:, 3:]
+        mujoco.mj_kinematics(m, d)
+        tool = d.site(site)
+        frame, body = tool.xmat.reshape(3, 3), task.objects[0]
+        places.append(frame.T @ (d.xpos[body] - tool.xpos))
+        rotations.append(frame.T @ d.xmat[body].reshape(3, 3))
+    return np.array(places), np.array(rotations)
+
+
+def outcomes(environment: Environment, policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Run an episode in every world to the step before it would begin anew.
+
+    Returns where object 1 is in place at that time, and where the episode had failed before, shape (N,) bool each.
+    """
+    environment.start_from(range(environment.num_envs))
+    observation = environment.get_observations()
+    failed = torch.zeros(environment.num_envs, dtype=torch.bool)
+    for _ in range(int(environment.max_episode_length) - 1):
+        with torch.inference_mode():
+            observation, _, done, _ = environment.step(policy(observation))
+        failed |= done
+    return (environment.success & ~failed).numpy(), failed.numpy()
+
+
+def page(data: dict[str, dict[str, Any]]) -> str:
+    """Return the page."""
+    head = [
+        "policy", "episodes", "in the physics of its training", "in the model's own", "in the stand-in world",
+        "stuck there", "turned in the hand", "slid", "from these: in the physics of its training", "in the model's own",
+    ]  # fmt: skip
+    names = ("episodes", "training", "own", "reality", "stuck")
+    lines = [
+        [name, *(str(row[n]) for n in names), *in_the_hand(row), *(str(row[f"{n}, from stuck"]) for n in names[1:3])]
+        for name, row in data.items()
+    ]
+    settings = [
+        f"- {name}: {f'`{how}`' if (how := row['settings']) else 'default settings'}" for name, row in data.items()
+    ]
+    assert __doc__ is not None
+    about = __doc__.split("\n\n")
+    first = next(iter(data.values()))
+    return "\n\n".join([
+        "# What keeps policies from succeeding in the stand-in world",
+        "Written by `benchmarks/train/stuck.py`; do not edit.",
+        about[0],
+        about[2].strip(),
+        "Episodes in which object 1 is in place at the end:",
+        table(head, lines),
+        machine_line(first["machine"]),
+        "How they were trained:\n\n" + "\n".join(settings),
+    ])  # fmt: skip
+
+
+def in_the_hand(row: dict[str, Any]) -> list[str]:
+    """Return how far object 1 has turned and slid where a policy got stuck, empty where that was not measured."""
+    if row.get("turned") is None:
+        return ["", ""]
+    return [f"{row['turned']:.0f} deg", f"{1e3 * row['slid']:.0f} mm"]
+
+
+def main() -> None:
+    """Measure policies and write the page."""
+    args = tyro.cli(Args, description=__doc__)
+    quiet_warp()
+    torch.set_num_threads(1)
+    data = read_data(NAME)
+    for folder in args.policies:
+        name = "/".join(part for part in folder.parts[-4:] if part not in ("runs", "policy"))
+        name += f", force {args.force:g}" * (args.force < 1)
+        try:
+            data[name] = measure(folder, args)
+        except ConcentError as error:
+            raise SystemExit(str(error)) from None
+        print(name, data[name], flush=True)
+    write_data(NAME, data)
+    write_page(NAME, page(data))
+
+
+if __name__ == "__main__":
+    main()
