@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.compare.compare import compare
-from concent_warp.compare.comparison import Comparison
-from concent_warp.compare.no_contact import without_object_contact
+from concent_warp.comparison.compare import compare
+from concent_warp.comparison.no_contact import without_object_contact
+from concent_warp.comparison.result import Comparison
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.extract import extract
 from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
+
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import carrier_pose
 from concent_warp.render.raw import RawCamera, Stage, body_id

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from concent_warp.render.composite import Layers
 
 from concent_warp.errors import RenderError
+from concent_warp.render.composite import Layers
 
 COLUMNS = ("raw simulation", "hybrid composite", "robot and background", "objects", "object shadows")
 KEPT = 8

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from concent_warp.render.composite import HybridCamera
 from concent_warp.render.dataset.layout import DatasetWriter, EpisodeWriter
 from concent_warp.render.dataset.video import VideoWriter

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.render.splats.rasterise import Rasteriser
 from concent_warp.render.splats.splats import Splats

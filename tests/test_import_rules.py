@@ -60,7 +60,7 @@ def test_package_keeps_the_rules(tree):
         ("train", "render"),
         ("render", "train"),
         ("fit.fit_geometry", "reality.world"),
-        ("compare.compare", "reality.record"),
+        ("comparison.compare", "reality.record"),
         ("train", "reality.record"),
         ("reality.world", "model"),
         ("reality.record", "simulate.replay"),

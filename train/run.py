@@ -5,13 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from concent_warp.train.cfg import SETTINGS, TrainCfg, TrainError, plain
-from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.learning.distributed import Ranks
-from concent_warp.train.learning.ppo import CHECKPOINT, Report, Round, Trainer
-from concent_warp.train.resets.sample import InitialStates, draw_states
-from concent_warp.train.task.task import Task
-
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
@@ -19,6 +12,12 @@ from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.train.cfg import SETTINGS, TrainCfg, TrainError, plain
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.ppo import CHECKPOINT, Report, Round, Trainer
+from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.task.task import Task
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
 FREE = ("iterations", "checkpoint", "target", "capture", "fuse")

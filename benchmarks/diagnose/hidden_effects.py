@@ -27,8 +27,8 @@ import tyro
 from benchmarks.diagnose.hidden_effects_data import DataSet, Kind, cases, make
 from benchmarks.diagnose.hidden_effects_report import write_again, write_report
 from benchmarks.pages import machine, machine_line
-from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnose.diagnose import DiagnosisCfg
+from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnosis.diagnose import DiagnosisCfg
 from concent_warp.errors import ConcentError
 from concent_warp.model import Model, write_text
 

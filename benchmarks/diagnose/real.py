@@ -34,8 +34,8 @@ import tyro
 from benchmarks.diagnose.real_report import NAME, write_report
 from benchmarks.fit.held_out import Spans, by_demonstration, change, cut_spans, prediction_errors
 from benchmarks.pages import ROOT, machine, read_data, write_data
-from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnose.diagnose import DiagnosisCfg, Procedure, silent
+from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.least_squares import FitCfg, Solver

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial import KDTree
+
 from concent_warp.kernels.chamfer.distance import ChamferPlan, chamfer
 from concent_warp.kernels.chamfer.distance_cuda import Tiling
-from scipy.spatial import KDTree
 
 PAGE = Path(__file__).parents[2] / "docs/benchmarks/chamfer.md"
 TILINGS = [

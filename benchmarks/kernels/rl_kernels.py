@@ -30,10 +30,10 @@ import numpy as np
 import torch
 import trimesh
 import warp as wp
-from concent_warp.kernels.contact_pairs import ContactPairs, PairTable
-from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
 
 from benchmarks.pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
+from concent_warp.kernels.contact_pairs import ContactPairs, PairTable
+from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
 
 TABLE, BOX, BLOCK, HAND, FINGERS, LINKS = 0, 1, 2, 3, (4, 5), (6, 7, 8)
 BODIES = 9

@@ -20,18 +20,18 @@ from typing import Any
 
 import torch
 import warp as wp
-from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
-from concent_warp.render.networks.flow import draw
-from concent_warp.render.networks.flow_network import FlowNetwork
-from concent_warp.render.networks.pairs import Pairs, drawn_scene, pairs_of, to_signed
-from concent_warp.render.networks.train import ENLARGE, NetworkTraining, RenderTraining, network_of
-from concent_warp.render.raw import RawCamera, Stage
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import machine
 from benchmarks.render.feature_distance import FeatureDistance, feature_distance
 from benchmarks.render.footage import EMPTY, HELD, footage
 from concent_warp.recording.recording import Recording
+from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
+from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow_network import FlowNetwork
+from concent_warp.render.networks.pairs import Pairs, drawn_scene, pairs_of, to_signed
+from concent_warp.render.networks.train import ENLARGE, NetworkTraining, RenderTraining, network_of
+from concent_warp.render.raw import RawCamera, Stage
 from concent_warp.scene.scene import Scene
 
 SMALL, WHOLE = "64 and enlarged", "256 at once"

@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from concent_warp.render.splats.views import FILE, SplatViews
 
 from concent_warp.reality.appearance.surroundings import light
 from concent_warp.reality.record import RealityCfg, record
@@ -25,6 +24,7 @@ from concent_warp.reality.sensors.footage import FootageCfg, developed
 from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
+from concent_warp.render.splats.views import FILE, SplatViews
 
 CAMERAS = ("base", "wrist")
 OBJECTS = ("block", "box")

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import machine
@@ -30,6 +29,7 @@ from benchmarks.render.footage import CAMERAS, EMPTY, HELD, OBJECTS, footage, ph
 from concent_warp.cli.entry import main as concent
 from concent_warp.reality.sensors.photographs import PhotographsCfg
 from concent_warp.recording.recording import Recording
+from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 
 if TYPE_CHECKING:
     from concent_warp.render.networks.pairs import Pairs
@@ -69,6 +69,7 @@ def fitted_splats(folder: Path, body: str, arguments: argparse.Namespace) -> Pat
 def trained(folder: Path, networks: Path, arguments: argparse.Namespace) -> None:
     """Train the networks of the footage without objects into a folder, or go on with that."""
     import warp as wp
+
     from concent_warp.render.networks.pairs import pairs_of
     from concent_warp.render.networks.train import CHECKPOINT, RenderTraining
 
@@ -99,6 +100,7 @@ def trained(folder: Path, networks: Path, arguments: argparse.Namespace) -> None
 def steps_within(seconds: float, cfg: RenderTrainCfg, pairs: Sequence[Pairs], device: str) -> tuple[int, int]:
     """Return the steps of flow and super-resolution that a time [s] allows, at most those of the settings."""
     import torch
+
     from concent_warp.render.networks.train import ENLARGE, RenderTraining
 
     trial = RenderTraining(pairs, cfg, device=device)
@@ -127,10 +129,11 @@ def compared(
     """Return PSNR [dB], SSIM, distance of features and time of one way of rendering, over all held-out frames."""
     import torch
     import warp as wp
+    from kornia.metrics import ssim
+
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.figure import Album, decomposition
     from concent_warp.render.shadow_cfg import ShadowCfg
-    from kornia.metrics import ssim
 
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
     features = feature_distance(arguments.features, where)
@@ -213,6 +216,7 @@ def main() -> None:
 def painter(networks: Path, arguments: argparse.Namespace) -> Any:
     """Return the trained networks."""
     import warp as wp
+
     from concent_warp.render.networks.painter import Painter
 
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
@@ -222,12 +226,12 @@ def painter(networks: Path, arguments: argparse.Namespace) -> Any:
 def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what all ways of rendering share."""
     import warp as wp
-    from concent_warp.render.cameras import Camera
-    from concent_warp.render.networks.pairs import drawn_scene
-    from concent_warp.render.splats.splats import Splats
 
     from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
+    from concent_warp.render.cameras import Camera
+    from concent_warp.render.networks.pairs import drawn_scene
+    from concent_warp.render.splats.splats import Splats
     from concent_warp.scene.scene import Scene
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 

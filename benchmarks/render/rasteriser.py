@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
-from concent_warp.render.splats.splats import Splats
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, ROOT, machine, machine_line, table, write_page
+from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
+from concent_warp.render.splats.splats import Splats
 
 NAME = "rasteriser"
 DATA = FOLDER / "data" / f"{NAME}.jsonl"

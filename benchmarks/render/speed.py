@@ -21,6 +21,9 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
+
+from benchmarks.measurements import Measurements
+from benchmarks.pages import machine
 from concent_warp.render.cameras import Camera
 from concent_warp.render.composite import HybridCamera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
@@ -31,9 +34,6 @@ from concent_warp.render.networks.super_resolution import SuperResolution
 from concent_warp.render.raw import RawCamera, Stage
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.render.splats.splats import Splats
-
-from benchmarks.measurements import Measurements
-from benchmarks.pages import machine
 from concent_warp.scene.cameras import with_cameras
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 

@@ -21,15 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from concent_warp.render.splats.cfg import SplatFitCfg
-from concent_warp.render.splats.fit import SplatFit
-from concent_warp.render.splats.initial import visual_hull
-from concent_warp.render.splats.views import FILE, SplatViews, read_views
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_page
 from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.reality.world import WorldCfg
+from concent_warp.render.splats.cfg import SplatFitCfg
+from concent_warp.render.splats.fit import SplatFit
+from concent_warp.render.splats.initial import visual_hull
+from concent_warp.render.splats.views import FILE, SplatViews, read_views
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 NAME = "splat_fit"

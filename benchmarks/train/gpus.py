@@ -21,7 +21,6 @@ from statistics import median
 from typing import Literal
 
 import tyro
-from concent_warp.train.learning.metrics import read_curve
 
 from benchmarks.measurements import Measurements, Row
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
@@ -30,6 +29,7 @@ from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.train.learning.metrics import read_curve
 
 NAME = "train_gpus"
 MARKS = (0.25, 0.5, 0.9)

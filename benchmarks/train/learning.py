@@ -27,13 +27,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from concent_warp.train.cfg import TrainCfg
-from concent_warp.train.learning.metrics import CURVE
-from concent_warp.train.run import Run, train
 
 from benchmarks.pages import machine
 from benchmarks.train.cases import CASES, Case, material
 from concent_warp.model import write_text
+from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.learning.metrics import CURVE
+from concent_warp.train.run import Run, train
 
 RESULT, POLICY, LOG = "result.json", "policy", "log.txt"
 PACKED = 14 * 2**20
@@ -85,11 +85,10 @@ def folder_of(args: Args, case: str, seed: int) -> Path:
 def train_one(args: Args, name: str, seed: int) -> None:
     """Train a case with a seed, and try the policy in simulation."""
     begun = time.monotonic()
-    from concent_warp.train.learning.ppo import CHECKPOINT, Round, load_checkpoint
-    from concent_warp.train.policy.pretrained import ship
-
     from concent_warp.cli.terminal import quiet_warp
     from concent_warp.simulate.warp_engine import preferred_device
+    from concent_warp.train.learning.ppo import CHECKPOINT, Round, load_checkpoint
+    from concent_warp.train.policy.pretrained import ship
 
     quiet_warp()
     case, folder, device = CASES[name], folder_of(args, name, seed), args.device or preferred_device()

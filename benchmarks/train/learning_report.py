@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from concent_warp.train.learning.metrics import read_curve
 
 from benchmarks.pages import FOLDER, machine_line, read_data, table, write_data, write_page
 from benchmarks.train.cases import CASES
 from benchmarks.train.learning import RESULT, changed
+from concent_warp.train.learning.metrics import read_curve
 
 NAME = "train_learning"
 KEPT = ("steps", "seconds", "success", "chain success", "return")

@@ -19,6 +19,12 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+
+from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
+from benchmarks.train.learning import changed
+from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
+from concent_warp.cli.terminal import quiet_warp
+from concent_warp.errors import ConcentError
 from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
@@ -26,12 +32,6 @@ from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
 from concent_warp.train.policy.evaluate import Policy
 from concent_warp.train.resets.sample import InitialStates
 from concent_warp.train.run import Run
-
-from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
-from benchmarks.train.learning import changed
-from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
-from concent_warp.cli.terminal import quiet_warp
-from concent_warp.errors import ConcentError
 
 NAME = "train_stuck"
 LOST = 0.05

@@ -18,11 +18,6 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from concent_warp.train.environment.environment import Environment
-from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
-from concent_warp.train.policy.evaluate import evaluate, wilson
-from concent_warp.train.run import Run
-from concent_warp.train.task.task import Task
 from joblib import Parallel, delayed
 
 from benchmarks.measurements import Measurements, Row
@@ -31,6 +26,11 @@ from benchmarks.train.cases import CASES, HIDDEN, Case, same_world
 from benchmarks.train.learning import POLICY, RESULT, changed
 from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.policy.evaluate import evaluate, wilson
+from concent_warp.train.run import Run
+from concent_warp.train.task.task import Task
 
 NAME = "train_table1"
 TOLERANCE, HOLD = 0.004, 2

@@ -22,13 +22,6 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 import tyro
-from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
-from concent_warp.train.environment.environment import Environment
-from concent_warp.train.environment.worlds import buffers, make_environment
-from concent_warp.train.learning.ppo import Trainer
-from concent_warp.train.resets.sample import InitialStates, draw_states
-from concent_warp.train.run import Run
-from concent_warp.train.task.task import Task
 
 from benchmarks.measurements import Measurements, Row
 from benchmarks.pages import machine
@@ -49,6 +42,13 @@ from concent_warp.reality.record import RealityCfg, record
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.warp_engine import preferred_device
+from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.environment.worlds import buffers, make_environment
+from concent_warp.train.learning.ppo import Trainer
+from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.run import Run
+from concent_warp.train.task.task import Task
 
 T = TypeVar("T")
 Collision = Literal["vcp", "full"]

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco_warp as mjw
 import torch
 import warp as wp
+
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import Graph, WarpPhysics
 

@@ -12,8 +12,8 @@ from rich.markup import escape
 
 from concent_warp.cli.run_folder import resuming_command
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
-from concent_warp.compare.comparison import Comparison
-from concent_warp.compare.comparison_table import mean_and_interval, percent, unit_shown
+from concent_warp.comparison.result import Comparison
+from concent_warp.comparison.table import mean_and_interval, percent, unit_shown
 from concent_warp.events.sequence import ContactEventSequence
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.compare.units import words
+from concent_warp.comparison.units import words
 from concent_warp.report.tables import Row, table
 
 MOST_EFFECTS = 10

@@ -8,8 +8,8 @@ from html import escape
 
 import numpy as np
 
-from concent_warp.compare.comparison import Comparison, Summary
-from concent_warp.compare.units import percent, shown, times, unit_shown, words
+from concent_warp.comparison.result import Comparison, Summary
+from concent_warp.comparison.units import percent, shown, times, unit_shown, words
 from concent_warp.events.sequence import ContactEventSequence
 
 NULL = "no contact"

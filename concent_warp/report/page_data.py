@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.compare.comparison import Comparison
-from concent_warp.compare.units import SHOWN, unit_shown, words
-from concent_warp.compare.worst_spans import Place
+from concent_warp.comparison.result import Comparison
+from concent_warp.comparison.units import SHOWN, unit_shown, words
+from concent_warp.comparison.worst_spans import Place
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.motion_data import motion_data

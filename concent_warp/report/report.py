@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import concent_warp
-from concent_warp.compare.bootstrap import RULE
-from concent_warp.compare.comparison import Comparison, finite
+from concent_warp.comparison.bootstrap import RULE
+from concent_warp.comparison.result import Comparison, finite
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import write_text
 from concent_warp.report.diagnosis import bullet_list, diagnosis_section
@@ -58,7 +58,7 @@ def write_report(
         overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
         settings: ``command``, ``versions`` and ``settings`` to show.
         diagnosis: JSON object of a diagnosis (`concent_warp.report.diagnosis`).
-        location: JSON object of a location (`concent_warp.diagnose.forces.result.Location.to_json`).
+        location: JSON object of a location (`concent_warp.diagnosis.forces.result.Location.to_json`).
     """
     events, overlap = events or {}, overlap or {}
     shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.compare.comparison import Comparison, Summary
-from concent_warp.compare.units import percent, shown, unit_shown
+from concent_warp.comparison.result import Comparison, Summary
+from concent_warp.comparison.units import percent, shown, unit_shown
 
 Row = tuple[str, Sequence[str]]
 """Class of a table row and its cells as HTML."""

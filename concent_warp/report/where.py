@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from html import escape
 
-from concent_warp.compare.comparison import Comparison
-from concent_warp.compare.units import words
-from concent_warp.compare.worst_spans import LEAST, Place, alike
+from concent_warp.comparison.result import Comparison
+from concent_warp.comparison.units import words
+from concent_warp.comparison.worst_spans import LEAST, Place, alike
 from concent_warp.estimation.noise import WORDS
 
 MOST_PLACES = 6

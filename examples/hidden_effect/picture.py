@@ -13,7 +13,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from concent_warp.compare.compare import compare
+from concent_warp.comparison.compare import compare
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 

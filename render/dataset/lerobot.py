@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
 from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, replace_text, settle
 from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged, of_values
 from concent_warp.render.dataset.video import PIXELS, Codec, VideoWriter, join_videos

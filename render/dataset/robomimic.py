@@ -14,6 +14,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+
 from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, settle
 
 NAME = "dataset.hdf5"

@@ -7,6 +7,7 @@ network predicts x_1 (paper, appendix E: "the output is the denoised image").
 from __future__ import annotations
 
 import torch
+
 from concent_warp.render.networks.flow_network import FlowNetwork
 
 

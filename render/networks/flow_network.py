@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 import torch
-from concent_warp.render.networks.cfg import FlowNetworkCfg
 from torch import nn
 from torch.nn import functional
+
+from concent_warp.render.networks.cfg import FlowNetworkCfg
 
 IMAGES = 3
 """Images in: the noised one, the simulation's, and the previous real one; 9 channels."""

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+
+from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
 from concent_warp.render.networks.flow import draw
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.super_resolution import SuperResolution, reduced
 from concent_warp.render.networks.train import CHECKPOINT, ENLARGE, load_checkpoint, network_of
-
-from concent_warp.errors import RenderError
 
 
 class Painter:

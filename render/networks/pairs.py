@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
-from concent_warp.render.cameras import Camera, place_cameras
-from concent_warp.render.raw import RawCamera, Stage
 
 from concent_warp.errors import RenderError
 from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
+from concent_warp.render.cameras import Camera, place_cameras
+from concent_warp.render.raw import RawCamera, Stage
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 

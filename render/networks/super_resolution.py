@@ -7,9 +7,10 @@ forward pass, trained with L1.
 from __future__ import annotations
 
 import torch
-from concent_warp.render.networks.cfg import SuperResolutionCfg
 from torch import nn
 from torch.nn import functional
+
+from concent_warp.render.networks.cfg import SuperResolutionCfg
 
 FACTOR = 4
 """Enlargement of an edge."""

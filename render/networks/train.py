@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
 from concent_warp.render.networks.flow import flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.pairs import Pairs, to_signed
 from concent_warp.render.networks.super_resolution import FACTOR, SuperResolution, reduced
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-
-from concent_warp.errors import RenderError
 
 CHECKPOINT = "checkpoint.pt"
 """File of the state of a training."""

@@ -23,13 +23,13 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 import warp as wp
+
+from concent_warp.errors import RenderError
 from concent_warp.render.splats.cfg import SplatFitCfg
 from concent_warp.render.splats.initial import first_splats
 from concent_warp.render.splats.rasterise import Rasteriser
 from concent_warp.render.splats.splats import Splats
 from concent_warp.render.splats.views import SplatViews
-
-from concent_warp.errors import RenderError
 
 Report = Callable[[int, float], None]
 """Called with the number of steps done and the loss."""

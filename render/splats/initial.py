@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from concent_warp.render.splats.splats import COEFFICIENTS, Splats
-from concent_warp.render.splats.views import SplatViews
 from scipy.spatial import KDTree
 
 from concent_warp.errors import RenderError
+from concent_warp.render.splats.splats import COEFFICIENTS, Splats
+from concent_warp.render.splats.views import SplatViews
 from concent_warp.scene.shapes.objects import MESHES, read_mesh, read_points
 from concent_warp.scene.shapes.ply import read_header
 from concent_warp.scene.shapes.splat import HARMONIC

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import torch
 import warp as wp
-from concent_warp.kernels.splats.splats import PARAMETERS, SplatArrays, SplatPlan
-from concent_warp.render.splats.splats import Splats
 
 from concent_warp.errors import RenderError
+from concent_warp.kernels.splats.splats import PARAMETERS, SplatArrays, SplatPlan
+from concent_warp.render.splats.splats import Splats
 
 HEADROOM = 2.0
 """Room for pairs of Gaussian and tile, as a multiple of what the first images take."""

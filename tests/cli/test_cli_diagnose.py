@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from concent_warp.cli import main
-from concent_warp.diagnose.diagnosis import Diagnosis
+from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Channel
@@ -98,7 +98,7 @@ def test_a_report_shows_the_diagnosis_before_and_after(swing, tmp_path):
 
 
 def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, capsys, monkeypatch):
-    from concent_warp.diagnose.checkpoint import CheckpointedProcedure
+    from concent_warp.diagnosis.checkpoint import CheckpointedProcedure
 
     finish = CheckpointedProcedure.fitted
 

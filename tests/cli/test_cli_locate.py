@@ -4,7 +4,7 @@ import numpy as np
 
 from concent_warp.cli import main
 from concent_warp.recording.formats.hdf5 import write_hdf5
-from tests.diagnose.forces.locate_scenes import swing, throw
+from tests.diagnosis.forces.locate_scenes import swing, throw
 
 
 def test_locate_prints_sentences_and_writes_what_was_asked_for(tmp_path, capsys):

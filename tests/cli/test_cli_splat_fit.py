@@ -2,12 +2,12 @@ import json
 
 import cv2
 import pytest
-from concent_warp.render.splats.splats import Splats
-from concent_warp.render.splats.views import SplatViews
 
 from concent_warp.cli import main
 from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.reality.world import WorldCfg
+from concent_warp.render.splats.splats import Splats
+from concent_warp.render.splats.views import SplatViews
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 QUICK = ["--fit.start", "300", "--fit.held-out", "4"]

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from scipy.spatial import KDTree
+
 from concent_warp.kernels.chamfer import distance_cpu, distance_cuda, distance_gradient, distance_gradient_cuda
 from concent_warp.kernels.chamfer.distance import ChamferPlan, chamfer, chamfer_parts
 from concent_warp.kernels.chamfer.pairs import batch_of
-from scipy.spatial import KDTree
 
 
 def points(rng, *shape):

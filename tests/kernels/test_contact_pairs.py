@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from rigid_poses import Poses, on_each_device, outputs, turn
+
 from concent_warp.kernels import contact_pairs
 from concent_warp.kernels.contact_pairs import SLOT, SLOTS, ContactPairs, PairTable
-from rigid_poses import Poses, on_each_device, outputs, turn
 
 AMPLITUDE, SIGMA = (1.0, 2.0), (0.05, 0.008)
 NAMES = ("features", "distance", "worst", "worst_distance", "reach", "finite")

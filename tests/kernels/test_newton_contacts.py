@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
+
 from concent_warp.kernels.newton_contacts import (
     BOX,
     CAPSULE,
@@ -15,7 +17,6 @@ from concent_warp.kernels.newton_contacts import (
     gather_contacts,
     write_contacts,
 )
-from scipy.spatial.transform import Rotation
 
 TURNED = wp.transform(wp.vec3(0.1, -0.2, 0.3), wp.quat_rpy(0.4, -0.6, 0.7))
 STILL = wp.transform_identity()

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import splat_reference
 import warp as wp
+from rigid_poses import on_each_device
+
 from concent_warp.kernels.splats import blend, projection, tiles
 from concent_warp.kernels.splats.splats import SplatArrays, SplatPlan
-from rigid_poses import on_each_device
 
 NAMES = ("means", "quats", "scales", "opacities", "harmonics")
 

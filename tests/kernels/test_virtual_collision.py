@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from rigid_poses import Poses, on_each_device, outputs, turn, turn_back
+
 from concent_warp.kernels import virtual_collision_kernel
 from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
-from rigid_poses import Poses, on_each_device, outputs, turn, turn_back
 
 WEIGHTS = {"depth_weight": 30.0, "band_weight": 0.05, "severe_penalty": 7.0}
 NAMES = ("reward", "penetration", "band", "deepest", "deepest_pair", "severe", "finite")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+
 from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
 from concent_warp.render.splats.splats import Splats
 from concent_warp.render.splats.views import SplatViews

@@ -4,11 +4,11 @@ otherwise: the same shapes in other colours, under another light."""
 import mujoco
 import numpy as np
 import torch
+
+from concent_warp.recording.recording import Channel, Demonstration, ImageStream, Recording
 from concent_warp.render.cameras import Camera
 from concent_warp.render.raw import RawCamera, Stage
 from concent_warp.render.splats.splats import Splats
-
-from concent_warp.recording.recording import Channel, Demonstration, ImageStream, Recording
 from concent_warp.scene.scene import Scene
 
 SIZE = 64

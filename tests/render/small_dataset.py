@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+
 from concent_warp.render.dataset.layout import EpisodeLayout
 
 LAYOUT = EpisodeLayout(10, ("base", "wrist"), (32, 48), ("a", "b"), ("x", "y", "z"))

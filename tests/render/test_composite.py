@@ -2,12 +2,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from small_arm import XML, ball, states
+
 from concent_warp.render.composite import HybridCamera, composed
 from concent_warp.render.figure import Album, decomposition
 from concent_warp.render.raw import camera_ids
 from concent_warp.render.shadows import ShadowCfg
-from small_arm import XML, ball, states
-
 from concent_warp.scene.scene import Scene
 
 SIZE = (64, 64)

@@ -8,14 +8,14 @@ import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from small_dataset import LAYOUT, frame, length, write
+
+from concent_warp.errors import RenderError
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
 from concent_warp.render.dataset.statistics import ImageHistogram, merged, of_values
 from concent_warp.render.dataset.video import VideoWriter, read_frames
-from small_dataset import LAYOUT, frame, length, write
-
-from concent_warp.errors import RenderError
 
 
 def episodes(folder: Path) -> list[dict]:

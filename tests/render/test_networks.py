@@ -3,6 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
+from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import (
     AugmentCfg,
@@ -17,8 +19,6 @@ from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import Pairs, columns, frames_before
 from concent_warp.render.networks.super_resolution import SuperResolution, enlarged, reduced
 from concent_warp.render.networks.train import RenderTraining
-
-from concent_warp.errors import RenderError
 
 SMALL = FlowNetworkCfg(size=16, width=8, factors=(1, 2))
 CFG = RenderTrainCfg(

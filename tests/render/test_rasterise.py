@@ -1,10 +1,10 @@
 import pytest
 import torch
 import warp as wp
-from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
-from concent_warp.render.splats.splats import Splats
 
 from concent_warp.errors import RenderError
+from concent_warp.render.splats.rasterise import Rasteriser, intrinsics_of
+from concent_warp.render.splats.splats import Splats
 
 STILL = torch.tensor([0.0, 0, 0, 1, 0, 0, 0])
 

@@ -2,9 +2,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from concent_warp.render.raw import RawCamera, Stage, camera_ids, matrix_quaternions
 
 from concent_warp.errors import RenderError, SceneError
+from concent_warp.render.raw import RawCamera, Stage, camera_ids, matrix_quaternions
 from concent_warp.scene.cameras import BASE, WRIST, with_cameras
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_arm
-from concent_warp.render.dataset.video import read_frames
 from small_arm import ball
 
 from concent_warp.cli.entry import main
 from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.render.dataset.video import read_frames
 
 TRAIN = [
     "--network.size", "16", "--network.width", "16", "--network.factors", "1", "2", "--flow.batch", "8",

@@ -2,11 +2,11 @@ import math
 
 import pytest
 import torch
+
+from concent_warp.errors import RenderError
 from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
 from concent_warp.render.splats.rasterise import intrinsics_of
 from concent_warp.render.splats.splats import Splats
-
-from concent_warp.errors import RenderError
 
 SIZE = 96
 INTRINSICS = intrinsics_of(15.0, SIZE, SIZE)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from photographed import ball, cameras, photographed
+
+from concent_warp.errors import RenderError, SceneError
 from concent_warp.render.splats.cfg import RatesCfg, SplatFitCfg
 from concent_warp.render.splats.fit import SplatFit, turned
 from concent_warp.render.splats.initial import read_start, visual_hull
 from concent_warp.render.splats.splats import Splats
-from photographed import ball, cameras, photographed
-
-from concent_warp.errors import RenderError, SceneError
 
 CFG = SplatFitCfg(
     iterations=120, start=500, most=800, every=40, degree=0, rates=RatesCfg(scales=0.03, opacities=0.1, colour=0.05)

@@ -3,10 +3,10 @@ import json
 import cv2
 import numpy as np
 import pytest
-from concent_warp.render.splats.views import FILE, read_views
 from photographed import photographed
 
 from concent_warp.errors import RenderError
+from concent_warp.render.splats.views import FILE, read_views
 
 
 @pytest.fixture

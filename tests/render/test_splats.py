@@ -1,8 +1,8 @@
 import pytest
 import torch
-from concent_warp.render.splats.splats import Splats
 
 from concent_warp.errors import RenderError
+from concent_warp.render.splats.splats import Splats
 from concent_warp.scene.shapes.objects import load_object
 
 

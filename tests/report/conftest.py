@@ -2,8 +2,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.compare.compare import compare
-from concent_warp.compare.no_contact import without_object_contact
+from concent_warp.comparison.compare import compare
+from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.events.extract import extract
 from concent_warp.fit.geometry.search import FitResult
 from concent_warp.model import Model

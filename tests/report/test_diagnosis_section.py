@@ -3,7 +3,7 @@ from html import unescape
 
 import pytest
 
-from concent_warp.compare.compare import compare
+from concent_warp.comparison.compare import compare
 from concent_warp.report.diagnosis import accepted, bars, diagnosis_section, headline
 from concent_warp.report.report import write_report
 

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.compare.compare import compare
-from concent_warp.compare.units import shown
+from concent_warp.comparison.compare import compare
+from concent_warp.comparison.units import shown
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.report.report import filled, write_report

@@ -1,10 +1,11 @@
 import pytest
 import torch
+from small_insertion import SETTINGS, make_task
+
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.resets.sample import InitialStates, draw_states
 from concent_warp.train.task.task import Task
-from small_insertion import SETTINGS, make_task
 
 
 @pytest.fixture(scope="session")

@@ -5,15 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from small_insertion import SETTINGS, make_demonstration, make_events, make_model, make_task
+
+from concent_warp.recording.recording import Recording
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import Trainer
 from concent_warp.train.resets.sample import draw_states
 from concent_warp.train.run import Run, train
-from small_insertion import SETTINGS, make_demonstration, make_events, make_model, make_task
-
-from concent_warp.recording.recording import Recording
 
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 

@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
-from concent_warp.train.task.task import Task
 
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
@@ -13,6 +11,8 @@ from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
+from concent_warp.train.task.task import Task
 
 HOLE = 0.12
 OPEN, SHUT = 0.02, -0.004

@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from small_insertion import CHAIN, HOLE, SETTINGS, make_task
+
 from concent_warp.train.cfg import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import make_environment, make_physics
@@ -14,7 +16,6 @@ from concent_warp.train.resets.sample import InitialStates, draw_states
 from concent_warp.train.task.movable import movable
 from concent_warp.train.task.stages import worst_distance
 from concent_warp.train.task.task import Task
-from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 
 WORLDS = 6
 

@@ -6,15 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+
+from concent_warp.effects.effect import AddedEffect, Parameter
+from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 from concent_warp.train.cfg import RandomisationCfg, TrainError
 from concent_warp.train.environment.commands import Follower, Following
 from concent_warp.train.environment.effects import effects_of_worlds
 from concent_warp.train.environment.worlds import make_environment, make_physics
 from concent_warp.train.task.task import Task
-from small_insertion import SETTINGS, make_demonstration, make_events, make_model
-
-from concent_warp.effects.effect import AddedEffect, Parameter
-from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 
 DELAY = AddedEffect(ActuatorDelay("x", "y"), (0.031,), ((0.0, 0.062),))
 LAG = AddedEffect(ActuatorLag("x", "z"), (0.04,), ((0.02, 0.06),))

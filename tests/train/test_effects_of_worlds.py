@@ -7,17 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.effects import drawn, effects_of_worlds
-from concent_warp.train.environment.randomisation import drawn_fields
-from concent_warp.train.environment.worlds import make_physics
-from concent_warp.train.task.task import Task
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.joints import JointDamping, Stribeck
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
+from concent_warp.train.cfg import RandomisationCfg
+from concent_warp.train.environment.effects import drawn, effects_of_worlds
+from concent_warp.train.environment.randomisation import drawn_fields
+from concent_warp.train.environment.worlds import make_physics
+from concent_warp.train.task.task import Task
 
 DAMPING = AddedEffect(JointDamping("x", "y"), (30.0, 20.0), ((20.0, 40.0), (20.0, 20.0)))
 STRIBECK = AddedEffect(

@@ -6,12 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from small_insertion import SETTINGS
+
 from concent_warp.train.cfg import TrainCfg, TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.physics import WarpPhysics, compiled_or_plain
 from concent_warp.train.environment.randomisation import drawn_fields
 from concent_warp.train.environment.worlds import make_environment, make_physics
-from small_insertion import SETTINGS
 
 
 def still(environment: Environment) -> torch.Tensor:

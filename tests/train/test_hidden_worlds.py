@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.environment.physics import Actor, MujocoPhysics
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError
@@ -13,6 +12,7 @@ from concent_warp.reality.hidden.in_task import MET, TaskWorld, pads, wanted
 from concent_warp.reality.rigs.grasp import SCENE
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.train.environment.physics import Actor, MujocoPhysics
 
 MAGNITUDES = {
     "stribeck_friction": 5.0,

@@ -3,12 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
+
+from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 from concent_warp.train.cfg import ActionCfg
 from concent_warp.train.resets.inverse_kinematics import reach
 from concent_warp.train.resets.inverse_kinematics_batch import reach_many, tool_chain
 from concent_warp.train.task.robot import Robot
-
-from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 Asked = tuple[mujoco.MjModel, Robot, np.ndarray, np.ndarray, np.ndarray]
 

@@ -1,4 +1,5 @@
 import torch
+
 from concent_warp.train.learning.normalisation import LARGEST, BoundedNormalization
 
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from small_insertion import SETTINGS
+
 from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg, TrainError
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round, Trainer
-from small_insertion import SETTINGS
 
 WORLD, WORLDS = 2, 6
 NAN = float("nan")

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from small_insertion import SETTINGS
+
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.play import Player
-from small_insertion import SETTINGS
 
 
 @pytest.fixture

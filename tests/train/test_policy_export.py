@@ -9,10 +9,6 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
-from concent_warp.train.learning.ppo import CHECKPOINT
-from concent_warp.train.policy.export import export
-from concent_warp.train.run import Run, train
 from onnx.reference import ReferenceEvaluator
 from small_insertion import SETTINGS, make_demonstration, make_model
 from tensordict import TensorDict
@@ -21,6 +17,10 @@ from concent_warp.cli import main
 from concent_warp.events.extract import extract
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.learning.ppo import CHECKPOINT
+from concent_warp.train.policy.export import export
+from concent_warp.train.run import Run, train
 
 Trained = tuple[Path, torch.Tensor, torch.Tensor]
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from small_insertion import SETTINGS
+
+from concent_warp.effects.registry import effect_class
 from concent_warp.train.cfg import TrainCfg, TrainError
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics, WarpPhysics
 from concent_warp.train.environment.worlds import make_environment
-from small_insertion import SETTINGS
-
-from concent_warp.effects.registry import effect_class
 
 PUSHED = replace(SETTINGS, randomisation=replace(SETTINGS.randomisation, push=(2.0, 0.05), push_share=0.5))
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from several_processes import make_run, updated
+
+from concent_warp.cli import main
 from concent_warp.train.cfg import TrainError
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.run import train
-from several_processes import make_run, updated
-
-from concent_warp.cli import main
 
 SCRIPT = Path(__file__).with_name("several_processes.py")
 

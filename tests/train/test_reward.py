@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
 from concent_warp.train.environment.environment import TERMS
 from concent_warp.train.environment.reward import disturbance, effort, engineered

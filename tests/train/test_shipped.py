@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from several_processes import make_run
+
+from concent_warp.cli import main
+from concent_warp.cli.commands.evaluate import restrained
 from concent_warp.train.cfg import TrainError
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, ship, shipped
 from concent_warp.train.run import Run, train
-from several_processes import make_run
-
-from concent_warp.cli import main
-from concent_warp.cli.commands.evaluate import restrained
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_insertion import SETTINGS, make_demonstration, make_model, make_task
+
+from concent_warp.model import Model
+from concent_warp.reality.record import RealityCfg, record
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg, TrainError
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.observation import Layout
@@ -11,12 +17,6 @@ from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.resets.sample import draw_states
 from concent_warp.train.task.slots import choose
 from concent_warp.train.task.task import Task
-from small_insertion import SETTINGS, make_demonstration, make_model, make_task
-
-from concent_warp.model import Model
-from concent_warp.reality.record import RealityCfg, record
-from concent_warp.scene.scene import Scene
-from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_insertion import SETTINGS, make_demonstration, make_model
+
+from concent_warp.cli import main
+from concent_warp.events.extract import extract
+from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.recording.recording import Recording
+from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
@@ -14,13 +21,6 @@ from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round
 from concent_warp.train.policy.evaluate import evaluate, wilson
 from concent_warp.train.policy.export import export
 from concent_warp.train.run import Run, train
-from small_insertion import SETTINGS, make_demonstration, make_model
-
-from concent_warp.cli import main
-from concent_warp.events.extract import extract
-from concent_warp.recording.formats.hdf5 import write_hdf5
-from concent_warp.recording.recording import Recording
-from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from concent_warp.train.cfg import CollisionCfg
-from concent_warp.train.environment.vcp import surface_points, within
-from concent_warp.train.environment.worlds import make_environment
 from small_insertion import SETTINGS
 
 from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
+from concent_warp.train.cfg import CollisionCfg
+from concent_warp.train.environment.vcp import surface_points, within
+from concent_warp.train.environment.worlds import make_environment
 
 HALF, RADIUS, SLACK = 0.02, 0.004, 0.0005
 CUBE = Surface.of_solids([Box(np.full(3, HALF))])

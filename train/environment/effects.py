@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from concent_warp.train.environment.commands import Following
-from concent_warp.train.task.task import Task
 
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
+from concent_warp.train.environment.commands import Following
+from concent_warp.train.task.task import Task
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import Law

@@ -15,6 +15,9 @@ from typing import Any, cast
 import numpy as np
 import torch
 import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg, TrainError
 from concent_warp.train.environment.observation import BaseObservation, Layout
@@ -24,8 +27,6 @@ from concent_warp.train.environment.rotation import inverse, rotate
 from concent_warp.train.environment.vcp import virtual_collision
 from concent_warp.train.resets.sample import InitialStates
 from concent_warp.train.task.task import Task
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 
 TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
 """Terms of the reward, in the order of `Environment.terms`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+
 from concent_warp.kernels.contact_pairs import SLOT
 from concent_warp.train.environment.physics import Physics
 from concent_warp.train.environment.rotation import two_columns

@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 import torch
 import warp as wp
-from concent_warp.train.environment.commands import Follower, Following
 
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
+from concent_warp.train.environment.commands import Follower, Following
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import Law

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
+
 from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.commands import Following
 from concent_warp.train.task.task import Task

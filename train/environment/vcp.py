@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
-from concent_warp.train.cfg import CollisionCfg
-from concent_warp.train.environment.physics import Physics
-from concent_warp.train.task.task import Task
 
+from concent_warp.kernels.virtual_collision import SphereSet, TargetMesh, VirtualCollision, VirtualPair
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.inset import inset
 from concent_warp.scene.spheres.sampling import farthest_point_sampling
+from concent_warp.train.cfg import CollisionCfg
+from concent_warp.train.environment.physics import Physics
+from concent_warp.train.task.task import Task
 
 if TYPE_CHECKING:
     import trimesh

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 
 import mujoco
+
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.commands import Following
 from concent_warp.train.environment.effects import effects_of_worlds

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from concent_warp.train.cfg import TrainError
 from torch import distributed
 
 from concent_warp.errors import ConcentError
+from concent_warp.train.cfg import TrainError
 
 
 @dataclass(frozen=True)

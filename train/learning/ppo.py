@@ -13,13 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+
 from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.learning.metrics import curve
 from concent_warp.train.learning.normalisation import bound_observations
-from rsl_rl.algorithms import PPO
-from tensordict import TensorDict
 
 CHECKPOINT = "checkpoint.pt"
 """File of the latest state of a training in its run folder."""

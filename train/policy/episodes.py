@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.policy.evaluate import Policy
 

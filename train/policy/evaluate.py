@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
+
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.resets.sample import InitialStates
-from tensordict import TensorDict
 
 Policy = Callable[[TensorDict], torch.Tensor]
 Watch = Callable[[np.ndarray, np.ndarray], None]

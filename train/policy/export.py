@@ -13,6 +13,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
+from torch import nn
+
 from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
 from concent_warp.train.cfg import TrainCfg, TrainError
 from concent_warp.train.environment.observation import Layout
@@ -20,9 +24,6 @@ from concent_warp.train.learning.normalisation import bound_observations
 from concent_warp.train.learning.ppo import load_checkpoint, network
 from concent_warp.train.run import Run
 from concent_warp.train.task.task import Task
-from rsl_rl.models import MLPModel
-from tensordict import TensorDict
-from torch import nn
 
 FORMAT, VERSION = "concent-policy", 1
 METADATA = "concent"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
+
+from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.policy.evaluate import FAILURES, Policy
 from concent_warp.train.task.task import Task
-
-from concent_warp.simulate.inputs import compile_model
 
 TOUCH = 5e-4
 """Gap below which a sphere counts as touching something [m]."""

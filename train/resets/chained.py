@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+
 from concent_warp.train.cfg import ResetCfg
 from concent_warp.train.resets.reset_states import Draft, Drawing, about_vertical, place
 from concent_warp.train.task.task import Task

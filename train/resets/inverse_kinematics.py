@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+
 from concent_warp.train.task.robot import Robot
 
 ITERATIONS = 20

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+
 from concent_warp.train.cfg import TrainError
 from concent_warp.train.task.robot import Robot
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+
+from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.cfg import ResetCfg, TrainError
 from concent_warp.train.resets.inverse_kinematics import reach
 from concent_warp.train.resets.inverse_kinematics_batch import reach_many
 from concent_warp.train.task.movable import mocap_of
 from concent_warp.train.task.task import Task
-
-from concent_warp.simulate.inputs import compile_model
 
 ROUNDS = 20
 """Rounds, of as many drafts as states are wanted, after which the search is given up."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+
 from concent_warp.train.cfg import ActionCfg, TrainError
 
 

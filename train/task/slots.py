@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from concent_warp.kernels.contact_pairs import PairTable
 
 from concent_warp.events.sequence import ContactEventSequence, ContactPair, Stage
+from concent_warp.kernels.contact_pairs import PairTable
 
 
 def slot_table(compiled: mujoco.MjModel, events: ContactEventSequence, count: int) -> tuple[PairTable, np.ndarray]:

@@ -6,21 +6,21 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from concent_warp.kernels.contact_pairs import PairTable
-from concent_warp.train.cfg import ALL, EnvironmentCfg, TrainError
-from concent_warp.train.task.movable import movable
-from concent_warp.train.task.robot import Robot
-from concent_warp.train.task.slots import slot_table
-from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stages
 
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.kernels.contact_pairs import PairTable
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
+from concent_warp.train.cfg import ALL, EnvironmentCfg, TrainError
+from concent_warp.train.task.movable import movable
+from concent_warp.train.task.robot import Robot
+from concent_warp.train.task.slots import slot_table
+from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stages
 
 
 @dataclass(frozen=True)

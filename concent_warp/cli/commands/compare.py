@@ -13,11 +13,11 @@ from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.summary import say_diverged
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.compare.compare import compare
-from concent_warp.compare.comparison import Comparison
-from concent_warp.compare.comparison_table import markdown_table, rich_table
-from concent_warp.compare.phases import tell_a_task
-from concent_warp.compare.worst_spans import LEAST, alike
+from concent_warp.comparison.compare import compare
+from concent_warp.comparison.phases import tell_a_task
+from concent_warp.comparison.result import Comparison
+from concent_warp.comparison.table import markdown_table, rich_table
+from concent_warp.comparison.worst_spans import LEAST, alike
 from concent_warp.errors import EventsError
 from concent_warp.estimation.noise import WORDS
 from concent_warp.ground import extract_all

@@ -14,11 +14,11 @@ from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.compare.compare import compare
-from concent_warp.diagnose.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnose.diagnose import DiagnosisCfg, diagnose
-from concent_warp.diagnose.diagnosis import Diagnosis, Finding
-from concent_warp.diagnose.search.candidates import candidates
+from concent_warp.comparison.compare import compare
+from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
+from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.result import Diagnosis, Finding
+from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.model import Model

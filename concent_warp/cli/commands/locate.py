@@ -12,9 +12,9 @@ from rich.markup import escape
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.diagnose.forces.locate import locate
-from concent_warp.diagnose.forces.result import Location
-from concent_warp.diagnose.forces.window_forces import WindowCfg
+from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.diagnosis.forces.result import Location
+from concent_warp.diagnosis.forces.window_forces import WindowCfg
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.simulate.select import EngineName
@@ -62,13 +62,13 @@ def run(arguments: Arguments) -> Location:
             say(escape(sentence))
     written = []
     if arguments.png is not None:
-        from concent_warp.diagnose.forces.plot import plot_location
+        from concent_warp.diagnosis.forces.plot import plot_location
 
         make_folder(arguments.png.parent)
         plot_location(found, model, arguments.png)
         written.append(arguments.png)
     if arguments.html is not None:
-        from concent_warp.compare.compare import compare
+        from concent_warp.comparison.compare import compare
         from concent_warp.report.report import write_report
 
         models = {"model": model}

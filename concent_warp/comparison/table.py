@@ -1,0 +1,84 @@
+"""A comparison as a table: for the terminal and as Markdown. Lengths in mm, angles in degrees."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from concent_warp.comparison.result import Comparison, Summary
+from concent_warp.comparison.units import percent, shown, times, unit_shown
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def mean_and_interval(summary: Summary) -> str:
+    """Return a mean with its interval, such as ``1.20 [1.05, 1.38]``."""
+    mean = shown(summary.mean, summary.unit)
+    if not np.isfinite(summary.low):
+        return mean
+    return f"{mean} [{shown(summary.low, summary.unit)}, {shown(summary.high, summary.unit)}]"
+
+
+def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of the table as text.
+
+    Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
+
+    Per channel and phase: number of samples, mean error of each model with its 95 % interval, RMS, 95th percentile and
+    largest error of the last, noise floor and how many times that the mean is; with two models or more also the change
+    of the mean, with its interval.
+    """
+    several = len(comparison.models) > 1
+    header = ["channel", "phase", "unit", "samples", *(f"mean {name}" for name in comparison.models)]
+    header += ["change"] if several else []
+    header += ["RMS", "p95", "max", "noise", "x noise"]
+    rows = []
+    for channel, phase in comparison.rows():
+        if phase and not every_phase and channel not in (comparison.object_channels or comparison.channels):
+            continue
+        summaries = [comparison.summarise(model, channel, phase) for model in comparison.models]
+        last = summaries[-1]
+        if not last.count:
+            continue
+        row = ["" if phase else channel, last.phase, unit_shown(last.unit), str(last.count)]
+        row += [mean_and_interval(summary) for summary in summaries]
+        if several:
+            row.append(change(comparison, channel, phase))
+        row += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
+        row.append("-" if last.ratio is None else times(last.ratio))
+        rows.append(row)
+    return header, rows
+
+
+def change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str:
+    """Return the change of the mean error in percent and the interval of the difference."""
+    found = comparison.difference(channel, phase)
+    if not np.isfinite(found.share):
+        return "-"
+    text = percent(found.share)
+    if not np.isfinite(found.low):
+        return text
+    low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
+    return f"{text} [{low}, {high}]"
+
+
+def rich_table(comparison: Comparison, *, every_phase: bool = False) -> Table:
+    """Return the table for a terminal."""
+    from rich.table import Table
+
+    header, rows = cells(comparison, every_phase=every_phase)
+    table = Table(header_style="bold")
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < 3 else "right", no_wrap=i == 0)
+    for i, row in enumerate(rows):
+        table.add_row(*row, end_section=i + 1 == len(rows) or bool(rows[i + 1][0]))
+    return table
+
+
+def markdown_table(comparison: Comparison, *, every_phase: bool = False) -> str:
+    """Return the table as Markdown."""
+    header, rows = cells(comparison, every_phase=every_phase)
+    rule = [":---" if i < 3 else "---:" for i in range(len(header))]
+    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows)) + "\n"

@@ -1,0 +1,303 @@
+"""Where a model fails worst: spans of time in which the error stands farthest above the noise, named in words.
+
+The error of a channel, in units of its noise floor, is smoothed over `SMOOTHING`; a place is the span about a peak in
+which it stays above half the peak and above `LEAST`. Spans of several channels of one body that overlap are one place.
+What the body touches then is read off the contacts of the model's replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from concent_warp.comparison.contact_names import Partners
+from concent_warp.comparison.phases import Phase
+from concent_warp.comparison.residuals import Residual
+from concent_warp.comparison.units import shown, times, unit_shown, words
+from concent_warp.events.filter import runs
+
+SMOOTHING = 0.05
+"""Length of the windows over which errors are averaged [s]."""
+FEWEST = 3
+"""Samples that a window has at least."""
+LEAST = 3.0
+"""What stays below this many times the noise is no place."""
+SLACK = 0.5
+"""Rises of the error by less than this many times the noise count as falling on [-]."""
+EACH = 3
+"""Places of one channel in one demonstration, and places that are alike in several of them."""
+MOST = 20
+"""Places kept in all."""
+QUIET = 0.01
+"""Where the noise is not known, this share of the channel's motion stands for it."""
+ONE_AXIS = 0.85
+"""Share of a direction from which one axis alone names it."""
+ONE_WAY = 0.5
+"""A residual whose mean is below this share of its RMS points to and fro."""
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A span of time in which a channel of one body, or several of them, is far off."""
+
+    demonstration: str
+    channels: tuple[str, ...]
+    """The worst first; `error`, `ratio`, `direction` and `vector` are its."""
+    body: str | None
+    phase: str | None
+    """Phase that most of the error falls in, where phases are known."""
+    start: float
+    """[s]"""
+    end: float
+    """[s]"""
+    peak: float
+    """Time of the largest error [s]."""
+    onset: float
+    """Since when the error has been above `LEAST` times the noise without a break [s]."""
+    error: float
+    """RMS error over the span, in `unit`; infinite where the model has diverged."""
+    unit: str
+    ratio: float | None
+    """The same over the noise floor [-]; None where the noise is not known."""
+    against: tuple[str, ...]
+    """What the body touches there in the replay, as far as it has a name; the objects first."""
+    point: tuple[float, float, float] | None
+    """Mean contact point with the first of these [m], in the frame of `body`."""
+    direction: str
+    """Where the measurement lies as seen from the model, in words."""
+    vector: tuple[float, ...]
+    """The same as a unit vector; shorter where the residual points to and fro."""
+    arose: str | None = None
+    """Phase in which most of the error at the peak has come about; open loop, what is off once stays off."""
+    recurs: int = 1
+    """Number of demonstrations with a place of the same channel and phase against the same thing."""
+
+    @property
+    def size(self) -> str:
+        """How far off, in words."""
+        if not np.isfinite(self.error):
+            return "diverged"
+        size = f"{shown(self.error, self.unit)} {unit_shown(self.unit)}".strip()
+        return size if self.ratio is None else f"{times(self.ratio)} noise ({size})"
+
+    def sentence(self, *, demonstration: bool = False) -> str:
+        """Return the place in words, such as "block position, insert phase, 3.1-3.6 s, 8 x noise (3.4 mm), ..."."""
+        name = words(self.channels[0])
+        if len(self.channels) > 1:
+            also = (words(c).removeprefix(f"{words(self.body or '')} ") for c in self.channels[1:])
+            name += f" (and {', '.join(also)})"
+        parts = [f"{self.demonstration}: {name}" if demonstration else name]
+        parts += [f"{self.phase} phase"] if self.phase else []
+        parts += [f"{self.start:.2f}-{self.end:.2f} s", self.size]
+        parts += [f"against {' and '.join(self.against)}"] if self.against else []
+        parts += [self.direction] if self.direction else []
+        since = f"off since {self.onset:.2f} s" if self.start - self.onset > SMOOTHING else ""
+        if self.arose != self.phase and self.arose:
+            since = f"{since}, mostly from the {self.arose} phase".removeprefix(", ")
+        return ", ".join([*parts, *([since] if since else [])])
+
+
+def worst_places(
+    residuals: Sequence[Residual],
+    phases: Mapping[str | None, Sequence[Phase]],
+    partners: Partners | None,
+    demonstration: str,
+) -> list[Place]:
+    """Return the places of one demonstration, the worst first.
+
+    Args:
+        residuals: Of one model.
+        phases: Of each body that has phases of its own, and under None of the demonstration; may be empty.
+        partners: Who touches whom in the model's replay, where it is known.
+        demonstration: Its name.
+    """
+    found = [
+        place
+        for residual in residuals
+        for place in channel_places(residual, phases.get(residual.body, phases[None]), partners, demonstration)
+    ]
+    return merged(sorted(found, key=severity, reverse=True))
+
+
+def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
+    """Return the worst of the places of all demonstrations, the worst first, each with how often it recurs.
+
+    Of places that are alike in many demonstrations the worst few are kept, so that there is room for others.
+    """
+    seen: dict[tuple, set[str]] = {}
+    for place in places:
+        seen.setdefault(alike(place), set()).add(place.demonstration)
+    kept: list[Place] = []
+    count: dict[tuple, int] = {}
+    for place in sorted(places, key=severity, reverse=True):
+        count[alike(place)] = count.get(alike(place), 0) + 1
+        if count[alike(place)] <= EACH and len(kept) < most:
+            kept.append(replace(place, recurs=len(seen[alike(place)])))
+    return tuple(kept)
+
+
+def alike(place: Place) -> tuple:
+    """Return what two places that are the same in different demonstrations have in common."""
+    return place.channels[0], place.phase, place.against[:1]
+
+
+def severity(place: Place) -> tuple[float, float]:
+    """Return a key that is larger for worse places; known noise counts before unknown."""
+    return (np.inf if not np.isfinite(place.error) else -1.0 if place.ratio is None else place.ratio), place.error
+
+
+def channel_places(
+    residual: Residual, phases: Sequence[Phase], partners: Partners | None, demonstration: str
+) -> Iterator[Place]:
+    """Yield the places of one channel."""
+    floor = residual.noise or QUIET * residual.extent
+    if not floor or not len(residual.time):
+        return
+    if (lost := np.isinf(residual.error)).any():
+        first, last = float(residual.time[lost.argmax()]), float(residual.time[-1])
+        rows = np.flatnonzero(lost)
+        yield described(residual, rows, first, first, phases, partners, demonstration, last)
+    level = smoothed(residual.time, np.where(lost, np.nan, residual.error) / floor)
+    above = level >= LEAST
+    taken = np.zeros(len(level), dtype=bool)
+    for _ in range(EACH):
+        left = np.where(taken | ~above, -np.inf, level)
+        if not np.isfinite(peak := left.max()):
+            return
+        top = int(left.argmax())
+        start, end = run_at(above & ~taken & (level >= peak / 2), top)
+        onset = run_at(above, top)[0]
+        taken[slice(*downhill(level, start, end))] = True
+        if end - start < FEWEST:
+            continue
+        rows, (at, since) = np.arange(start, end), residual.time[[top, onset]].tolist()
+        place = described(residual, rows, at, since, phases, partners, demonstration)
+        growth = np.diff(np.maximum.accumulate(level[onset : top + 1]), prepend=0.0)
+        yield replace(place, arose=main_phase(residual.time[onset : top + 1], growth, phases))
+
+
+def smoothed(time: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Return the root mean square of `ratio` (T,) over centred windows; 0 where nothing was measured.
+
+    Args:
+        time: Times [s], shape (T,).
+        ratio: Error over noise [-], NaN where nothing was measured.
+    """
+    period = float(np.median(np.diff(time))) if len(time) > 1 else SMOOTHING
+    width = min(max(FEWEST, round(SMOOTHING / period)), len(time))
+    valid = np.isfinite(ratio)
+    kernel = np.ones(width)
+    square = np.convolve(np.where(valid, ratio, 0) ** 2, kernel, mode="same")
+    count = np.convolve(valid, kernel, mode="same")
+    return np.sqrt(square / np.maximum(count, 1))[: len(time)]
+
+
+def run_at(mask: np.ndarray, row: int) -> tuple[int, int]:
+    """Return first and one-past-last row of the run of True in `mask` (T,) that holds `row`."""
+    spans = runs(mask)
+    start, end = spans[(spans[:, 0] <= row) & (row < spans[:, 1])][0]
+    return int(start), int(end)
+
+
+def downhill(level: np.ndarray, start: int, end: int) -> tuple[int, int]:
+    """Return a span of `level` (T,) widened to where it stops falling, so that its shoulders are no places."""
+    least = level[start]
+    while start > 0 and level[start - 1] < 1.1 * least + SLACK:
+        start -= 1
+        least = min(least, level[start])
+    least = level[end - 1]
+    while end < len(level) and level[end] < 1.1 * least + SLACK:
+        least = min(least, level[end])
+        end += 1
+    return start, end
+
+
+def described(
+    residual: Residual,
+    rows: np.ndarray,
+    peak: float,
+    onset: float,
+    phases: Sequence[Phase],
+    partners: Partners | None,
+    demonstration: str,
+    end: float | None = None,
+) -> Place:
+    """Return the place at some rows of a residual."""
+    start, end = float(residual.time[rows[0]]), float(residual.time[rows[-1]]) if end is None else end
+    error = residual.error[rows]
+    rms = float(np.sqrt(np.nanmean(error**2)))
+    text, vector = direction(residual, rows)
+    touching = None if partners is None or residual.body is None else partners.of(residual.body, start, end)
+    return Place(
+        demonstration=demonstration,
+        channels=(residual.channel,),
+        body=residual.body,
+        phase=main_phase(residual.time[rows], np.nan_to_num(error, posinf=1.0), phases),
+        start=start,
+        end=end,
+        peak=peak,
+        onset=onset,
+        error=rms,
+        unit=residual.unit,
+        ratio=rms / residual.noise if residual.noise else None,
+        against=touching.names if touching else (),
+        point=touching.point if touching else None,
+        direction=text if np.isfinite(rms) else "",
+        vector=vector if np.isfinite(rms) else (),
+    )
+
+
+def main_phase(time: np.ndarray, error: np.ndarray, phases: Sequence[Phase]) -> str | None:
+    """Return the name of the phase in which errors (n,) at `time` (n,) weigh most."""
+    weight: dict[str, float] = {}
+    for phase in phases:
+        within = (time >= phase.start) & (time < phase.end)
+        weight[phase.name] = weight.get(phase.name, 0.0) + float(error[within].sum())
+    return max(weight, key=lambda name: weight[name]) if weight else None
+
+
+def direction(residual: Residual, rows: np.ndarray) -> tuple[str, tuple[float, ...]]:
+    """Return where the measurement lies as seen from the model, in words and as a vector of length 0 to 1."""
+    value = residual.value[rows]
+    value = value[np.asarray(np.isfinite(value).all(axis=1))]
+    if not len(value) or not (size := float(np.sqrt((value**2).sum(axis=1).mean()))):
+        return "", ()
+    mean = value.mean(axis=0) / size
+    vector = tuple(float(v) for v in mean)
+    steady = float(np.linalg.norm(mean)) >= ONE_WAY
+    if len(mean) == 1:
+        side = "above" if mean[0] > 0 else "below"
+        return f"measured {side} the model" if steady else "to and fro", vector
+    if len(mean) != 3:
+        return "", vector
+    axes = named_axes(mean, signed=True) if steady else named_axes(np.sqrt((value**2).mean(axis=0)), signed=False)
+    turning = residual.unit.startswith("rad") or residual.unit == "N m"
+    along = f"{'about' if turning else 'along'} {'its own ' if residual.local else ''}{axes}"
+    return along if steady else f"to and fro {along}", vector
+
+
+def named_axes(vector: np.ndarray, *, signed: bool) -> str:
+    """Return the one or two axes along which a vector (3,) mostly points."""
+    order = np.argsort(-np.abs(vector))
+    count = 1 if abs(vector[order[0]]) >= ONE_AXIS * np.linalg.norm(vector) else 2
+    names = [f"{('-' if vector[k] < 0 else '+') if signed else ''}{AXES[k]}" for k in order[:count]]
+    return " and ".join(names)
+
+
+def merged(places: Sequence[Place]) -> list[Place]:
+    """Return `places`, the worst first, with those of one body that overlap by half of the shorter made one."""
+    kept: list[Place] = []
+    for place in places:
+        for i, other in enumerate(kept):
+            shared = min(place.end, other.end) - max(place.start, other.start)
+            half = 0.5 * min(place.end - place.start, other.end - other.start)
+            if place.body is not None and place.body == other.body and shared >= half:
+                if place.channels[0] not in other.channels:
+                    kept[i] = replace(other, channels=(*other.channels, *place.channels))
+                break
+        else:
+            kept.append(place)
+    return kept

@@ -1,0 +1,173 @@
+"""The unexplained force and torque on a free body: what they depend on, and where they act in each phase."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from concent_warp.comparison.phases import FREE, REST
+from concent_warp.diagnosis.forces.contact_state import BETWEEN, BodyWindows, body_windows
+from concent_warp.diagnosis.forces.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
+from concent_warp.diagnosis.forces.features import body_force_features, body_torque_features
+from concent_warp.diagnosis.forces.force_data import BodyForce, ForceSeries, PhaseForce
+from concent_warp.diagnosis.forces.point_of_action import force_place
+from concent_warp.diagnosis.forces.wrench import Wrenches, joined, steady_force, wrenches
+
+if TYPE_CHECKING:
+    from concent_warp.diagnosis.forces.window_forces import Windows
+    from concent_warp.estimation.measured_motion import BodyMotion, Motion
+    from concent_warp.model import Model
+
+FEWEST_WINDOWS = 3
+"""Windows that make a phase."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A body in one demonstration; K windows, n of them told from."""
+
+    motion: Motion
+    windows: Windows
+    body: BodyMotion
+    state: BodyWindows
+    valid: np.ndarray
+    """Windows that tell something, shape (K,) bool."""
+    seen: Wrenches
+    """In these, n of them."""
+
+    @property
+    def phase(self) -> np.ndarray:
+        """Phases of the valid windows, shape (n,)."""
+        return self.state.phase[self.valid]
+
+
+def body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows]) -> list[Part]:
+    """Return a body in each demonstration in which it was measured."""
+    found = [
+        (motion, window, body, body_windows(motion, window, body))
+        for motion, window in zip(motions, windows, strict=True)
+        for body in motion.bodies
+        if body.name == name
+    ]
+    turned = all(body.orientation is not None for _, _, body, _ in found)
+    counts = [len(window.start) for _, window, _, _ in found]
+    block = np.split(blocks_of(counts), np.cumsum(counts)[:-1])
+    parts = []
+    for (motion, window, body, state), labels in zip(found, block, strict=True):
+        dofs = slice(body.dof, body.dof + 6)
+        force, covariance = window.force[:, dofs], window.covariance[:, dofs, dofs]
+        # Where it comes to rest in the model at another time than it did, friction acts in one of the two alone.
+        valid = np.isfinite(force[:, : 6 if turned else 3]).all(axis=1) & np.asarray(state.phase != BETWEEN)
+        seen = wrenches(force, covariance, state, labels, valid, turned=turned)
+        parts.append(Part(motion, window, body, state, valid, seen))
+    return parts
+
+
+def body_force(model: Model, name: str, motions: Sequence[Motion], windows: Sequence[Windows], seed: int) -> BodyForce:
+    """Return the unexplained force on a free body."""
+    parts = body_parts(name, motions, windows)
+    everything = joined([part.seen for part in parts])
+    forces, torques = [], []
+    for part in parts:
+        acceleration = part.motion.acceleration(part.windows.time)[:, part.body.dof : part.body.dof + 3]
+        along, about = body_force_features(part.state, acceleration, name), body_torque_features(part.state, name)
+        forces.append({n: f[part.valid] for n, f in along.items()})
+        torques.append({n: f[part.valid] for n, f in about.items()})
+    touches = any(touch for part in parts for touch in part.state.touches)
+    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
+    spread = np.sqrt(np.einsum("nii->n", everything.covariance[:, 3:, 3:]) / 3) * everything.size
+    force, torque = (
+        dependences(values, std, projected(sight, tables), everything.block, seed, least)
+        for values, std, sight, tables in (
+            (everything.force, everything.std, everything.free[:, :3, :3], forces),
+            (everything.torque, spread, everything.free[:, 3:, 3:], torques),
+        )
+    )
+    phases = body_phases(model, parts, seed)
+    values = [force.p, torque.p, *(phase.p for phase in phases)]
+    expected = np.einsum("nii->n", everything.covariance[:, :3, :3])
+    square = (everything.force**2).sum(axis=1)
+    some = len(square) > 0
+    return BodyForce(
+        body=name,
+        rms=float(np.sqrt(square.mean())) if some else np.nan,
+        noise=float(np.sqrt(expected.mean())) if some else np.nan,
+        ratio=float(np.sqrt(np.mean(square / np.maximum(expected, 1e-300)))) if some else np.nan,
+        p=min(1.0, min(values) * len(values)),
+        significant=False,
+        force=force,
+        torque=torque,
+        phases=tuple(sorted(phases, key=lambda phase: phase.p)),
+        series=tuple(
+            ForceSeries(part.windows.demonstration, part.windows.time[part.valid], part.seen.force, part.seen.std)
+            for part in parts
+        ),
+    )
+
+
+def projected(sight: np.ndarray, tables: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return features (n, 3) of several demonstrations together, as far as contacts leave them to be seen."""
+    together = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+    return {name: np.einsum("nij,nj->ni", sight, value) for name, value in together.items()}
+
+
+def body_phases(model: Model, parts: Sequence[Part], seed: int) -> list[PhaseForce]:
+    """Return the steady force and its place in each phase but rest, which shows no forces."""
+    names = {str(phase) for part in parts for phase in part.phase} - {REST}
+    found = [body_phase(model, parts, phase, seed) for phase in sorted(names)]
+    return [phase for phase in found if phase is not None]
+
+
+def body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> PhaseForce | None:
+    """Return the steady force and its place in one phase; None where there is too little of it, or all is hidden."""
+    chosen = [np.asarray(part.phase == phase) for part in parts]
+    counts = [int(c.sum()) for c in chosen]
+    w = joined([part.seen.only(c) for part, c in zip(parts, chosen, strict=True)])
+    if sum(counts) < FEWEST_WINDOWS or not (w.std > 0).all():
+        return None
+    w = replace(w, block=blocks_of(counts))
+    steady = steady_force(w, seed)
+    if steady is None:
+        return None
+    body, spans, touches = parts[0].body, [], []
+    for part, rows in zip(parts, chosen, strict=True):
+        spans += spans_of(part.windows, np.asarray(part.state.phase == phase) & part.valid)
+        touches += [part.state.touches[k] for k in np.flatnonzero(part.valid)[rows]]
+    stride = parts[0].windows.length / 2
+    return PhaseForce(
+        phase=phase,
+        spans=tuple(spans),
+        frame=body.name if steady.frame == "body" else steady.frame,
+        vector=steady.vector,
+        std=steady.std,
+        share=steady.share,
+        impulse=w.force.sum(axis=0) * stride / max(len(spans), 1),
+        torque=np.einsum("nji,nj->i", w.rotation, w.torque) / len(w.torque),
+        p=steady.p,
+        test=steady.test,
+        significant=False,
+        place=force_place(model, parts[0].motion.compiled, body.body, w, steady, touches),
+        arrow=np.einsum("nji,nj->i", w.rotation, steady.steady) / len(w.force),
+    )
+
+
+def spans_of(windows: Windows, chosen: np.ndarray) -> list[tuple[str, float, float]]:
+    """Return demonstration, start and end [s] of each run of `chosen` windows, shape (K,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int))).reshape(-1, 2)
+    ends = windows.start + windows.length
+    return [(windows.demonstration, float(windows.start[a]), float(ends[b - 1])) for a, b in edges]
+
+
+def judged(found: BodyForce, accepted: bool, beyond_noise: bool) -> BodyForce:
+    """Return a body with what is significant told; places of forces that are not are dropped."""
+    bound = LEVEL / max(len(found.phases), 1)
+    phases = []
+    for phase in found.phases:
+        least = LEAST_SHARE if phase.phase == FREE else LEAST_SHARE_IN_CONTACT
+        ok = accepted and phase.p <= bound and phase.share >= least
+        phases.append(replace(phase, significant=ok, place=phase.place if ok else None))
+    shown = any(phase.significant for phase in phases) or bool(found.force.patterns or found.torque.patterns)
+    return replace(found, significant=beyond_noise or (accepted and shown), phases=tuple(phases))

@@ -1,0 +1,142 @@
+"""Locate what a model lacks: unexplained forces by degree of freedom, and the places on objects where they act."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from concent_warp.diagnosis.forces.body_forces import body_force, judged
+from concent_warp.diagnosis.forces.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
+from concent_warp.diagnosis.forces.features import CONTACT, joint_features
+from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
+from concent_warp.diagnosis.forces.result import DETECTABLE, Location
+from concent_warp.diagnosis.forces.window_forces import WindowCfg, Windows, window_forces, window_length
+from concent_warp.estimation.measured_motion import Motion, measured_motion
+from concent_warp.simulate.select import EngineName, make_engine
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Recording
+
+SELDOM = 0.05
+"""Share of the time below which a joint's contact is neglected."""
+BEYOND_NOISE = 1.7
+"""Forces this many times what noise leaves are there, whatever they depend on; without any, up to 1.4 was seen where
+contacts change within windows."""
+
+
+def locate(
+    model: Model,
+    recording: Recording,
+    engine: EngineName = "auto",
+    *,
+    cfg: WindowCfg | None = None,
+    demonstrations: Sequence[str] | None = None,
+) -> Location:
+    """Find where a model lacks forces.
+
+    Args:
+        model: The model.
+        recording: What was commanded and measured.
+        engine: Which engine simulates, see `make_engine`.
+        cfg: How demonstrations are cut into windows.
+        demonstrations: Names of those to use; None takes all.
+
+    Raises:
+        RecordingError: There is no such demonstration, or nothing in it that a force could be told from.
+        EngineError: The model cannot be simulated.
+    """
+    cfg = cfg or WindowCfg()
+    simulator = make_engine(engine, model)
+    chosen = recording.only(demonstrations or ()).demonstrations
+    motions = [measured_motion(model, d, simulator) for d in chosen]
+    if cfg.length is None:
+        # One length for all, so that their forces can be taken together.
+        cfg = replace(cfg, length=max(map(window_length, motions)))
+    windows = [window_forces(d.name, simulator, m, cfg) for d, m in zip(chosen, motions, strict=True)]
+    features = [joint_features(w, m) for w, m in zip(windows, motions, strict=True)]
+    joints = [joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in all_joints(motions)]
+    bodies = [body_force(model, name, motions, windows, cfg.seed) for name in all_bodies(motions)]
+    accepted = holm([f.p for f in joints] + [f.p for f in bodies])
+    joints = [
+        replace(f, significant=f.ratio > BEYOND_NOISE or (ok and bool(f.dependences.patterns)))
+        for f, ok in zip(joints, accepted[: len(joints)], strict=True)
+    ]
+    bodies = [judged(f, ok, f.ratio > BEYOND_NOISE) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
+    joints.sort(key=lambda f: (not f.significant, -f.ratio))
+    bodies.sort(key=lambda f: (not f.significant, -f.ratio))
+    return Location(windows[0].length, tuple(joints), tuple(bodies))
+
+
+def all_joints(motions: Sequence[Motion]) -> list[tuple[str, str, int]]:
+    """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
+    return sorted(
+        {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
+    )
+
+
+def all_bodies(motions: Sequence[Motion]) -> list[str]:
+    """Return the names of the free bodies measured in any demonstration."""
+    return list(dict.fromkeys(b.name for m in motions for b in m.bodies))
+
+
+def joint_force(
+    name: str,
+    unit: str,
+    dof: int,
+    windows: Sequence[Windows],
+    features: Sequence[Mapping[str, Mapping[str, np.ndarray]]],
+    cfg: WindowCfg,
+) -> JointForce:
+    """Return the unexplained force of a joint, its features in each demonstration given."""
+    parts = [(w, f[name]) for w, f in zip(windows, features, strict=True) if name in f]
+    force = np.concatenate([w.force[:, dof] for w, _ in parts])
+    std = np.concatenate([w.std[:, dof] for w, _ in parts])
+    names = [n for n in parts[0][1] if all(n in f for _, f in parts)]
+    table = {n: np.concatenate([f[n] for _, f in parts]) for n in names}
+    block = blocks_of([len(w.start) for w, _ in parts])
+    touches = float(np.mean(table.get(CONTACT, 0.0))) > SELDOM
+    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
+    found = dependences(force[:, None], std, table, block, cfg.seed, least)
+    valid = np.isfinite(force) & (std > 0)
+    return JointForce(
+        joint=name,
+        unit=unit,
+        rms=root_mean_square(force[valid]),
+        noise=root_mean_square(std[valid]),
+        ratio=root_mean_square(force[valid] / std[valid]),
+        detectable=detectable(std[valid], least),
+        p=found.p,
+        significant=False,
+        dependences=found,
+        series=tuple(ForceSeries(w.demonstration, w.time, w.force[:, dof], w.std[:, dof]) for w, _ in parts),
+    )
+
+
+def detectable(std: np.ndarray, share: float) -> float:
+    """Return the smallest steady force that would be seen in windows with errors `std` (n,); NaN without any.
+
+    It stands out from their mean's error, and makes a `share` of all forces.
+    """
+    if not len(std):
+        return np.nan
+    precision = float((1 / std**2).sum())
+    return max(DETECTABLE, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
+
+
+def holm(p: Sequence[float]) -> list[bool]:
+    """Return which hypotheses are rejected at `LEVEL` over all of them (Holm, 1979)."""
+    accepted = [False] * len(p)
+    for rank, i in enumerate(np.argsort(p)):
+        if p[i] > LEVEL / (len(p) - rank):
+            break
+        accepted[i] = True
+    return accepted
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """Return the RMS of values (n,); NaN of none."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan

@@ -1,0 +1,112 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis import diagnose as procedure
+from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint, load, save
+from concent_warp.diagnosis.diagnose import DiagnosisCfg
+from concent_warp.diagnosis.search.steps import Screened
+from concent_warp.effects.registry import effect_class
+from concent_warp.errors import ConcentError
+from tests.diagnosis.same_results import assert_same
+from tests.scenes.swinging import drawing, swung
+
+CFG = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return swung(seconds=1.0)
+
+
+@pytest.fixture(scope="module")
+def done(recording, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoint") / "new"
+    return folder, diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+
+
+def counted(monkeypatch):
+    """Count the pieces of work that are done and not read."""
+    tasks = []
+    run_all = procedure.run_all
+
+    def watched(work, given, jobs):
+        tasks.extend(work.__name__ for _ in given)
+        return run_all(work, given, jobs)
+
+    monkeypatch.setattr(procedure, "run_all", watched)
+    return tasks
+
+
+def test_a_second_run_reads_every_piece_and_ends_the_same(recording, done, monkeypatch):
+    folder, first = done
+    tasks = counted(monkeypatch)
+    again = diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+    assert tasks == []
+    assert_same(again.to_json(), first.to_json())
+    assert [a.values for a in again.model.effects] == [a.values for a in first.model.effects]
+
+
+def test_an_interrupted_run_goes_on_to_the_same_end(recording, done, tmp_path, monkeypatch):
+    class Stop(Exception):  # noqa: N818
+        pass
+
+    def stop(_, text):
+        if text.startswith("fitting, 1"):
+            raise Stop
+
+    with pytest.raises(Stop):
+        diagnose_with_checkpoint(drawing(recording), recording, tmp_path, CFG, stop)
+    assert len(list(tmp_path.glob("*.npz"))) >= 3
+    tasks = counted(monkeypatch)
+    again = diagnose_with_checkpoint(drawing(recording), recording, tmp_path, CFG)
+    assert "screen" not in tasks
+    assert "fit_candidate" not in tasks
+    assert_same(again.to_json(), done[1].to_json())
+
+
+def test_damaged_pieces_are_done_again(recording, done, monkeypatch):
+    folder, first = done
+    pieces = sorted(folder.glob("*.npz"))
+    pieces[0].write_bytes(b"nothing")
+    pieces[1].write_bytes(pieces[1].read_bytes()[:200])
+    tasks = counted(monkeypatch)
+    again = diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+    assert len(tasks) == 2
+    assert_same(again.to_json(), first.to_json())
+
+
+@pytest.mark.parametrize("other", ["seed", "data", "model"])
+def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monkeypatch):
+    folder, _ = done
+    cfg, model, used = CFG, drawing(recording), recording
+    if other == "seed":
+        cfg = replace(CFG, seed=1)
+    elif other == "data":
+        used = swung(seconds=1.0, seed=1)
+    else:
+        model = model.add(effect_class("joint_friction")("hinge"))
+    before = len(list(folder.glob("*.npz")))
+    tasks = counted(monkeypatch)
+    diagnose_with_checkpoint(model, used, folder, cfg)
+    assert tasks
+    assert len(list(folder.glob("*.npz"))) == before + len(tasks)
+
+
+def test_what_is_kept_comes_back_as_it_was(recording, tmp_path):
+    effect = effect_class("joint_damping")("hinge")
+    kept = Screened(effect, 0.5, float("-inf"), np.array([1.0, np.inf]), (), 2.5)
+    save(tmp_path / "a.npz", kept)
+    found = load(tmp_path / "a.npz", drawing(recording))
+    assert (found.effect.name, found.effect.target) == ("joint_damping", ("hinge",))
+    assert (found.gain, found.scanned, found.pieces, found.simulated) == (0.5, float("-inf"), (), 2.5)
+    assert found.start.tolist() == [1.0, np.inf]
+    assert load(tmp_path / "b.npz", drawing(recording)) is None
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(recording, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConcentError, match="cannot be made"):
+        diagnose_with_checkpoint(drawing(recording), recording, tmp_path / "file" / "folder", CFG)

@@ -1,0 +1,62 @@
+"""The JSON object of a diagnosis is documented key by key."""
+
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.result import VERDICTS
+from tests.scenes.swinging import drawing, swung
+
+PAGE = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text()
+
+
+def keys(heading):
+    """First cells of the table that follows a line of the page."""
+    rest = PAGE[PAGE.index(heading) :]
+    table = re.search(r"\| key \| \|\n\|---\|---\|\n((?:\|.*\n)+)", rest)
+    assert table is not None
+    return re.findall(r"^\| `(\w+)` \|", table[1], re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def found():
+    recording = swung(seconds=1.0)
+    cfg = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1)
+    return diagnose(drawing(recording), recording, cfg)
+
+
+def test_every_key_is_documented_and_nothing_else(found):
+    assert keys("## JSON") == list(found.to_json())
+    rejected = replace(found.effects[0], accepted=False, reason="no better than chance")
+    assert keys("Each of `effects`:") == list(rejected.to_json())
+
+
+def test_keys_of_lists_are_documented(found):
+    document = found.to_json()
+    assert document["where"]
+    assert document["detectable"]
+    for name in ("where", "detectable"):
+        sentence = PAGE[PAGE.index(f"Each of `{name}` has") :].split(".\n")[0]
+        named = re.findall(r"`(\w+)`", sentence)
+        assert set(document[name][0]) <= set(named)
+    parameter = document["effects"][0]["parameters"][0]
+    row = next(line for line in PAGE.splitlines() if line.startswith("| `parameters` |"))
+    assert set(re.findall(r"`(\w+)`", row)) == {"parameters", *parameter}
+
+
+def test_every_verdict_is_explained():
+    assert set(re.findall(r"^\| `(\w+)` \| ", PAGE.split("## Procedure")[0], re.MULTILINE)) == set(VERDICTS)
+
+
+def test_figures_of_the_procedure_are_those_of_the_settings():
+    cfg = DiagnosisCfg()
+    assert f"found on {cfg.draws} data sets" in PAGE
+    assert f"p ≤ {cfg.level:g} that takes away at least {100 * cfg.least_gain:.0f} %" in PAGE
+    assert cfg.additions == 3
+    assert "up to three times (`--additions`)" in PAGE
+    assert {f.name for f in fields(cfg)} >= {"engine", "jobs", "seed", "window", "effects"}
+    assert np.isfinite(cfg.adequate)

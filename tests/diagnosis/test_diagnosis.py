@@ -1,0 +1,109 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, joined, number
+from concent_warp.fit.effects.intervals import FittedParameter
+from concent_warp.model import Model
+from concent_warp.scene.scene import Scene
+from tests.scenes.swinging import swing_scene
+
+FRICTION = FittedParameter("torque[hinge]", 0.03, 0.029, 0.031, "N m", 0.0)
+LIMIT = FittedParameter("limit", 2.0, 1.9, np.inf, "N m", np.inf)
+
+
+def finding(name, gain, *, accepted=True, step=0, reason="", parameters=(FRICTION,)):
+    return Finding(
+        name, ("hinge",), "joints", parameters, gain, gain - 0.1, gain + 0.1, 0.01, 0.002, accepted, step,
+        (("angle", 0.9),), reason,
+    )  # fmt: skip
+
+
+def diagnosis(**changes):
+    model = Model(Scene(swing_scene()))
+    base = Diagnosis(
+        "effect",
+        (finding("joint_friction", 0.8), finding("joint_damping", 0.3, accepted=False, reason="no better than chance")),
+        (("joint_friction",),),
+        (),
+        0.0,
+        (4.0, 1.0),
+        (Detectable("joint_friction", "torque[hinge]", 0.002, "N m"),),
+        None,
+        (),
+        (model, model),
+    )
+    return replace(base, **changes)
+
+
+def test_an_effect_is_named_with_value_interval_gain_and_chance():
+    (sentence,) = diagnosis().sentences()
+    assert sentence == (
+        "Missing: joint_friction (torque[hinge] 0.03 [0.029, 0.031] N m). "
+        "Held-out error falls by 80 % [70, 90], p 0.01."
+    )
+
+
+def test_effects_that_cannot_be_told_apart_are_named_together():
+    found = diagnosis(verdict="group", groups=(("joint_friction", "joint_damping", "backlash"),))
+    assert found.sentences()[1] == "The data cannot tell it from joint_damping or backlash."
+
+
+def test_a_second_effect_follows_the_first():
+    both = (finding("joint_friction", 0.8), finding("mass", 0.2, step=1))
+    found = diagnosis(effects=both, groups=(("joint_friction",), ("mass",)))
+    assert [s.split(" (")[0] for s in found.sentences()] == ["Missing: joint_friction", "Then missing: mass"]
+    assert [f.name for f in found.accepted] == ["joint_friction", "mass"]
+
+
+def test_nothing_found_comes_with_what_would_have_been_seen():
+    said = diagnosis(verdict="none_needed", effects=(), ratio=(1.02,)).sentences()
+    assert said[0] == "No discrepancy detected: residuals are 1.02 x noise."
+    assert "joint_friction 0.002 N m" in said[1]
+
+
+def test_what_no_effect_explains_is_said_with_its_share():
+    said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment="swing faster").sentences()
+    assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
+    assert said[-1] == "Next: swing faster"
+
+
+def test_the_headline_tells_of_effects_beside_what_none_explains():
+    assert diagnosis().headline == VERDICTS["effect"]
+    assert diagnosis(verdict="none_of_these", effects=()).headline == VERDICTS["none_of_these"]
+    partly = diagnosis(verdict="none_of_these").headline
+    assert partly == "the library explains a part; something is missing that no effect in it explains"
+
+
+def test_doubts_about_the_data_come_first():
+    assert diagnosis(issues=("a gap of 1 s.",)).sentences()[0] == "a gap of 1 s."
+
+
+def test_json_holds_plain_types_and_no_infinity():
+    found = diagnosis(effects=(finding("actuator_saturation", 0.5, parameters=(LIMIT,)),), versions={"concent": "1"})
+    document = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    (parameter,) = document["effects"][0]["parameters"]
+    assert parameter == {"name": "limit", "value": 2.0, "interval": [1.9, None], "unit": "N m", "null": None}
+    assert document["effects"][0]["gain"] == {"value": 0.5, "interval": pytest.approx([0.4, 0.6])}
+    assert document["effects"][0]["removes"] == [{"channel": "angle", "share": 0.9}]
+    assert document["versions"] == {"concent": "1"}
+    assert "reason" not in document["effects"][0]
+
+
+def test_every_verdict_has_words():
+    assert set(VERDICTS) == {"effect", "group", "none_needed", "none_of_these"}
+
+
+def test_an_interval_that_holds_the_null_value_does_not_exclude_it():
+    assert FRICTION.excludes_null
+    assert not replace(FRICTION, low=-0.001).excludes_null
+    assert not LIMIT.excludes_null
+    assert replace(LIMIT, high=2.1).excludes_null
+
+
+def test_numbers_and_lists_of_names():
+    assert number(np.float64(1.5)) == 1.5
+    assert number(np.inf) is None
+    assert [joined(["a"]), joined(["a", "b"]), joined(["a", "b", "c"])] == ["a", "a or b", "a, b or c"]

@@ -1,0 +1,96 @@
+import time
+
+import mujoco
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis import failures as module
+from concent_warp.diagnosis.failures import located, where, with_starts
+from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.errors import RecordingError
+from concent_warp.fit.effects.observe import observe
+from concent_warp.model import Model
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.scene import Scene
+
+XML = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody><body name="cart">
+    <joint name="rail" type="slide" axis="1 0 0" damping="{damping}"/><geom size=".1" mass="1"/>
+  </body></worldbody>
+  <actuator><position name="drive" joint="rail" kp="40" dampratio="0.5"/></actuator>
+  <sensor><jointpos name="rail_position" joint="rail"/></sensor>
+</mujoco>
+"""
+TIME = np.arange(0, 2, 0.01)
+NOISE = 1e-4
+
+
+def recorded(damping: float, start: float = 0.0) -> Recording:
+    """What a cart with some damping does on a square wave."""
+    m = mujoco.MjModel.from_xml_string(XML.format(damping=damping))
+    d = mujoco.MjData(m)
+    d.qpos[0] = start
+    command = 0.1 * np.sign(np.sin(2 * np.pi * TIME))
+    position = np.zeros(len(TIME))
+    for i in range(len(TIME)):
+        d.ctrl[0], position[i] = command[i], d.qpos[0]
+        mujoco.mj_step(m, d, nstep=2)
+    read = position + np.random.default_rng(0).normal(0, NOISE, len(TIME))
+    channels = {"rail_position": Channel(TIME, read[:, None], noise_std=NOISE)}
+    demonstration = Demonstration(
+        "swing", qpos=np.zeros(1), qvel=np.zeros(1), action={"drive": Channel(TIME, command)}, measured=channels
+    )
+    return Recording(XML.format(damping=0.5), (demonstration,))
+
+
+def model() -> Model:
+    return Model(Scene(XML.format(damping=0.5)))
+
+
+def test_places_of_a_wrong_model_name_channel_time_and_size():
+    found = where(model(), recorded(3.0))
+    assert 1 <= len(found) <= 5
+    worst = found[0]
+    assert (worst["channel"], worst["body"]) == ("rail_position", "cart")
+    assert 0 <= worst["start"] < worst["end"] <= 2
+    assert worst["ratio"] > 20
+    assert "x noise" in worst["sentence"]
+
+
+def test_right_model_has_no_place():
+    assert where(model(), recorded(0.5)) == []
+
+
+def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "located", lambda *args: locate(*args[:3]))
+    found = where(model(), recorded(3.0), seconds=60)
+    assert found[0]["start"] is not None
+    assert found[-1]["channel"] == "rail"
+    assert found[-1]["start"] is None
+    assert "opposes" in found[-1]["sentence"]
+
+
+def test_search_for_forces_that_takes_too_long_is_given_up():
+    before = time.monotonic()
+    assert located(model(), recorded(3.0), "mujoco", seconds=0.01) is None
+    assert time.monotonic() - before < 5
+
+
+def test_recording_that_cannot_be_compared_has_no_places(monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_, **__):
+        raise RecordingError("nothing was measured")
+
+    monkeypatch.setattr(module, "compare", refuse)
+    assert where(model(), recorded(3.0)) == []
+
+
+def test_replay_starts_where_the_window_was_fitted_to_start():
+    started_off = recorded(0.5, start=0.004)
+    windows = observe(model(), started_off)
+    offset = np.array([0.004, 0.0]) / windows[0].spread
+    moved = with_starts(model(), started_off, windows, [offset] * len(windows))
+    np.testing.assert_allclose(np.asarray(moved.demonstrations[0].qpos, dtype=float), [0.004])
+    assert where(model(), started_off) != []
+    assert where(model(), started_off, windows=windows, offsets=[offset] * len(windows)) == []
