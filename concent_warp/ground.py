@@ -22,9 +22,10 @@ from concent_warp.events.extract import extract
 from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid
 from concent_warp.events.schedule import plot_schedule
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.files import write_text
 from concent_warp.fit.fit_geometry import FitCfg, Method, fit_geometry
 from concent_warp.fit.geometry.search import FitResult, Progress
-from concent_warp.model import Model, write_text
+from concent_warp.model import Model
 from concent_warp.report.report import write_report
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg

@@ -17,6 +17,7 @@ import numpy as np
 from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
 from concent_warp.effects.table import checked_values, effects_table, read_effects
 from concent_warp.errors import ModelError
+from concent_warp.files import write_text
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
@@ -179,10 +180,3 @@ def contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameter
         else:
             values[name] = value
     return ContactParameters(**values)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file in one piece or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    partial.replace(path)

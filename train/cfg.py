@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from concent_warp.errors import ConcentError
 from concent_warp.events.decode import decode
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 
 Range = tuple[float, float]
 ALL = "all"

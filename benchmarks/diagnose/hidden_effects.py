@@ -30,7 +30,8 @@ from benchmarks.pages import machine, machine_line
 from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
 from concent_warp.diagnosis.diagnose import DiagnosisCfg
 from concent_warp.errors import ConcentError
-from concent_warp.model import Model, write_text
+from concent_warp.files import write_text
+from concent_warp.model import Model
 
 OUT = Path("runs/hidden_effects")
 SHIFT = 4000

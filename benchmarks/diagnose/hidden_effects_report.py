@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from benchmarks.diagnose.hidden_effects_data import BEST
 from benchmarks.pages import FOLDER, data_path, read_data, table
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 
 NAME = "hidden_effects"
 FLOOR = 1.3

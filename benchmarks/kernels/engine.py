@@ -28,7 +28,8 @@ import numpy as np
 import warp as wp
 
 from benchmarks.pages import FOLDER, table, write_page
-from concent_warp.model import Model, write_text
+from concent_warp.files import write_text
+from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg

@@ -30,7 +30,7 @@ import tyro
 
 from benchmarks.pages import machine
 from benchmarks.train.cases import CASES, Case, material
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.metrics import CURVE
 from concent_warp.train.run import Run, train

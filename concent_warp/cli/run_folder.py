@@ -17,7 +17,7 @@ from typing import Any
 import concent_warp
 from concent_warp.cli.terminal import processes
 from concent_warp.errors import ConcentError
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 
 SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""

@@ -14,7 +14,7 @@ import concent_warp
 from concent_warp.comparison.bootstrap import RULE
 from concent_warp.comparison.result import Comparison, finite
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 from concent_warp.report.diagnosis import bullet_list, diagnosis_section
 from concent_warp.report.headline import cards, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data

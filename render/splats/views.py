@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.errors import RenderError
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 
 FILE = "transforms.json"
 SUFFIXES = (".png", ".jpg", ".jpeg")

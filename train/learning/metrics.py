@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 
 CURVE = "curve.jsonl"
 """File of the rounds in a run folder."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import ConcentError
-from concent_warp.model import write_text
+from concent_warp.files import write_text
 from concent_warp.train.cfg import TrainError
 from concent_warp.train.learning.ppo import CHECKPOINT, load_checkpoint
 from concent_warp.train.run import Run
