@@ -51,3 +51,7 @@ class EventsError(ConcentError):
 
 class RenderError(ConcentError):
     """Splats, images or settings with which nothing can be rendered."""
+
+
+class TrainError(ConcentError):
+    """A training that cannot be set up, gone on with or evaluated."""

@@ -14,7 +14,10 @@ HEAVY = {
     *("open3d", "trimesh", "kornia", "cv2", "matplotlib", "plotly"),
 }
 """Packages that are slow to import or that a host may lack."""
-ABOUT_WARP = ("concent_warp.kernels", "concent_warp.train", "concent_warp.render", "concent_warp.simulate.warp_")
+ABOUT_WARP = (
+    *("concent_warp.kernels", "concent_warp.train", "concent_warp.render", "concent_warp.simulate.warp_"),
+    *("concent_warp.deploy.evaluate", "concent_warp.deploy.play", "concent_warp.deploy.reality_world"),
+)
 """Modules that are all about such a package: whoever needs them imports them where needed."""
 ANSWER = 1.0
 """Within which a user expects an answer [s]."""

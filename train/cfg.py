@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from concent_warp.errors import ConcentError
+from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
 from concent_warp.files import write_text
 
@@ -19,10 +19,6 @@ SINGLE, CHAINED = 3.0, 12.0
 """Lengths of episodes of one stage and of a chain of them, where none is given [s]."""
 SETTINGS = "train.toml"
 """File of the resolved configuration in a run folder."""
-
-
-class TrainError(ConcentError):
-    """A training that cannot be set up, gone on with or evaluated."""
 
 
 @dataclass(frozen=True)

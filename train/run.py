@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from concent_warp.errors import TrainError
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
@@ -12,7 +13,7 @@ from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import SETTINGS, TrainCfg, TrainError, plain
+from concent_warp.train.cfg import SETTINGS, TrainCfg, plain
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import CHECKPOINT, Report, Round, Trainer
@@ -83,7 +84,7 @@ class Run:
         return draw_states(task, cfg, seed + 1_000_000, count=count)
 
 
-def train(
+def train_run(
     run: Run,
     folder: Path | None,
     *,

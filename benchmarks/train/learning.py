@@ -33,7 +33,7 @@ from benchmarks.train.cases import CASES, Case, material
 from concent_warp.files import write_text
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.metrics import CURVE
-from concent_warp.train.run import Run, train
+from concent_warp.train.run import Run, train_run
 
 RESULT, POLICY, LOG = "result.json", "policy", "log.txt"
 PACKED = 14 * 2**20
@@ -88,7 +88,8 @@ def train_one(args: Args, name: str, seed: int) -> None:
     from concent_warp.cli.terminal import quiet_warp
     from concent_warp.simulate.warp_engine import preferred_device
     from concent_warp.train.learning.ppo import CHECKPOINT, Round, load_checkpoint
-    from concent_warp.train.policy.pretrained import ship
+    from concent_warp.train.policy.load import Policy
+    from concent_warp.train.policy.ship import ship
 
     quiet_warp()
     case, folder, device = CASES[name], folder_of(args, name, seed), args.device or preferred_device()
@@ -104,7 +105,7 @@ def train_one(args: Args, name: str, seed: int) -> None:
     resume, left = checkpoint.is_file(), args.seconds
     if resume and left is not None:
         left = max(left - load_checkpoint(checkpoint)["seconds"], 0.0)
-    trainer, _ = train(run, folder, device=device, resume=resume, report=note, seconds=left)
+    trainer, _ = train_run(run, folder, device=device, resume=resume, report=note, seconds=left)
     learnt = time.monotonic() - begun
     result = {
         "case": name,
@@ -119,7 +120,7 @@ def train_one(args: Args, name: str, seed: int) -> None:
     }
     del trainer
     result["simulation"] = simulated(run, checkpoint, args, device)
-    ship(checkpoint, folder / POLICY, overwrite=True)
+    ship(Policy.load(checkpoint), folder / POLICY, overwrite=True)
     write_text(folder / RESULT, json.dumps(result, indent=1))
     print(f"{folder.name}: {result['simulation']['rate']:.2%} after {result['seconds']:.0f} s", flush=True)
 
@@ -169,16 +170,15 @@ def with_stage(run: Run, stage: str) -> Run:
 def simulated(run: Run, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
     """Return what the policy without exploration does in simulation, from states that training has not seen."""
     from concent_warp.train.environment.worlds import make_environment
-    from concent_warp.train.learning.ppo import Trainer, load_checkpoint
-    from concent_warp.train.policy.evaluate import evaluate
+    from concent_warp.train.policy.evaluate import run_episodes
+    from concent_warp.train.policy.load import Policy
 
     task = run.task()
     states = run.evaluation_states(task, args.episodes, run.cfg.seed)
     cfg = replace(run.cfg.environment, worlds=min(args.episodes, run.cfg.environment.worlds))
     environment = make_environment(task, cfg, states, device=device)
-    trainer = Trainer(environment, run.cfg)
-    trainer.algorithm.load(load_checkpoint(checkpoint, str(environment.device)), {"actor": True}, True)
-    found = evaluate(environment, trainer.policy(), states).to_json()
+    policy = replace(Policy.load(checkpoint), run=run)
+    found = run_episodes(environment, policy.act_in(environment), states).to_json()
     return {name: found[name] for name in ("episodes", "successes", "rate", "interval")}
 
 

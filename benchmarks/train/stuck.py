@@ -22,14 +22,14 @@ import tyro
 
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
 from benchmarks.train.learning import changed
-from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
+from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import ConcentError
 from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
-from concent_warp.train.policy.evaluate import Policy
+from concent_warp.train.policy.evaluate import PolicyFunction
+from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import InitialStates
 from concent_warp.train.run import Run
 
@@ -48,13 +48,14 @@ class Args:
     episodes: int = 64
     seed: int = 1
     """Of the initial states."""
-    force: float = 1.0
-    """Share of the force that policies may exert, as of `concent evaluate`."""
+    setpoint_lead_scale: float = 1.0
+    """How far commands may run ahead of the joints, as of `concent evaluate`."""
 
 
 def measure(folder: Path, args: Args) -> dict[str, Any]:
     """Return how a policy does in the three worlds, and from where it failed in the last of them."""
-    run = restrained(Run.load(folder), 1.0, args.force)
+    loaded = Policy.load(folder).scaled(setpoint_lead_scale=args.setpoint_lead_scale)
+    run = loaded.run
     task = run.task()
     states = run.evaluation_states(task, args.episodes, args.seed)
     trained = replace(
@@ -62,17 +63,15 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
     )
     own = replace(trained, cone="auto", stride=1)
 
-    def policy(environment: Environment) -> Policy:
+    def policy(environment: Environment) -> PolicyFunction:
         torch.manual_seed(args.seed)
-        trainer = Trainer(environment, run.cfg)
-        trainer.algorithm.load(load_checkpoint(folder / CHECKPOINT), {"actor": True}, True)
-        return trainer.policy()
+        return loaded.act_in(environment)
 
     def succeeded(cfg: EnvironmentCfg, starts: InitialStates) -> np.ndarray:
         environment = make_environment(task, cfg, starts, device="cpu")
         return outcomes(environment, policy(environment))[0]
 
-    real = real_environment(task, trained, states, Arguments(checkpoint=folder))
+    real = reality_environment(task, trained, states)
     success, failed = outcomes(real, policy(real))
     stuck = ~success & ~failed
     ended = {name: getattr(real.physics, name).numpy().copy() for name in ("qpos", "ctrl")}
@@ -81,7 +80,7 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
     cosine = (np.einsum("nij,nij->n", before[1], after[1]) - 1) / 2
     turned, slid = np.degrees(np.arccos(cosine.clip(-1, 1))), np.linalg.norm(after[0] - before[0], axis=1)
     found = {
-        "force": args.force,
+        "setpoint_lead_scale": args.setpoint_lead_scale,
         "turned": float(np.median(turned[stuck])) if stuck.any() else None,
         "slid": float(np.median(slid[stuck])) if stuck.any() else None,
         "episodes": args.episodes,
@@ -117,7 +116,7 @@ def held(environment: Environment, qpos: np.ndarray, mocap: np.ndarray) -> tuple
     return np.array(places), np.array(rotations)
 
 
-def outcomes(environment: Environment, policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+def outcomes(environment: Environment, policy: PolicyFunction) -> tuple[np.ndarray, np.ndarray]:
     """Run an episode in every world to the step before it would begin anew.
 
     Returns where object 1 is in place at that time, and where the episode had failed before, shape (N,) bool each.
@@ -176,7 +175,7 @@ def main() -> None:
     data = read_data(NAME)
     for folder in args.policies:
         name = "/".join(part for part in folder.parts[-4:] if part not in ("runs", "policy"))
-        name += f", force {args.force:g}" * (args.force < 1)
+        name += f", lead scale {args.setpoint_lead_scale:g}" * (args.setpoint_lead_scale < 1)
         try:
             data[name] = measure(folder, args)
         except ConcentError as error:

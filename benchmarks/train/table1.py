@@ -24,11 +24,12 @@ from benchmarks.measurements import Measurements, Row
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
 from benchmarks.train.cases import CASES, HIDDEN, Case, same_world
 from benchmarks.train.learning import POLICY, RESULT, changed
-from concent_warp.cli.commands.evaluate import Arguments, real_environment, restrained
 from concent_warp.cli.terminal import quiet_warp
+from concent_warp.deploy.cfg import RealityWorldCfg
+from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
-from concent_warp.train.policy.evaluate import evaluate, wilson
+from concent_warp.train.policy.evaluate import run_episodes, wilson
+from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import Run
 from concent_warp.train.task.task import Task
 
@@ -43,7 +44,7 @@ geometry, contact events, policy. All cases of a seed start from the same initia
 demonstration, block in the hand; none was trained from. An episode succeeds where the block ends within 3 mm of its
 place at the bottom of the hole. Pooled over the seeds, with Wilson's 95 % interval; it is that of these policies, and
 says nothing of how much trainings differ, which the column *seeds* does. Settings were chosen by what seeds 0 to 2
-showed in the stand-in world, those with pushes by what seeds 0 and 3 to 5 did, `held 0.6` by seeds 5 to 7, the force by
+showed in the stand-in world, those with pushes by what seeds 0 and 3 to 5 did, `held 0.6` by seeds 5 to 7, the scale by
 policies with pushes of seeds 0 and 3 to 8 from other initial states, smaller leads (`turn-lead`) by seeds 3 to 5.
 By seeds 9 to 11 nothing was chosen, but they confirmed a choice: smaller leads and more exploration, tried on them as
 well, did worse and were dropped. The hidden delay is the third effect that was tried here, after weaker gravity
@@ -78,8 +79,8 @@ class Args:
     """Initial states of each seed."""
     hidden: str = HIDDEN
     """Effect that is hidden in the world of some cases."""
-    force: float = 1.0
-    """Share of the force that policies may exert, as of `concent evaluate`."""
+    setpoint_lead_scale: float = 1.0
+    """How far commands may run ahead of the joints, as of `concent evaluate`."""
     processes: int = 1
     table: bool = False
     """Write the page from what is there, without runs."""
@@ -109,7 +110,7 @@ def key(args: Args, case: str, seed: int) -> str:
     row = {
         "settings": changed(result["settings"]),
         "trained": result,
-        "force": args.force,
+        "setpoint_lead_scale": args.setpoint_lead_scale,
         "hidden": hidden(args, case),
     }
     return named({"case": case, "seed": seed, **row}, args.stage)
@@ -122,8 +123,8 @@ def hidden(args: Args, case: str) -> list[str]:
 
 def named(row: Row, stage: str) -> str:
     """Return the name under which a trial is kept."""
-    how, seconds, force = manner(row)
-    gently = f"--force {force:g}" * (force < 1)
+    how, seconds, lead = manner(row)
+    gently = f"--setpoint-lead-scale {lead:g}" * (lead < 1)
     without = " ".join(["hiding", *row["hidden"]]) if row.get("hidden") else ""
     return " ".join(f"{row['case']} {stage} {row['seed']} {seconds} s {how} {gently} {without}".split())
 
@@ -138,7 +139,8 @@ def trial(args: Args, name: str, seed: int) -> Row:
     quiet_warp()
     torch.set_num_threads(1)
     case, folder = CASES[name], policy_folder(args, name, seed)
-    run = restrained(Run.load(folder), 1.0, args.force)
+    policy = Policy.load(folder).scaled(setpoint_lead_scale=args.setpoint_lead_scale)
+    run = policy.run
     judge = Run.load(policy_folder(args, reference(case), seed))
     task, shown = run.task(), judge.task()
     states = judge.evaluation_states(shown, args.episodes, seed)
@@ -148,11 +150,9 @@ def trial(args: Args, name: str, seed: int) -> Row:
     hide = hidden(args, name)
     # Each model has contact points of its own to tell a lost block by; here its place at the end tells.
     cfg = replace(run.cfg.environment, worlds=min(args.episodes, 32), engine="mujoco", dropped=0.05)
-    environment = real_environment(task, cfg, starts, Arguments(checkpoint=folder, hide=tuple(hide)))
-    trainer = Trainer(environment, run.cfg)
-    trainer.algorithm.load(load_checkpoint(folder / CHECKPOINT), {"actor": True}, True)
+    environment = reality_environment(task, cfg, starts, RealityWorldCfg(hide=tuple(hide)))
     watcher = Watcher(args.episodes)
-    found = evaluate(environment, trainer.policy(), starts, watch=watcher)
+    found = run_episodes(environment, policy.act_in(environment), starts, watch=watcher)
     met = [
         targets_met(shown, environment, np.array(qpos), mocap)
         for qpos, mocap in zip(watcher.states, states.mocap, strict=True)
@@ -164,7 +164,7 @@ def trial(args: Args, name: str, seed: int) -> Row:
         "outcomes": found.counts(), "stages": stages, "met": met, "hidden": hide,
         "simulation": result["simulation"], "trained": {k: result[k] for k in ("stage", "steps", "seconds", "worlds")},
         "machine": machine(), "trained_on": result["machine"], "settings": changed(result["settings"]),
-        "force": args.force,
+        "setpoint_lead_scale": args.setpoint_lead_scale,
     }  # fmt: skip
 
 
@@ -219,8 +219,8 @@ def page(rows: Sequence[Row], stage: str) -> str:
     for what, name in (("Trials", "machine"), ("Policies", "trained_on")):
         parts += [f"{what}: {line}" for line in dict.fromkeys(machine_line(row[name]) for row in rows)]
     parts += ["## Several cases"] * bool(compared)
-    for (how, seconds, force), group in compared:
-        gently = "" if force == 1 else f", run with `--force {force:g}`"
+    for (how, seconds, lead), group in compared:
+        gently = "" if lead == 1 else f", run with `--setpoint-lead-scale {lead:g}`"
         parts.append(f"### {seconds} s of training with " + (f"`{how}`" if how else "the default settings") + gently)
         parts += section(group)
     return "\n\n".join(parts)
@@ -232,25 +232,25 @@ def overview(groups: Sequence[tuple[tuple[str, int, float], Sequence[Row]]]) -> 
     Those of three seeds and more come first, then the better ones.
     """
     lines = []
-    for (how, seconds, force), group in groups:
+    for (how, seconds, lead), group in groups:
         of = sorted((row for row in group if row["case"] == "ours"), key=lambda row: row["seed"])
         if of:
             share, shown = pooled(of)
             name = f"`{how}`" if how else "default settings"
-            lines.append(((len(of) < 3, -share), [name, f"{seconds}", f"{force:g}", *shown, f"{targets(of):.0%}"]))
-    head = ["trained with", "seconds", "force", "succeed", "95 % interval", "episodes", "seeds", "targets met"]
+            lines.append(((len(of) < 3, -share), [name, f"{seconds}", f"{lead:g}", *shown, f"{targets(of):.0%}"]))
+    head = ["trained with", "seconds", "lead scale", "succeed", "95 % interval", "episodes", "seeds", "targets met"]
     return table(head, [line for _, line in sorted(lines)])
 
 
 def overview_of_hidden(groups: Sequence[tuple[tuple[str, int, float], Sequence[Row]]]) -> str:
     """Return a table of the cases with an effect hidden, by the effect and by the ways of training and running."""
     lines = []
-    for (how, seconds, force), group in groups:
+    for (how, seconds, lead), group in groups:
         for title, of in by_title(row for row in group if row.get("hidden")).items():
             name = f"`{how}`" if how else "default settings"
-            order = (of[0]["hidden"], how, seconds, force, list(CASES).index(of[0]["case"]))
-            lines.append((order, [title, name, f"{seconds}", f"{force:g}", *pooled(of)[1]]))
-    head = ["case", "trained with", "seconds", "force", "succeed", "95 % interval", "episodes", "seeds"]
+            order = (of[0]["hidden"], how, seconds, lead, list(CASES).index(of[0]["case"]))
+            lines.append((order, [title, name, f"{seconds}", f"{lead:g}", *pooled(of)[1]]))
+    head = ["case", "trained with", "seconds", "lead scale", "succeed", "95 % interval", "episodes", "seeds"]
     return table(head, [line for _, line in sorted(lines)])
 
 
@@ -277,8 +277,8 @@ def targets(of: Sequence[Row]) -> float:
 
 
 def manner(row: Row) -> tuple[str, int, float]:
-    """Return the settings with which a policy was trained, for how long, to 5 s, and with what force it was run."""
-    return row.get("settings", ""), 5 * round(row["trained"]["seconds"] / 5), row.get("force", 1.0)
+    """Return the settings of a training, its length to 5 s, and the lead scale with which the policy was run."""
+    return row.get("settings", ""), 5 * round(row["trained"]["seconds"] / 5), row.get("setpoint_lead_scale", 1.0)
 
 
 def titled(row: Row) -> str:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import concent_warp
-from concent_warp.cli.terminal import processes
 from concent_warp.errors import ConcentError
+from concent_warp.run_folder import processes
 
 COMMANDS = {
     "demo": "the main job on a simulated stand-in of the real world, from recording to report",
@@ -91,7 +91,7 @@ def run(command: str, arguments: Sequence[str]) -> int:
     try:
         import tyro
 
-        from concent_warp.cli.run_folder import INVOCATION
+        from concent_warp.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
         module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")

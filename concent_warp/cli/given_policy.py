@@ -1,16 +1,19 @@
-"""Which policy a command is to run: of a run folder, or one that comes with the package."""
+"""The policy that a command is to run: that of a run folder, or one that comes with the package."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import TrainError
+
+if TYPE_CHECKING:
+    from concent_warp.train.policy.load import Policy
 
 DEFAULT = "shape_sorter"
-"""The policy that is meant where no name is given."""
+"""The policy that ``--pretrained`` without a name means."""
 
 
 def named(arguments: list[str]) -> str:
@@ -33,8 +36,8 @@ Pretrained = Annotated[
 """The name of a policy that comes with the package; the option alone means the default one."""
 
 
-def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
-    """Return the checkpoint file of the policy that was asked for.
+def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
+    """Return the policy that was asked for.
 
     Args:
         checkpoint: Run folder, or a checkpoint file in one.
@@ -43,8 +46,8 @@ def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
     Raises:
         TrainError: Neither or both are given, or there is no such policy, folder or file.
     """
-    from concent_warp.train.learning.ppo import CHECKPOINT
-    from concent_warp.train.policy.pretrained import shipped
+    from concent_warp.train.policy.load import Policy
+    from concent_warp.train.policy.pretrained import pretrained_checkpoint
 
     if (checkpoint is None) == (pretrained is None):
         raise TrainError(
@@ -52,9 +55,4 @@ def given_checkpoint(checkpoint: Path | None, pretrained: str | None) -> Path:
             expected="either --checkpoint with a run folder or --pretrained",
             found="neither" if checkpoint is None else "both",
         )
-    if checkpoint is None:
-        assert pretrained is not None
-        return shipped(pretrained)
-    if not checkpoint.exists():
-        raise TrainError("no such training", where=checkpoint, expected="its run folder, or a checkpoint file in one")
-    return checkpoint / CHECKPOINT if checkpoint.is_dir() else checkpoint
+    return Policy.load(pretrained_checkpoint(pretrained) if pretrained is not None else checkpoint or Path())

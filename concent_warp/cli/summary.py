@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.markup import escape
 
-from concent_warp.cli.run_folder import resuming_command
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import mean_and_interval, percent, unit_shown
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.run_folder import resuming_command
 
 if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import Progress

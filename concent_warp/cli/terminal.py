@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from concent_warp.run_folder import processes
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -20,16 +21,6 @@ def console(*, stderr: bool = False) -> Console:
 
     width = None if sys.stdout.isatty() else 160
     return Console(stderr=stderr, highlight=False, width=width, quiet=processes()[0] > 0)
-
-
-def processes() -> tuple[int, int]:
-    """Return the number of this process among those that torchrun started on this host, and how many they are.
-
-    Only the first of them talks.
-    """
-    if "TORCHELASTIC_RUN_ID" not in os.environ:
-        return 0, 1
-    return int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
 
 
 def say(message: RenderableType) -> None:

@@ -6,13 +6,13 @@ def train_table1(script):
     return script("benchmarks.train.table1")
 
 
-def row(case, seed, successes, *, hidden=(), force=1.0, settings="", seconds=61):
+def row(case, seed, successes, *, hidden=(), lead=1.0, settings="", seconds=61):
     facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
     return {
         "case": case, "seed": seed, "episodes": 200, "successes": successes, "stages": 3, "met": [3, 0],
         "outcomes": {"missed": 200 - successes, "success": successes}, "hidden": list(hidden),
         "simulation": {"rate": 1.0}, "trained": {"stage": "insert", "steps": 10, "seconds": seconds},
-        "machine": facts, "trained_on": facts, "settings": settings, "force": force,
+        "machine": facts, "trained_on": facts, "settings": settings, "setpoint_lead_scale": lead,
     }  # fmt: skip
 
 
@@ -42,8 +42,8 @@ def test_what_is_hidden_tells_rows_apart(train_table1):
     assert "added (actuator_delay=0.1), 75.0% > ours, an effect hidden (actuator_delay=0.1), 45.0%." in text
 
 
-def test_force_and_time_of_training_tell_rows_apart(train_table1):
-    rows = [row("ours", 0, 100), row("ours", 0, 120, force=0.5), row("ours", 0, 140, seconds=150)]
+def test_lead_scale_and_time_of_training_tell_rows_apart(train_table1):
+    rows = [row("ours", 0, 100), row("ours", 0, 120, lead=0.5), row("ours", 0, 140, seconds=150)]
     assert len({train_table1.named(one, "insert") for one in rows}) == 3
     lines = [line for line in train_table1.page(rows, "insert").splitlines() if line.startswith("| default settings")]
     assert [line.split("|")[2:5] for line in lines] == [

@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 
 from concent_warp.cli import main
-from concent_warp.cli.run_folder import claim_folder
 from concent_warp.errors import ConcentError
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.fit.geometry.search import Search
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import claim_folder
 
 SMALL = ["--count", "60", "--radius", "0.008", "--fit.generations", "3", "--fit.evolution.population", "4"]
 

@@ -12,7 +12,9 @@ import pytest
 from live_page import BROWSER, Page, opened
 
 from concent_warp.cli import main
-from concent_warp.cli.commands.play import Arguments, prepared
+from concent_warp.deploy.cfg import PlayCfg
+from concent_warp.deploy.play import make_player
+from concent_warp.train.policy.load import Policy
 
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
 
@@ -118,16 +120,17 @@ def test_episodes_are_counted_on_the_page(page):
 
 def test_policy_is_shown_in_the_stand_in_world_for_so_many_episodes(capsys):
     command = ["play", "--pretrained", "--world", "reality", "--hide", "mass=1.5", "--states", "1", "--episodes", "1"]
-    assert main([*command, "--force", "0.5", "--speed", "4", "--port", "8766"]) == 0
+    assert main([*command, "--setpoint-lead-scale", "0.5", "--speed", "4", "--port", "8766"]) == 0
     said = capsys.readouterr().out
     assert re.search(r"http://127.0.0.1:87\d\d shows it", said)
     assert re.search(r"1 episode: 1 (success|missed)", said)
 
 
-def test_pace_and_force_are_restrained_as_in_an_evaluation():
+def test_commands_are_scaled_as_in_an_evaluation():
     robots = []
-    for pace, force in ((1.0, 1.0), (0.4, 0.5)):
-        player, _ = prepared(Arguments(pretrained="shape_sorter", states=1, pace=pace, force=force))
+    for action_scale, lead_scale in ((1.0, 1.0), (0.4, 0.5)):
+        cfg = PlayCfg(states=1, action_scale=action_scale, setpoint_lead_scale=lead_scale)
+        player, _ = make_player(Policy.load("shape_sorter"), cfg, world="simulation")
         robots.append(player.environment.task.robot)
     np.testing.assert_allclose(robots[1].step, 0.4 * robots[0].step)
     np.testing.assert_allclose(robots[1].lead, 0.5 * robots[0].lead)
@@ -136,9 +139,9 @@ def test_pace_and_force_are_restrained_as_in_an_evaluation():
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--hide", "mass=1.5"], "hidden in the stand-in world alone"),
+        (["--hide", "mass=1.5"], "effects are hidden in Reality alone"),
         (["--states", "0"], "number of states"),
-        (["--force", "0"], "share of the force is not right; expected more than 0, at most 1, found 0"),
+        (["--setpoint-lead-scale", "0"], "setpoint lead scale is out of bounds; expected above 0, at most 1, found 0"),
         (["--states", "1", "--speed", "9"], "speed is not right; expected 0.1 to 4"),
         (["--states", "1", "--host", "203.0.113.7"], "no page can be served at this address"),
     ],

@@ -90,7 +90,7 @@ def test_data_set_is_gone_on_with(folder, capsys):
     assert "seed 3" in capsys.readouterr().err
     assert main([*command, "--splats", "cup=none.ply", "--overwrite"]) == 2  # before anything is taken away
     assert main([*command, "--resume", "--figure", str(folder / "none.png")]) == 0
-    assert "no frame was rendered anew" in capsys.readouterr().out
+    assert "no frame was rendered in this call" in capsys.readouterr().out
     assert not (folder / "none.png").exists()
     assert main([*command, "--rate", "5", "--overwrite"]) == 0
     assert main([*command, "--out", str(folder / "net"), "--overwrite"]) == 2

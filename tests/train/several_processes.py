@@ -7,13 +7,14 @@ from pathlib import Path
 import torch
 from small_insertion import SETTINGS, make_demonstration, make_events, make_model, make_task
 
+from concent_warp.errors import TrainError
 from concent_warp.recording.recording import Recording
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import Trainer
 from concent_warp.train.resets.sample import draw_states
-from concent_warp.train.run import Run, train
+from concent_warp.train.run import Run, train_run
 
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
@@ -69,13 +70,13 @@ def updated(ranks: Ranks) -> dict[str, torch.Tensor]:
 def main(out: Path) -> None:
     ranks, run = Ranks.here(), make_run()
     with ranks.joined("cpu"):
-        trainer, last = train(run, out / "whole", device="cpu", ranks=ranks)
+        trainer, last = train_run(run, out / "whole", device="cpu", ranks=ranks)
         assert last is not None
         weights = trainer.algorithm.save()["actor_state_dict"]
         torch.save({"weights": weights, "steps": last.steps, "log": last.log}, out / f"rank{ranks.rank}.pt")
         torch.save(updated(ranks), out / f"updated{ranks.rank}.pt")
-        train(rounds(run, 2), out / "parts", device="cpu", ranks=ranks)
-        train(run, out / "parts", device="cpu", ranks=ranks, resume=True)
+        train_run(rounds(run, 2), out / "parts", device="cpu", ranks=ranks)
+        train_run(run, out / "parts", device="cpu", ranks=ranks, resume=True)
         try:
             with ranks.agreeing():
                 if not ranks.first:

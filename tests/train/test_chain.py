@@ -8,10 +8,10 @@ import pytest
 import torch
 from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import make_environment, make_physics
-from concent_warp.train.policy.evaluate import evaluate
+from concent_warp.train.policy.evaluate import run_episodes
 from concent_warp.train.resets.sample import InitialStates, draw_states
 from concent_warp.train.task.movable import movable
 from concent_warp.train.task.stages import worst_distance
@@ -202,7 +202,7 @@ def test_evaluation_tells_how_many_targets_were_met_in_order(chain):
     states = draw_states(chain, cfg.reset, 0, count=6)
     environment = make_environment(chain, cfg, states, device="cpu")
     step = iter(range(10_000))
-    found = evaluate(environment, lambda _: as_demonstrated(environment, next(step)), states)
+    found = run_episodes(environment, lambda _: as_demonstrated(environment, next(step)), states)
     # Of the second batch nothing is reached: its commands are those at the demonstration's end.
     assert found.reached.tolist() == [3, 3, 3, 3, 0, 0]
     assert found.met == {"pick": 4, "align": 4, "insert": 4}

@@ -10,7 +10,8 @@ from small_insertion import SETTINGS, make_demonstration, make_events, make_mode
 
 from concent_warp.effects.effect import AddedEffect, Parameter
 from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
-from concent_warp.train.cfg import RandomisationCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.commands import Follower, Following
 from concent_warp.train.environment.effects import effects_of_worlds
 from concent_warp.train.environment.worlds import make_environment, make_physics

@@ -8,7 +8,8 @@ import pytest
 import torch
 from small_insertion import SETTINGS
 
-from concent_warp.train.cfg import TrainCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.physics import WarpPhysics, compiled_or_plain
 from concent_warp.train.environment.randomisation import drawn_fields

@@ -7,7 +7,8 @@ import pytest
 import torch
 from small_insertion import SETTINGS
 
-from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round, Trainer

@@ -14,13 +14,13 @@ from small_insertion import SETTINGS, make_demonstration, make_model
 from tensordict import TensorDict
 
 from concent_warp.cli import main
+from concent_warp.errors import TrainError
 from concent_warp.events.extract import extract
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
-from concent_warp.train.learning.ppo import CHECKPOINT
-from concent_warp.train.policy.export import export
-from concent_warp.train.run import Run, train
+from concent_warp.train.cfg import PpoCfg, TrainCfg
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.run import Run, train_run
 
 Trained = tuple[Path, torch.Tensor, torch.Tensor]
 
@@ -34,7 +34,9 @@ def trained(tmp_path_factory) -> Trained:
     ppo = PpoCfg(iterations=2, steps=4, hidden=(32, 16), epochs=2, batches=2)
     environment = replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8))
     folder = tmp_path_factory.mktemp("run")
-    trainer, _ = train(Run(model, recording, events, TrainCfg(environment=environment, ppo=ppo)), folder, device="cpu")
+    trainer, _ = train_run(
+        Run(model, recording, events, TrainCfg(environment=environment, ppo=ppo)), folder, device="cpu"
+    )
     seen = trainer.environment.get_observations()["policy"]
     seen = seen[[0, 1, 2, 3, 0]] + 0.3 * torch.randn(5, seen.shape[1], generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
@@ -44,7 +46,7 @@ def trained(tmp_path_factory) -> Trained:
 
 def test_onnx_policy_acts_as_ours(trained, tmp_path):
     folder, seen, actions = trained
-    assert main(["export", str(folder), "--out", f"{tmp_path}/policy.onnx"]) == 0
+    assert main(["export", "--checkpoint", str(folder), "--out", f"{tmp_path}/policy.onnx"]) == 0
     (found,) = list(ReferenceEvaluator(f"{tmp_path}/policy.onnx").run(None, {"observation": seen.numpy()}))
     assert actions.abs().max() > 1e-2
     np.testing.assert_allclose(np.asarray(found), actions.numpy(), rtol=0, atol=1e-5)
@@ -52,7 +54,7 @@ def test_onnx_policy_acts_as_ours(trained, tmp_path):
 
 def test_torchscript_policy_acts_as_ours(trained, tmp_path):
     folder, seen, actions = trained
-    described = export(folder / CHECKPOINT, tmp_path / "policy.pt")
+    described = Policy.load(folder).export(tmp_path / "policy.pt")
     extra: dict[str, Any] = {"concent.json": ""}
     policy = torch.jit.load(str(tmp_path / "policy.pt"), _extra_files=extra)
     torch.testing.assert_close(policy(seen), actions, rtol=0, atol=1e-5)
@@ -61,7 +63,7 @@ def test_torchscript_policy_acts_as_ours(trained, tmp_path):
 
 def test_metadata_says_what_the_numbers_are(trained, tmp_path):
     folder, seen, _ = trained
-    export(folder / CHECKPOINT, tmp_path / "policy.onnx")
+    Policy.load(folder).export(tmp_path / "policy.onnx")
     model = onnx.load(tmp_path / "policy.onnx")
     said = json.loads({p.key: p.value for p in model.metadata_props}["concent"])
     parts = said["observation"]["parts"]
@@ -83,7 +85,7 @@ def test_commands_follow_from_metadata_alone(trained, tmp_path):
     from concent_warp.train.environment.worlds import make_environment
 
     folder, _, _ = trained
-    said = export(folder / CHECKPOINT, tmp_path / "policy.onnx")
+    said = Policy.load(folder).export(tmp_path / "policy.onnx")
     run = Run.load(folder)
     task = run.task()
     environment = make_environment(task, run.cfg.environment, run.evaluation_states(task, 4, 0), device="cpu")
@@ -107,10 +109,10 @@ def test_commands_follow_from_metadata_alone(trained, tmp_path):
 def test_other_formats_and_files_in_the_way_are_refused(trained, tmp_path, capsys):
     folder, _, _ = trained
     with pytest.raises(TrainError, match="onnx"):
-        export(folder / CHECKPOINT, tmp_path / "policy.bin")
+        Policy.load(folder).export(tmp_path / "policy.bin")
     (tmp_path / "policy.pt").write_text("mine")
-    assert main(["export", str(folder), "--out", f"{tmp_path}/policy.pt"]) == 2
+    assert main(["export", "--checkpoint", str(folder), "--out", f"{tmp_path}/policy.pt"]) == 2
     assert "overwrite" in capsys.readouterr().err
     assert (tmp_path / "policy.pt").read_text() == "mine"
-    assert main(["export", str(tmp_path), "--out", f"{tmp_path}/policy.onnx"]) == 2
-    assert "no training" in capsys.readouterr().err
+    assert main(["export", "--checkpoint", str(tmp_path), "--out", f"{tmp_path}/policy.onnx"]) == 2
+    assert "no such checkpoint" in capsys.readouterr().err

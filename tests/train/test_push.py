@@ -8,7 +8,8 @@ import torch
 from small_insertion import SETTINGS
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.train.cfg import TrainCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics, WarpPhysics
 from concent_warp.train.environment.worlds import make_environment

@@ -10,10 +10,10 @@ import torch
 from several_processes import make_run, updated
 
 from concent_warp.cli import main
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import TrainError
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import CHECKPOINT
-from concent_warp.train.run import train
+from concent_warp.train.run import train_run
 
 SCRIPT = Path(__file__).with_name("several_processes.py")
 
@@ -61,7 +61,7 @@ def test_update_is_that_of_one_process_with_the_worlds_of_both(trained):
 
 
 def test_policy_is_not_that_of_a_single_process(trained):
-    trainer, last = train(make_run(), None, device="cpu")
+    trainer, last = train_run(make_run(), None, device="cpu")
     assert last is not None
     assert last.steps == loaded(trained / "rank0.pt")["steps"] / 2
     assert not same(trainer.algorithm.save()["actor_state_dict"], loaded(trained / "rank0.pt")["weights"])
@@ -82,7 +82,7 @@ def test_what_stops_one_process_stops_all(trained):
 
 def test_checkpoint_wants_as_many_processes_as_it_was_made_by(trained):
     with pytest.raises(TrainError, match="another number of processes; expected 2, found 1"):
-        train(make_run(), trained / "whole", device="cpu", resume=True)
+        train_run(make_run(), trained / "whole", device="cpu", resume=True)
 
 
 def test_each_process_takes_a_gpu_and_seeds_of_its_own(monkeypatch):

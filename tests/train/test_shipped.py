@@ -10,19 +10,20 @@ import torch
 from several_processes import make_run
 
 from concent_warp.cli import main
-from concent_warp.cli.commands.evaluate import restrained
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import TrainError
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.learning.ppo import CHECKPOINT
-from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, ship, shipped
-from concent_warp.train.run import Run, train
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, pretrained_checkpoint
+from concent_warp.train.policy.ship import ship
+from concent_warp.train.run import Run, train_run
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a short training."""
     out = tmp_path_factory.mktemp("shipped") / "run"
-    train(make_run(), out, device="cpu")
+    train_run(make_run(), out, device="cpu")
     (out / "settings.toml").write_text('command = "concent train some/where/demo.h5 --seed 0"\n')
     return out
 
@@ -46,19 +47,19 @@ def test_whole_task_comes_with_the_package_too(capsys):
     assert found["stages met"] == [{"stage": stage, "episodes": 4} for stage in ("pick", "align", "insert")]
 
 
-def test_policy_at_half_the_pace_and_force_takes_half_the_steps_and_leads_of_the_commands(capsys):
+def test_scaled_policy_takes_smaller_the_steps_and_leads_of_the_commands(capsys):
     options = ["evaluate", "--pretrained", "--episodes", "4", "--world", "simulation", "--device", "cpu", "--json"]
-    assert main([*options, "--pace", "0.5", "--force", "0.5"]) == 0
+    assert main([*options, "--action-scale", "0.5", "--setpoint-lead-scale", "0.5"]) == 0
     slow = json.loads(capsys.readouterr().out)
-    assert (slow["pace"], slow["force"]) == (0.5, 0.5)
+    assert (slow["action_scale"], slow["setpoint_lead_scale"]) == (0.5, 0.5)
     assert slow["worlds"]["simulation"]["successes"] == 4
-    run = Run.load(FOLDER / "shape_sorter")
-    robot, trained = restrained(run, 0.5, 0.4).task().robot, run.task().robot
+    policy = Policy.load("shape_sorter")
+    robot, trained = policy.scaled(0.5, 0.4).run.task().robot, policy.run.task().robot
     np.testing.assert_allclose(robot.step, 0.5 * trained.step)
     np.testing.assert_allclose(robot.lead, 0.4 * trained.lead)
-    for option, name in (("--pace", "pace"), ("--force", "share of the force")):
+    for option, name in (("--action-scale", "action scale"), ("--setpoint-lead-scale", "setpoint lead scale")):
         assert main([*options, option, "1.5"]) != 0
-        assert f"the {name} is not right" in capsys.readouterr().err
+        assert f"the {name} is out of bounds" in capsys.readouterr().err
 
 
 def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
@@ -70,12 +71,12 @@ def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_sma
         assert origin["steps"] > 0
         assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
         run = Run.load(FOLDER / name)
-        weights = torch.load(shipped(name), weights_only=False)["actor_state_dict"]
+        weights = torch.load(pretrained_checkpoint(name), weights_only=False)["actor_state_dict"]
         assert weights["obs_normalizer._mean"].shape[1] == Layout.of(run.task()).size
 
 
 def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_path):
-    assert main(["export", str(folder), "--as-pretrained", "--out", f"{tmp_path}/small"]) == 0
+    assert main(["export", "--checkpoint", str(folder), "--as-pretrained", "--out", f"{tmp_path}/small"]) == 0
     small = tmp_path / "small"
     whole = [torch.load(path / CHECKPOINT, weights_only=False) for path in (folder, small)]
     for name, value in whole[0]["actor_state_dict"].items():
@@ -91,13 +92,13 @@ def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_p
 
 
 def test_training_cannot_go_on_from_a_policy_alone(folder, tmp_path):
-    ship(folder / CHECKPOINT, tmp_path / "small")
+    ship(Policy.load(folder), tmp_path / "small")
     with pytest.raises(TrainError, match="no training to go on with"):
-        train(make_run(), tmp_path / "small", device="cpu", resume=True)
+        train_run(make_run(), tmp_path / "small", device="cpu", resume=True)
 
 
 def test_folders_are_replaced_only_on_demand_and_only_such(folder, tmp_path, capsys):
-    command = ["export", str(folder), "--as-pretrained", "--out", str(tmp_path / "small")]
+    command = ["export", "--checkpoint", str(folder), "--as-pretrained", "--out", str(tmp_path / "small")]
     assert main(command) == 0
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from small_insertion import SETTINGS, make_demonstration, make_model, make_task
 
+from concent_warp.errors import TrainError
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg, TrainError
+from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.environment.physics import MujocoPhysics

@@ -9,18 +9,19 @@ import torch
 from small_insertion import SETTINGS, make_demonstration, make_model
 
 from concent_warp.cli import main
+from concent_warp.errors import TrainError
 from concent_warp.events.extract import extract
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
 from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round
-from concent_warp.train.policy.evaluate import evaluate, wilson
-from concent_warp.train.policy.export import export
-from concent_warp.train.run import Run, train
+from concent_warp.train.policy.evaluate import run_episodes, wilson
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.run import Run, train_run
 
 LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
@@ -41,26 +42,26 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
     cfg = TrainCfg(environment=SETTINGS, ppo=LEARNING)
-    trainer, last = train(replace(made, cfg=cfg), None, device="cpu")
+    trainer, last = train_run(replace(made, cfg=cfg), None, device="cpu")
     assert last is not None
     assert last.seconds < 120
     task = made.task()
     states = replace(made, cfg=cfg).evaluation_states(task, 64, 0)
     environment = make_environment(task, SETTINGS, states, device="cpu")
     torch.manual_seed(1)
-    untrained = evaluate(environment, lambda o: 2 * torch.rand(len(o["policy"]), 4) - 1, states)
-    trained = evaluate(environment, trainer.policy(), states)
+    untrained = run_episodes(environment, lambda o: 2 * torch.rand(len(o["policy"]), 4) - 1, states)
+    trained = run_episodes(environment, trainer.policy(), states)
     assert untrained.rate < 0.3
     assert trained.rate >= 0.8
 
 
 def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, tmp_path):
-    train(made, tmp_path / "whole", device="cpu")
+    train_run(made, tmp_path / "whole", device="cpu")
     half = replace(made, cfg=replace(made.cfg, ppo=replace(SHORT, iterations=2)))
-    train(half, tmp_path / "parts", device="cpu")
+    train_run(half, tmp_path / "parts", device="cpu")
     with (tmp_path / "parts" / CURVE).open("a") as file:  # a round after the checkpoint, which is done again
         file.write(json.dumps({"iteration": 3, "steps": 48, "seconds": 0.1}) + "\n")
-    _, last = train(made, tmp_path / "parts", device="cpu", resume=True)
+    _, last = train_run(made, tmp_path / "parts", device="cpu", resume=True)
     assert last is not None
     assert (last.iteration, last.steps) == (4, 64)
     for folder in ("whole", "parts"):
@@ -77,37 +78,37 @@ def test_interruption_keeps_what_was_learnt(made, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(made, tmp_path, device="cpu", report=interrupt)
-    _, last = train(made, tmp_path, device="cpu", resume=True)
+        train_run(made, tmp_path, device="cpu", report=interrupt)
+    _, last = train_run(made, tmp_path, device="cpu", resume=True)
     assert last is not None
     assert last.iteration == 4
 
 
 def test_other_settings_and_foreign_files_are_refused_on_resuming(made, tmp_path):
-    train(made, tmp_path, device="cpu")
+    train_run(made, tmp_path, device="cpu")
     other = replace(made, cfg=replace(made.cfg, environment=replace(made.cfg.environment, decimation=5)))
     with pytest.raises(TrainError, match="decimation 10"):
-        train(other, tmp_path, device="cpu", resume=True)
+        train_run(other, tmp_path, device="cpu", resume=True)
     (tmp_path / CHECKPOINT).write_bytes(b"nothing")
     with pytest.raises(TrainError, match="not a checkpoint"):
-        train(made, tmp_path, device="cpu", resume=True)
+        train_run(made, tmp_path, device="cpu", resume=True)
 
 
 def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
-    train(made, tmp_path / "first", device="cpu")
+    train_run(made, tmp_path / "first", device="cpu")
     given = weights(tmp_path / "first")
     hardly = replace(SHORT, iterations=1, learning_rate=1e-12, schedule="fixed")
     still = replace(made, cfg=replace(made.cfg, seed=1, ppo=hardly))
     same = []
     for begin_with in (None, tmp_path / "first" / CHECKPOINT):
-        trainer, _ = train(still, None, device="cpu", begin_with=begin_with)
+        trainer, _ = train_run(still, None, device="cpu", begin_with=begin_with)
         found = dict(trainer.algorithm.actor.named_parameters())
         same.append([torch.allclose(value, given[name], rtol=0, atol=1e-9) for name, value in found.items()])
     assert not all(same[0])
     assert all(same[1])
     wider = replace(still, cfg=replace(still.cfg, ppo=replace(hardly, hidden=(32,))))
     with pytest.raises(TrainError, match="another network"):
-        train(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
+        train_run(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
 
 
 def test_what_is_no_policy_to_begin_with_is_refused_before_anything_is_written(tmp_path, capsys):
@@ -129,7 +130,7 @@ def test_first_diverged_state_is_saved(made, tmp_path, monkeypatch):
         return step(self, actions)
 
     monkeypatch.setattr(Environment, "step", kicked)
-    _, last = train(made, tmp_path, device="cpu")
+    _, last = train_run(made, tmp_path, device="cpu")
     assert last is not None
     assert last.log["diverged worlds"] > 0
     assert (tmp_path / OFFENCE).is_file()
@@ -188,7 +189,7 @@ def test_commands_train_and_evaluate_a_chain(made, tmp_path, capsys):
         met = document["worlds"][world]["stages met"]
         assert met == [{"stage": name, "episodes": 0} for name in ("pick", "align", "insert")]
     assert len(list((tmp_path / "run" / "videos").iterdir())) == 1
-    described = export(tmp_path / "run" / CHECKPOINT, tmp_path / "policy.pt")
+    described = Policy.load(tmp_path / "run").export(tmp_path / "policy.pt")
     assert described["stages"] == ["pick", "align", "insert"]
     assert described["moving on"]["hold"] == 2
     assert [p["stage"] for p in described["observation"]["slots"]["pairs"]].count("align") == 8
@@ -198,7 +199,7 @@ def test_first_episodes_in_the_stand_in_world_are_filmed(made, tmp_path, capsys)
     import cv2
 
     episode = replace(made, cfg=replace(made.cfg, environment=replace(made.cfg.environment, episode=0.4)))
-    train(episode, tmp_path / "run", device="cpu")
+    train_run(episode, tmp_path / "run", device="cpu")
     command = ["evaluate", "--checkpoint", f"{tmp_path}/run", "--episodes", "3", "--world", "reality", "--videos", "2"]
     command += ["--hide", "mass=1.5"]
     assert main(command) == 0

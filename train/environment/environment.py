@@ -18,8 +18,9 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import ContactPairs
-from concent_warp.train.cfg import EnvironmentCfg, TrainError
+from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.observation import BaseObservation, Layout
 from concent_warp.train.environment.physics import Graph, Physics, captured
 from concent_warp.train.environment.reward import disturbance, effort, engineered, relative_pose

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from torch import distributed
 
-from concent_warp.errors import ConcentError
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import ConcentError, TrainError
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ import torch
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
-from concent_warp.train.cfg import PpoCfg, TrainCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.learning.metrics import curve
@@ -61,6 +62,8 @@ class Round:
     """Time of this round's steps [s]."""
     updating: float
     """Time of its update [s]."""
+    rate: float = 0.0
+    """Environment steps a second, of all processes."""
     log: dict[str, float] = field(default_factory=dict)
     """What the environment and the losses came to."""
 
@@ -155,7 +158,8 @@ class Trainer:
         self.seconds += end - start
         log |= {f"loss {name}": value for name, value in means.items()}
         log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
-        this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, log)
+        rate = self.steps_of_round / (end - start)
+        this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, rate, log)
         self.history.append(this)
         return this, observations
 
@@ -214,12 +218,16 @@ class Trainer:
 
             def write_round(this: Round) -> None:
                 spent = {"collecting": this.collecting, "updating": this.updating}
-                rate = self.steps_of_round / sum(spent.values())
                 point = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds}
                 # The environment's log counts the steps of this round alone: those so far go last.
-                write({**point, **this.log, **spent, "steps_per_second": rate, **point})
+                write({**point, **this.log, **spent, "steps_per_second": this.rate, **point})
 
             yield write_round
+
+    def weights(self) -> dict[str, Any]:
+        """Return policy, value function and optimiser as they are, and how long they were trained."""
+        length = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
+        return {**self.algorithm.save(), **length}
 
     def save(self) -> None:
         """Write a checkpoint, in one piece or not at all, with the worlds and generators of all processes."""
@@ -229,14 +237,7 @@ class Trainer:
         ranks = self.ranks.gathered({"environment": worlds, "random": random_state(self.device)})
         if not self.ranks.first:
             return
-        document = {
-            **self.algorithm.save(),
-            "learning_rate": self.algorithm.learning_rate,
-            "iteration": self.iteration,
-            "steps": self.steps,
-            "seconds": self.seconds,
-            "ranks": ranks,
-        }
+        document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
         path = self.folder / CHECKPOINT
         partial = path.with_name(f".{path.name}.partial")
         torch.save(document, partial)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.evaluate import Policy
+from concent_warp.train.policy.evaluate import PolicyFunction
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ def start(environment: Environment, rows: Sequence[int]) -> None:
     environment.start_from([rows[k % len(rows)] for k in range(worlds)])
 
 
-def steps(environment: Environment, policy: Policy) -> Iterator[Step]:
+def steps(environment: Environment, policy: PolicyFunction) -> Iterator[Step]:
     """Act for as long as the longest episode lasts; look at the worlds' states before each step is asked for.
 
     A world whose episode has ended begins another one, which is nobody's.

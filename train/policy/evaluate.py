@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from tensordict import TensorDict
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.resets.sample import InitialStates
 
-Policy = Callable[[TensorDict], torch.Tensor]
+PolicyFunction = Callable[[TensorDict], torch.Tensor]
+"""From observations to actions, shape (N, A), without exploration."""
 Watch = Callable[[np.ndarray, np.ndarray], None]
 """Takes the episodes that are running, ids (R,) int, and their positions (R, nq)."""
 FAILURES = ("dropped", "severe", "diverged")
@@ -34,6 +36,8 @@ class Evaluation:
     """Stages whose targets were to be met, in their order; none where a single one was trained."""
     reached: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
     """How many of the targets each episode met, in their order, shape (E,) int."""
+    videos: tuple[Path, ...] = ()
+    """Videos that were written."""
 
     @property
     def rate(self) -> float:
@@ -76,9 +80,9 @@ class Evaluation:
         return f"{text}; stage targets met in order: {met}" if met else text
 
 
-def evaluate(
+def run_episodes(
     environment: Environment,
-    policy: Policy,
+    policy: PolicyFunction,
     states: InitialStates,
     *,
     progress: Callable[[float], None] | None = None,

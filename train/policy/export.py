@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import warnings
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
+from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
-from concent_warp.train.cfg import TrainCfg, TrainError
+from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.learning.normalisation import bound_observations
-from concent_warp.train.learning.ppo import load_checkpoint, network
+from concent_warp.train.learning.ppo import network
 from concent_warp.train.run import Run
 from concent_warp.train.task.task import Task
 
@@ -34,25 +36,24 @@ PACKAGES = ("concent-warp", "torch", "onnx", "rsl-rl-lib", "mujoco", "mujoco-war
 SUFFIXES = (".onnx", ".pt")
 
 
-def export(checkpoint: Path, out: Path) -> dict[str, Any]:
+def export(run: Run, weights: Mapping[str, Any], out: Path) -> dict[str, Any]:
     """Write a run's policy without exploration, and return its metadata.
 
     Args:
-        checkpoint: Checkpoint in a run folder.
+        run: What the policy was trained with.
+        weights: Its checkpoint.
         out: File to write: ``.onnx`` for ONNX, ``.pt`` for TorchScript.
 
     Raises:
-        TrainError: The file has another ending, or the folder holds no such training.
+        TrainError: The file has another ending.
     """
     if out.suffix not in SUFFIXES:
         raise TrainError(
             "the format of the export is not known", where=out, expected=f"a name in {' or '.join(SUFFIXES)}"
         )
-    run = Run.load(checkpoint.parent)
-    weights = load_checkpoint(checkpoint)
     task = run.task()
     described = describe(run.cfg, task) | {"rounds": weights["iteration"], "steps": weights["steps"]}
-    module = policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"], checkpoint)
+    module = policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"])
     partial = out.with_name(f".{out.name}.partial")
     write = write_onnx if out.suffix == ".onnx" else write_torchscript
     write(module, described, partial)
@@ -60,7 +61,7 @@ def export(checkpoint: Path, out: Path) -> dict[str, Any]:
     return described
 
 
-def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: dict[str, Any], where: Path) -> nn.Module:
+def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapping[str, Any]) -> nn.Module:
     """Return the policy as a module from observations (N, O), as the environment gives them, to actions (N, A)."""
     example = TensorDict({"policy": torch.zeros(1, observations)}, batch_size=[1])
     settings = network(cfg.ppo, actor=True)
@@ -70,7 +71,7 @@ def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: dict[
     try:
         actor.load_state_dict(weights)
     except RuntimeError as error:
-        raise TrainError("the checkpoint is of another network", where=where, found=str(error)[:200]) from None
+        raise TrainError("the checkpoint is of another network", found=str(error)[:200]) from None
     return actor.as_jit().eval()
 
 

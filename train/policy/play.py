@@ -10,7 +10,7 @@ import torch
 
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.evaluate import FAILURES, Policy
+from concent_warp.train.policy.evaluate import FAILURES, PolicyFunction
 from concent_warp.train.task.task import Task
 
 TOUCH = 5e-4
@@ -38,7 +38,7 @@ class Moment:
 class Player:
     """One world, the first of an environment, and a policy."""
 
-    def __init__(self, environment: Environment, policy: Policy, episodes: int) -> None:
+    def __init__(self, environment: Environment, policy: PolicyFunction, episodes: int) -> None:
         """Start the first of the episodes that the environment has initial states for."""
         self.environment, self.policy = environment, policy
         self.touches = Touches(environment.task)

@@ -1,30 +1,15 @@
-"""Policies that come with the package: run folders reduced to what running the policy takes, in `pretrained/`.
-
-Kept are the policy's weights, model, contact events, commands and measurements of the demonstration, and settings; left
-out are optimiser, value function, worlds and generators, tracked points and images. `origin.toml` says which command
-made a policy, and with which versions.
-"""
+"""Policies that come with the package, by name: reduced run folders in `train/pretrained`."""
 
 from __future__ import annotations
 
-import shlex
-import shutil
-import tomllib
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from concent_warp.errors import ConcentError
-from concent_warp.files import write_text
-from concent_warp.train.cfg import TrainError
-from concent_warp.train.learning.ppo import CHECKPOINT, load_checkpoint
-from concent_warp.train.run import Run
+from concent_warp.errors import TrainError
+from concent_warp.train.learning.ppo import CHECKPOINT
 
 FOLDER = Path(__file__).parents[1] / "pretrained"
 ORIGIN = "origin.toml"
-"""File that says where a policy comes from; a folder that holds one holds a policy for shipping."""
-COMMAND = "settings.toml"
-"""File of a run folder in which `concent train` writes its command."""
+"""File that says where a policy comes from; a folder that holds one holds a pretrained policy."""
 
 
 def names() -> list[str]:
@@ -32,7 +17,7 @@ def names() -> list[str]:
     return sorted(path.parent.name for path in FOLDER.glob(f"*/{ORIGIN}"))
 
 
-def shipped(name: str) -> Path:
+def pretrained_checkpoint(name: str) -> Path:
     """Return the checkpoint of a policy that comes with the package.
 
     Raises:
@@ -41,50 +26,3 @@ def shipped(name: str) -> Path:
     if name not in names():
         raise TrainError("no such policy comes with the package", expected=f"one of {names()}", found=name)
     return FOLDER / name / CHECKPOINT
-
-
-def ship(checkpoint: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Write a run's policy with what it needs to a folder, in one piece or not at all; return what `origin.toml` says.
-
-    Args:
-        checkpoint: Checkpoint in a run folder.
-        out: Folder to make.
-        overwrite: Replace an earlier policy in the folder.
-
-    Raises:
-        ConcentError: The folder is there and is not to be, or cannot be, replaced.
-    """
-    import tomli_w
-    import torch
-
-    if out.exists() and not (overwrite and (out / ORIGIN).is_file()):
-        fix = "pass --overwrite" if (out / ORIGIN).is_file() else "choose another folder"
-        raise ConcentError("the folder exists", where=out, fix=fix)
-    run, weights = Run.load(checkpoint.parent), load_checkpoint(checkpoint)
-    one = replace(run.recording[0], points={}, image={})
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    replace(run, recording=replace(run.recording, demonstrations=(one,))).save(partial)
-    kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
-    torch.save(kept, partial / CHECKPOINT)
-    length = {"rounds": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
-    origin = length | told(checkpoint.parent / COMMAND)
-    write_text(partial / ORIGIN, tomli_w.dumps(origin))
-    if out.exists():
-        shutil.rmtree(out)
-    partial.rename(out)
-    return origin
-
-
-def told(settings: Path) -> dict[str, Any]:
-    """Return the command and the versions that a run folder was made by, as far as it says so."""
-    if not settings.is_file():
-        return {}
-    stored = tomllib.loads(settings.read_text())
-    found: dict[str, Any] = {"command": without_folders(stored["command"])} if "command" in stored else {}
-    return found | ({"versions": stored["versions"]} if "versions" in stored else {})
-
-
-def without_folders(command: str) -> str:
-    """Return a command with the files in it named without the folders that they lay in."""
-    return shlex.join(Path(part).name if "/" in part else part for part in shlex.split(command))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.train.cfg import TrainError
+from concent_warp.errors import TrainError
 from concent_warp.train.task.robot import Robot
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.errors import TrainError
 from concent_warp.simulate.inputs import compile_model
-from concent_warp.train.cfg import ResetCfg, TrainError
+from concent_warp.train.cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import reach
 from concent_warp.train.resets.inverse_kinematics_batch import reach_many
 from concent_warp.train.task.movable import mocap_of

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from concent_warp.train.cfg import ActionCfg, TrainError
+from concent_warp.errors import TrainError
+from concent_warp.train.cfg import ActionCfg
 
 
 @dataclass(frozen=True)

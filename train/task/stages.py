@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.errors import TrainError
 from concent_warp.events.sequence import Stage
 from concent_warp.kernels.contact_pairs import PairTable
-from concent_warp.train.cfg import ChainCfg, TrainError
+from concent_warp.train.cfg import ChainCfg
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from concent_warp.errors import TrainError
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.kernels.contact_pairs import PairTable
@@ -16,7 +17,7 @@ from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
-from concent_warp.train.cfg import ALL, EnvironmentCfg, TrainError
+from concent_warp.train.cfg import ALL, EnvironmentCfg
 from concent_warp.train.task.movable import movable
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.slots import slot_table

@@ -13,11 +13,11 @@ from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
 from concent_warp.cli.given_model import check_fits
-from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.effects.registry import effect_class, effects
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.model import Model
+from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:

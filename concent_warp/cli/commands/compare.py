@@ -10,7 +10,6 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.summary import say_diverged
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare
@@ -22,6 +21,7 @@ from concent_warp.errors import EventsError
 from concent_warp.estimation.noise import WORDS
 from concent_warp.ground import extract_all
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
 
 

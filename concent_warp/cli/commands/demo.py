@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.cli.terminal import progress_bar, say
 from concent_warp.fit.fit_geometry import FitCfg
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.run_folder import run_folder, write_settings
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName
 

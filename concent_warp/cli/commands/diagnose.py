@@ -12,7 +12,6 @@ from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare
 from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
@@ -24,6 +23,7 @@ from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
+from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
 
 MOST_PLACES = 3

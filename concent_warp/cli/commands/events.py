@@ -8,13 +8,13 @@ from pathlib import Path
 import tyro
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.summary import say_events
 from concent_warp.cli.terminal import say_written
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.ground import event_paths, extract_all, save_events
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.select import EngineName
 
 

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file, make_folder
+from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.terminal import quiet_warp, say, say_written
+from concent_warp.run_folder import claim_file, make_folder
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write the policy of a training, without exploration, as ONNX or TorchScript.
+    """Write a policy, without exploration, as ONNX or TorchScript.
 
     Names, order and units of observation and action, scales, limits and the control period are in its metadata.
     With --as-pretrained, write a run folder reduced to what running the policy takes.
     """
 
-    run: tyro.conf.Positional[Path]
+    checkpoint: Path | None = None
     """Run folder of a training, or its checkpoint file."""
-    out: Path | None = None
-    """File to write: .onnx for ONNX, which is the default, .pt for TorchScript; with --as-pretrained a folder."""
+    pretrained: Pretrained = None
+    """Export a policy that comes with the package, shape_sorter where no name is given."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write: .onnx for ONNX, .pt for TorchScript; policy.onnx by default. With --as-pretrained a folder."""
     as_pretrained: bool = False
     """Write a folder as they are for --pretrained."""
     overwrite: bool = False
@@ -33,15 +36,13 @@ class Arguments:
 def run(arguments: Arguments) -> dict[str, Any]:
     """Export and return the metadata."""
     quiet_warp()
-    from concent_warp.train.learning.ppo import CHECKPOINT
-    from concent_warp.train.policy.export import export
-    from concent_warp.train.policy.pretrained import ship
-
-    path = arguments.run / CHECKPOINT if arguments.run.is_dir() else arguments.run
+    policy = given_policy(arguments.checkpoint, arguments.pretrained)
     if arguments.as_pretrained:
+        from concent_warp.train.policy.ship import ship
+
         folder = Path("pretrained") if arguments.out is None else arguments.out
         make_folder(folder.parent)
-        origin = ship(path, folder, overwrite=arguments.overwrite)
+        origin = ship(policy, folder, overwrite=arguments.overwrite)
         size = sum(file.stat().st_size for file in folder.iterdir())
         say(f"policy of {origin['steps']:,} steps with all it takes to run it, {size / 1e3:,.0f} kB")
         say_written(folder)
@@ -49,7 +50,7 @@ def run(arguments: Arguments) -> dict[str, Any]:
     out = Path("policy.onnx") if arguments.out is None else arguments.out
     claim_file(out, overwrite=arguments.overwrite)
     make_folder(out.parent)
-    described = export(path, out)
+    described = policy.export(out)
     observations, actions = described["observation"]["size"], described["action"]["size"]
     say(f"{observations} observations to {actions} actions every {1e3 * described['control period']:g} ms")
     say_written(out)

@@ -9,13 +9,13 @@ from typing import Annotated
 import tyro
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import run_folder, write_settings
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.fit.fit_geometry import FitCfg, Method
 from concent_warp.ground import GroundCfg, Grounded, ground
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
+from concent_warp.run_folder import run_folder, write_settings
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName

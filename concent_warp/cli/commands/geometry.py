@@ -9,10 +9,10 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
 from concent_warp.model import Model
+from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.objects import load_object
 from concent_warp.scene.spheres.build import ContactGeometryCfg

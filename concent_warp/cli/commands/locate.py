@@ -10,13 +10,13 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.locate import locate
 from concent_warp.diagnosis.forces.result import Location
 from concent_warp.diagnosis.forces.window_forces import WindowCfg
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
 
 

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
+from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.scene.robot import RobotCfg
 
 

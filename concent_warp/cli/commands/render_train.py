@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from concent_warp.cli.run_folder import resuming_command, run_folder, write_settings
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
 from concent_warp.render.networks.cfg import RenderTrainCfg
+from concent_warp.run_folder import resuming_command, run_folder, write_settings
 
 if TYPE_CHECKING:
     from concent_warp.render.networks.train import RenderTraining

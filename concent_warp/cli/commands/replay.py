@@ -8,9 +8,9 @@ from pathlib import Path
 import tyro
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.run_folder import claim_file, make_folder
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.rollout_file import save_rollout
 from concent_warp.simulate.select import EngineName, make_engine

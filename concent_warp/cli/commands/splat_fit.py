@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from concent_warp.cli.run_folder import CHECKPOINT, resuming_command, run_folder, write_settings
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
 from concent_warp.files import write_text
 from concent_warp.render.splats.cfg import SplatFitCfg
+from concent_warp.run_folder import CHECKPOINT, resuming_command, run_folder, write_settings
 
 if TYPE_CHECKING:
     import numpy as np

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.given_policy import given_checkpoint
-from concent_warp.cli.run_folder import resuming_command, run_folder, write_settings
+from concent_warp.cli.given_policy import given_policy
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import resuming_command
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
-    from concent_warp.train.learning.distributed import Ranks
     from concent_warp.train.learning.ppo import Round
+    from concent_warp.train.policy.load import Policy
 
 
 @dataclass(frozen=True)
@@ -71,59 +70,52 @@ class Arguments:
         return replace(self.train, environment=environment, ppo=ppo)
 
 
-def run(arguments: Arguments) -> Round | None:
+def run(arguments: Arguments) -> Policy:
     """Train and write the run folder, one of several processes where torchrun started them."""
     quiet_warp()
+    from concent_warp.events.sequence import ContactEventSequence
     from concent_warp.train.learning.distributed import Ranks
-    from concent_warp.train.learning.ppo import CHECKPOINT, load_checkpoint
+    from concent_warp.train.learning.ppo import CHECKPOINT
+    from concent_warp.train.train import train
 
-    ranks = Ranks.here()
-    begin_with = None if arguments.begin_with is None else given_checkpoint(arguments.begin_with, None)
-    if begin_with is not None:
-        load_checkpoint(begin_with)  # what is no checkpoint is refused before anything is written
+    Ranks.here().device(arguments.device)  # more processes than GPUs: refused before anything is read
+    begin_with = None if arguments.begin_with is None else given_policy(arguments.begin_with, None)
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
-    claimed = run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
-    with ranks.joined(ranks.device(arguments.device)), claimed if ranks.first else nullcontext():
-        try:
-            last = train_in(folder, arguments, ranks, begin_with)
-        except KeyboardInterrupt:
-            saved = (folder / CHECKPOINT).exists()
-            ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was trained yet."
-            raise KeyboardInterrupt(ending) from None
+    recording = load_recording(arguments.recording)
+    model = given_model(arguments.model, recording)
+    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
+    cfg = arguments.cfg()
+    last: Round | None = None
+    try:
+        with status_bar("training") as update:
+
+            def progress(this: Round) -> None:
+                nonlocal last
+                last = this
+                text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
+                left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
+                update(this.iteration / cfg.ppo.iterations, text, left)
+
+            policy = train(
+                model,
+                recording,
+                cfg,
+                events=events,
+                demonstration=arguments.demonstration,
+                begin_with=begin_with,
+                device=arguments.device,
+                out=folder,
+                resume=arguments.resume,
+                overwrite=arguments.overwrite,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        saved = (folder / CHECKPOINT).exists()
+        ending = f"The state is saved; continue with: {resuming_command()}" if saved else "Nothing was trained yet."
+        raise KeyboardInterrupt(ending) from None
     if last is None:
-        say(f"nothing is left to train: {arguments.cfg().ppo.iterations} rounds are done")
+        say(f"nothing is left to train: {cfg.ppo.iterations} iterations are done")
     else:
         say(f"{last.steps:,} steps in {last.seconds:.0f} s, success while exploring {last.log['success']:.1%}")
     say_written(folder / CHECKPOINT)
-    return last
-
-
-def train_in(folder: Path, arguments: Arguments, ranks: Ranks, begin_with: Path | None) -> Round | None:
-    """Train with a folder that was made, from a policy of a checkpoint or from none."""
-    from concent_warp.events.sequence import ContactEventSequence
-    from concent_warp.train.run import Run, train
-
-    recording = load_recording(arguments.recording)
-    model = given_model(arguments.model, recording)
-    cfg = arguments.cfg()
-    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
-    if ranks.first:
-        write_settings(folder, arguments)
-    made = Run.new(model, recording, cfg, demonstration=arguments.demonstration, events=events)
-    with status_bar("training") as update:
-
-        def show(this: Round) -> None:
-            rate = ranks.count * cfg.ppo.steps * cfg.environment.worlds / (this.collecting + this.updating)
-            text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {rate:,.0f} steps/s"
-            left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
-            update(this.iteration / cfg.ppo.iterations, text, left)
-
-        return train(
-            made,
-            folder,
-            device=arguments.device,
-            resume=arguments.resume,
-            report=show,
-            ranks=ranks,
-            begin_with=begin_with,
-        )[1]
+    return policy

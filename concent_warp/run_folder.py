@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import sys
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import concent_warp
-from concent_warp.cli.terminal import processes
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
 
@@ -175,3 +175,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value if item is not None]
     return value if isinstance(value, bool | int | float | str) else str(value)
+
+
+def processes() -> tuple[int, int]:
+    """Return the number of this process among those that torchrun started on this host, and how many they are.
+
+    Only the first of them talks.
+    """
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return 0, 1
+    return int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])

@@ -1,0 +1,127 @@
+"""How often a trained policy succeeds, in simulation and in Reality, from initial states that training has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
+from concent_warp.deploy.reality_world import reality_environment, reality_world
+from concent_warp.reality.hidden.in_task import TaskWorld
+from concent_warp.reality.sensors.video import filmed, write_video
+from concent_warp.run_folder import claim_file, make_folder
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.policy.evaluate import Evaluation, run_episodes
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.resets.reset_states import InitialStates
+from concent_warp.train.task.task import Task
+
+
+def evaluate(
+    policy: Policy,
+    cfg: EvaluateCfg | None = None,
+    *,
+    world: WorldName = "reality",
+    episodes: int = 200,
+    seed: int = 0,
+    device: str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Evaluation:
+    """Run a policy from many initial states and count successes.
+
+    Args:
+        policy: The policy.
+        cfg: Settings: Reality with its hidden effects, the scales of the robot's commands, videos.
+        world: "simulation", the model that the policy was trained in, or "reality": exact convex shapes, elliptic
+            friction cones, fine time steps, and what `EvaluateCfg.hide` names.
+        episodes: Initial states, of which each is run once.
+        seed: Seed of the initial states.
+        device: Warp's name of the device for the simulation; the first CUDA device by default where there is one.
+        out: Folder for the videos; by default the folder videos in the policy's run folder, of a pretrained policy in
+            the current one.
+        overwrite: Replace videos that are there.
+        progress: Called with the share done, 0..1.
+
+    Raises:
+        TrainError: A setting is out of bounds, or Reality has other bodies than the model.
+        ConcentError: No such effect can be hidden, or a video is there already.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> result = cw.evaluate(cw.load_policy("shape_sorter"), world="simulation", episodes=2, device="cpu")
+        >>> result.rate
+        1.0
+    """
+    cfg = cfg or EvaluateCfg()
+    check(cfg, world, episodes)
+    default = Path("videos") if policy.pretrained else policy.folder / "videos"
+    videos = video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
+    policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
+    run = policy.run
+    task = run.task()
+    states = run.evaluation_states(task, episodes, seed)
+    torch.manual_seed(seed)
+    settings = replace(run.cfg.environment, worlds=min(episodes, run.cfg.environment.worlds))
+    if world == "reality":
+        environment = reality_environment(task, settings, states, cfg)
+    else:
+        environment = make_environment(task, settings, states, device=device)
+    states_seen = EpisodeStates(len(videos))
+    found = run_episodes(environment, policy.act_in(environment), states, progress=progress, watch=states_seen)
+    if videos:
+        write_videos(videos, states_seen, reality_world(task, settings, cfg), task, states, environment.control_step)
+    return replace(found, videos=tuple(videos))
+
+
+def video_files(cfg: EvaluateCfg, folder: Path, *, overwrite: bool) -> list[Path]:
+    """Return the files of the videos that are asked for.
+
+    Raises:
+        ConcentError: One of them exists and is not to be replaced.
+    """
+    hidden = "".join(f"_{one}" for one in cfg.hide)
+    files = [folder / f"reality{hidden}_{k:03d}.mp4" for k in range(cfg.videos)]
+    for file in files:
+        claim_file(file, overwrite=overwrite)
+    return files
+
+
+class EpisodeStates:
+    """States of the first episodes of an evaluation, for `run_episodes`."""
+
+    def __init__(self, count: int) -> None:
+        self.states: list[list[np.ndarray]] = [[] for _ in range(count)]
+        """Positions of each step of each episode, each of shape (nq,)."""
+
+    def __call__(self, episodes: np.ndarray, qpos: np.ndarray) -> None:
+        """Keep the states of the first episodes; ids (R,) and positions (R, nq)."""
+        for episode, state in zip(episodes, qpos, strict=True):
+            if episode < len(self.states):
+                self.states[episode].append(state.copy())
+
+
+def write_videos(
+    files: list[Path], episodes: EpisodeStates, world: TaskWorld, task: Task, starts: InitialStates, period: float
+) -> None:
+    """Film episodes that began with `starts` and whose states are a period apart [s]."""
+    bodies = tuple(task.compiled.body(i).name for i in task.objects)
+    for k, (path, states) in enumerate(zip(files, episodes.states, strict=True)):
+        make_folder(path.parent)
+        spec = world.spec()
+        for body in task.objects:
+            mocap = int(task.compiled.body_mocapid[body])
+            if mocap >= 0:
+                placed = spec.body(task.compiled.body(body).name)
+                placed.pos, placed.quat = starts.mocap[k, mocap, :3], starts.mocap[k, mocap, 3:]
+        write_video(path, filmed(spec, bodies, np.array(states), period), 1 / period)
+
+
+def without_reality(cfg: EvaluateCfg) -> EvaluateCfg:
+    """Return the settings without what they say of Reality, for an evaluation in simulation."""
+    return replace(cfg, hide=(), videos=0)

@@ -1,0 +1,143 @@
+"""A policy at work in one world, shown live in the browser."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco
+import torch
+
+from concent_warp.deploy.cfg import PlayCfg, WorldName
+from concent_warp.deploy.reality_world import reality_environment
+from concent_warp.errors import TrainError
+from concent_warp.reality.hidden.in_task import wanted
+from concent_warp.report.live import LiveView
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.policy.play import Moment, Player
+
+
+def play(
+    policy: Policy,
+    cfg: PlayCfg | None = None,
+    *,
+    world: WorldName = "simulation",
+    episodes: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    serving: Callable[[str], None] | None = None,
+) -> list[str]:
+    """Serve a page that shows a policy at work, until so many episodes have ended or the call is interrupted.
+
+    Args:
+        policy: The policy.
+        cfg: Settings.
+        world: "simulation" or "reality".
+        episodes: Episodes after which to end; None goes on until interrupted.
+        seed: Seed of the initial states.
+        device: Warp's name of the device; one world is fastest on the CPU.
+        serving: Called with the address of the page once it is served.
+
+    Returns:
+        The outcomes of the episodes.
+
+    Raises:
+        TrainError: A setting is out of bounds.
+        ConcentError: The address cannot be served on.
+    """
+    cfg = cfg or PlayCfg()
+    player, drawn = make_player(policy, cfg, world=world, seed=seed, device=device)
+    task = player.environment.task
+    assert task.model.geometry is not None
+    view = LiveView(drawn, task.model.geometry, task.collidable, host=cfg.host, port=cfg.port, speed=cfg.speed)
+    try:
+        objects = player.moment().position[list(task.objects)]
+        view.look_at(objects.mean(axis=0), cfg.eye)
+        if serving is not None:
+            serving(view.address)
+        watch(player, view, episodes, cfg)
+    except KeyboardInterrupt:
+        return player.ended
+    finally:
+        view.stop()
+    return player.ended
+
+
+def make_player(
+    policy: Policy, cfg: PlayCfg, *, world: WorldName, seed: int = 0, device: str = "cpu"
+) -> tuple[Player, mujoco.MjModel]:
+    """Return the policy in its world, and the model to draw.
+
+    Raises:
+        TrainError: A setting is out of bounds.
+    """
+    if cfg.states < 1:
+        raise TrainError("the number of states is out of bounds", expected="at least 1", found=cfg.states)
+    if wanted(cfg.hide) and world == "simulation":
+        raise TrainError("effects are hidden in Reality alone", fix="add --world reality")
+    policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
+    run = policy.run
+    task = run.task()
+    states = run.evaluation_states(task, cfg.states, seed)
+    torch.manual_seed(seed)
+    settings = replace(run.cfg.environment, worlds=1)
+    if world == "reality":
+        environment = reality_environment(task, settings, states, cfg)
+        drawn = environment.physics.model
+    else:
+        environment = make_environment(task, settings, states, device=device)
+        drawn = task.model.scene.model
+    return Player(environment, policy.act_in(environment), cfg.states), drawn
+
+
+def watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -> None:
+    """Show the policy as the page's controls have it, until so many episodes have ended."""
+    wishes, period = view.wishes, player.environment.control_step
+    due = time.monotonic()
+    show(player, view, player.moment())
+    while episodes is None or len(player.ended) < episodes:
+        if wishes.reset:
+            wishes.reset = False
+            player.begin()
+            show(player, view, player.moment())
+        if not (wishes.running or wishes.step):
+            view.changed.wait(cfg.poll)
+            view.changed.clear()
+            due = time.monotonic()
+            continue
+        wishes.step = False
+        outcome = player.step()
+        if outcome is not None:
+            view.tell(f"**{outcome}**  \n{counted(player.ended)}")
+            due += cfg.pause / wishes.speed
+        due = max(due + period / wishes.speed, time.monotonic())
+        wait_until(due, view)
+        show(player, view, player.moment())
+
+
+def wait_until(due: float, view: LiveView) -> None:
+    """Wait until a time, or until a control is used."""
+    while (left := due - time.monotonic()) > 0:
+        if view.changed.wait(left):
+            view.changed.clear()
+            return
+
+
+def show(player: Player, view: LiveView, moment: Moment) -> None:
+    """Draw a moment and say what it is."""
+    view.show(moment.position, moment.quaternion, moment.touching, moment.pairs)
+    touching = int(moment.touching.sum())
+    view.tell(
+        f"**Stage {moment.stage}**, {moment.time:.2f} s  \n"
+        f"{touching} of {len(moment.touching)} spheres touch  \n"
+        f"{counted(player.ended)}"
+    )
+
+
+def counted(outcomes: list[str]) -> str:
+    """Return how many episodes ended and how, in words."""
+    each = ", ".join(f"{count} {name}" for name, count in Counter(outcomes).most_common())
+    return f"{len(outcomes)} episode{'s' * (len(outcomes) != 1)}{': ' * bool(outcomes)}{each}"

@@ -1,0 +1,310 @@
+"""Episodes of a policy, or a recording, as images in a data set for vision-language-action policies."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.deploy.cfg import Format, RenderCfg
+from concent_warp.errors import RenderError
+from concent_warp.run_folder import (
+    SETTINGS,
+    check_unchanged,
+    claim_file,
+    make_folder,
+    plain,
+    run_folder,
+    write_settings,
+)
+from concent_warp.scene.cameras import BASE, WRIST
+
+if TYPE_CHECKING:
+    from concent_warp.model import Model
+    from concent_warp.recording.recording import Recording
+    from concent_warp.render.composite import HybridCamera
+    from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
+    from concent_warp.render.filming import Filming
+    from concent_warp.train.policy.load import Policy
+
+FREE = ("out", "resume", "overwrite", "source", "episodes", "worlds", "films", "figure", "device")
+"""Settings that may differ when a data set is continued."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set that was written."""
+
+    folder: Path
+    format: Format
+    episodes: int
+    """Episodes that it holds."""
+    dropped: int = 0
+    """Episodes of the policy that were no success and were left out in this call."""
+    figure: Path | None = None
+    """The figure of the layers; None without one."""
+
+
+def render(
+    source: Policy | Recording,
+    out: str | Path,
+    cfg: RenderCfg | None = None,
+    *,
+    format: Format = "lerobot",
+    device: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Dataset:
+    """Render episodes of a policy, or the measured motion of a recording, to a data set.
+
+    Without networks and splats the images are the simulation's. With networks, robot and background look as the real
+    camera sees them; with splats, so do the objects.
+
+    Args:
+        source: The policy, whose episodes in simulation are rendered, or a recording.
+        out: Folder of the data set.
+        cfg: Settings.
+        format: LeRobotDataset v3.0, or one HDF5 file in robomimic's layout.
+        device: Warp's name of the device; the first CUDA device by default where there is one.
+        resume: Continue an interrupted data set, or one with fewer episodes.
+        overwrite: Replace an earlier data set in the folder.
+        progress: Called with the share done, 0..1.
+
+    Raises:
+        RenderError: A setting is out of bounds, or the folder holds something else.
+        ConcentError: A file is there already, or the data set was begun with other settings.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.RenderCfg(episodes=1, size=32, cameras=("base",), keep="all")
+        >>> cw.render(cw.load_policy("shape_sorter"), "dataset", cfg, format="robomimic", device="cpu").episodes
+        1
+    """
+    cfg, out = cfg or RenderCfg(), Path(out)
+    if min(cfg.episodes, cfg.worlds, cfg.rate, cfg.flow_steps) < 1:
+        raise RenderError("episodes, worlds, rate and flow steps are to be at least 1")
+    if cfg.figure is not None:
+        claim_file(cfg.figure, overwrite=overwrite)
+    check_replaced(out, overwrite=overwrite)
+    to = Destination(out, cfg, format, device, resume, overwrite)
+    with run_folder(out, overwrite=False, resume=resume or overwrite):
+        from concent_warp.recording.recording import Recording
+
+        film = film_recording if isinstance(source, Recording) else film_policy
+        filming = film(source, to, progress or ignore)  # pyright: ignore[reportArgumentType]
+        count = filming.writer.finish()
+    return Dataset(out, format, count, filming.dropped, draw_figure(cfg, filming))
+
+
+@dataclass(frozen=True)
+class Destination:
+    """Where a data set goes, and how."""
+
+    out: Path
+    cfg: RenderCfg
+    format: Format
+    device: str | None
+    resume: bool
+    overwrite: bool
+
+
+def ignore(share: float) -> None:
+    """Do nothing with the progress."""
+    del share
+
+
+def check_replaced(folder: Path, *, overwrite: bool) -> None:
+    """Check that what is to be replaced is a data set.
+
+    Raises:
+        RenderError: The folder holds another run.
+    """
+    from concent_warp.render.dataset.layout import STAGING
+
+    if overwrite and (folder / SETTINGS).is_file() and not (folder / STAGING).is_dir():
+        raise RenderError("the folder holds a run, but no data set", where=folder, fix="choose another folder")
+
+
+def film_policy(policy: Policy, to: Destination, progress: Callable[[float], None]) -> Filming:
+    """Render the episodes of a policy."""
+    import torch
+
+    from concent_warp.train.environment.worlds import make_environment
+    from concent_warp.train.policy.episodes import start, steps
+
+    cfg, run = to.cfg, policy.run
+    task = run.task()
+    states = run.evaluation_states(task, cfg.episodes, cfg.seed)
+    torch.manual_seed(cfg.seed)
+    worlds = min(cfg.worlds, cfg.episodes)
+    settings = replace(run.cfg.environment, worlds=worlds, capture="physics")
+    environment = make_environment(task, settings, states, device=to.device)
+    act = policy.act_in(environment)
+    rate = round(1 / environment.control_step)
+    if abs(rate * environment.control_step - 1) > 1e-6:
+        raise RenderError("a video wants a whole number of frames a second", found=1 / environment.control_step)
+    camera, model = hybrid_camera(cfg, task.model, worlds, to.device)
+    joints, layout = addressed(model, camera, rate)
+    writer = dataset_writer(to, layout)
+    filming = new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
+    left = [row for row in range(cfg.episodes) if not writer.has(row)]
+    physics, length = environment.physics, int(environment.max_episode_length)
+    with leaving(filming):
+        for first in range(0, len(left), worlds):
+            rows = left[first : first + worlds]
+            start(environment, rows)
+            filming.begin([*rows, *[None] * (worlds - len(rows))])
+            filming.shoot(physics.qpos, physics.mocap)
+            state = physics.qpos.cpu().numpy()[:, joints]
+            for k, step in enumerate(steps(environment, act)):
+                for world in filming.running:
+                    filming.add(world, state[world], step.command[world])
+                    if step.ended[world]:
+                        success = bool(step.success[world])
+                        filming.end(world, keep=cfg.keep == "all" or success, success=success)
+                progress((first + len(rows) * (k + 1) / length) / len(left))
+                if not filming.running:
+                    break
+                filming.shoot(physics.qpos, physics.mocap)
+                state = physics.qpos.cpu().numpy()[:, joints]
+    return filming
+
+
+def film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> Filming:
+    """Render the measured motion of the demonstrations of a recording, each an episode."""
+    from concent_warp.estimation.measured_motion import measured_motion
+    from concent_warp.model import Model
+    from concent_warp.scene.scene import Scene
+    from concent_warp.simulate.mujoco_engine import MujocoEngine
+    from concent_warp.simulate.replay import commands
+
+    cfg = to.cfg
+    model = Model(Scene(recording.scene, source=recording.source))
+    engine = MujocoEngine(model, threads=1)
+    camera, compiled = hybrid_camera(cfg, model, 1, to.device)
+    joints, layout = addressed(compiled, camera, cfg.rate)
+    writer = dataset_writer(to, layout)
+    filming = new_filming(to, camera, writer, cfg.task or recording[0].task or "do the task", cfg.rate)
+    with leaving(filming):
+        for k, demonstration in enumerate(recording.demonstrations):
+            if writer.has(k):
+                continue
+            motion = measured_motion(model, demonstration, engine)
+            time = np.arange(motion.span[0], motion.span[1], 1 / cfg.rate)
+            qpos = motion.states(time)[0]
+            ctrl = commands(compiled, demonstration, round(time[-1] / engine.timestep) + 1)
+            filming.begin([k])
+            for t, now in enumerate(time):
+                filming.shoot(qpos[t][None])
+                filming.add(0, qpos[t][joints], ctrl[round(now / engine.timestep)])
+                progress((k + (t + 1) / len(time)) / len(recording.demonstrations))
+            filming.end(0, keep=True)
+    return filming
+
+
+@contextmanager
+def leaving(filming: Filming) -> Iterator[None]:
+    """Discard the episodes that have not ended when something goes wrong."""
+    try:
+        yield
+    except BaseException:
+        filming.leave()
+        raise
+
+
+def hybrid_camera(cfg: RenderCfg, given: Model, worlds: int, device: str | None) -> tuple[HybridCamera, mujoco.MjModel]:
+    """Return what renders, and the scene's model with the cameras."""
+    import warp as wp
+
+    from concent_warp.model import Model
+    from concent_warp.render.cameras import place_cameras
+    from concent_warp.render.composite import HybridCamera
+    from concent_warp.render.networks.painter import Painter
+    from concent_warp.render.splats.splats import Splats
+    from concent_warp.scene.cameras import with_cameras
+    from concent_warp.simulate.warp_engine import preferred_device
+
+    device = device or preferred_device()
+    where = str(wp.device_to_torch(wp.get_device(device)))
+    painter = None
+    if cfg.networks is not None:
+        options = {"steps": cfg.flow_steps, "seed": cfg.seed, "half": cfg.half}
+        painter = Painter.load(cfg.networks, device=where, **options)
+    names = cfg.cameras or (tuple(painter.cameras) if painter is not None else (BASE, WRIST))
+    scene = given.scene
+    own = [] if painter is None else [painter.cameras[name] for name in names if name in painter.cameras]
+    others = [name for name in names if name not in [camera.name for camera in own]]
+    spec = Model(with_cameras(scene, others), given.geometry).spec()
+    place_cameras(spec, own)
+    model = spec.compile()
+    splats = {}
+    for text in cfg.splats:
+        body, _, file = text.partition("=")
+        if not file:
+            raise RenderError("splats are given as body=file.ply", found=repr(text))
+        splats[body] = Splats.read(Path(file), device=where)
+    camera = HybridCamera(
+        model, names, (cfg.size, cfg.size), worlds, objects=scene.objects(), splats=splats,
+        painter=painter, shadows=cfg.lights if cfg.shadows else None, show=cfg.show, device=device, seed=cfg.seed,
+    )  # fmt: skip
+    return camera, model
+
+
+def addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[np.ndarray, EpisodeLayout]:
+    """Return where the joints of one degree of freedom are in qpos, and the layout of a data set of them."""
+    from concent_warp.render.dataset.layout import EpisodeLayout
+
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    layout = EpisodeLayout(
+        rate,
+        camera.cameras,
+        camera.size,
+        tuple(model.joint(j).name for j in joints),
+        tuple(model.actuator(i).name for i in range(model.nu)),
+    )
+    return model.jnt_qposadr[joints], layout
+
+
+def dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
+    """Return the data set, new or to be continued; an earlier one is replaced only here, where all input is valid."""
+    if to.overwrite and not to.resume:
+        for path in to.out.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    settings = {"format": to.format, "out": str(to.out), **plain(to.cfg)}
+    if to.resume:
+        check_unchanged(to.out / SETTINGS, settings, FREE)
+    write_settings(to.out, settings)
+    if to.format == "robomimic":
+        from concent_warp.render.dataset.robomimic import RobomimicWriter
+
+        return RobomimicWriter(to.out, layout)
+    from concent_warp.render.dataset.lerobot import LeRobotWriter
+
+    return LeRobotWriter(to.out, layout, codec=to.cfg.codec)
+
+
+def new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> Filming:
+    """Return what takes the frames to the data set."""
+    from concent_warp.render.filming import FILMS, Filming
+
+    films = to.out / FILMS if to.cfg.films else None
+    return Filming(camera, writer, task, films=films, first_films=to.cfg.films, rate=rate)
+
+
+def draw_figure(cfg: RenderCfg, filming: Filming) -> Path | None:
+    """Write the figure that is asked for, and return its path; None where no frame was rendered in this call."""
+    if cfg.figure is None or not len(filming.album):
+        return None
+    from concent_warp.render.figure import decomposition
+
+    make_folder(cfg.figure.parent)
+    decomposition(filming.album.chosen(), filming.camera.cameras, cfg.figure)
+    return cfg.figure

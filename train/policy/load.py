@@ -1,0 +1,106 @@
+"""A trained policy: its weights with everything that it was made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from concent_warp.errors import TrainError
+from concent_warp.train.environment.environment import Environment
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.policy.evaluate import PolicyFunction
+from concent_warp.train.policy.pretrained import FOLDER, names, pretrained_checkpoint
+from concent_warp.train.run import Run
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> policy = cw.load_policy("shape_sorter")
+        >>> [stage.name for stage in policy.run.events.stages]
+        ['pick', 'align', 'insert']
+    """
+
+    run: Run
+    """Model, demonstration, contact events and settings that it was trained with."""
+    weights: Mapping[str, Any] = field(repr=False)
+    """The checkpoint: tensors and plain data."""
+    folder: Path
+    """Its run folder."""
+
+    @staticmethod
+    def load(source: str | Path) -> Policy:
+        """Load a policy.
+
+        Args:
+            source: Run folder of a training, a checkpoint file in one, or the name of a policy that comes with the
+                package.
+
+        Raises:
+            TrainError: There is no such training or policy, or the file is no checkpoint.
+        """
+        path = Path(source)
+        if isinstance(source, str) and not path.exists() and path.name == source:
+            if source not in names():
+                expected = f"a run folder, a checkpoint file, or one of {names()}"
+                raise TrainError("no such policy", expected=expected, found=source)
+            path = pretrained_checkpoint(source)
+        if not path.exists():
+            raise TrainError("no such training", where=path, expected="its run folder, or a checkpoint file in one")
+        checkpoint = path / CHECKPOINT if path.is_dir() else path
+        weights = load_checkpoint(checkpoint)
+        return Policy(Run.load(checkpoint.parent), weights, checkpoint.parent)
+
+    @property
+    def pretrained(self) -> bool:
+        """Whether it comes with the package."""
+        return self.folder.parent == FOLDER
+
+    def act_in(self, environment: Environment) -> PolicyFunction:
+        """Return the function from an environment's observations to actions, on the environment's device."""
+        trainer = Trainer(environment, self.run.cfg)
+        trainer.algorithm.load(dict(self.weights), {"actor": True}, True)
+        return trainer.policy()
+
+    def scaled(self, action_scale: float = 1.0, setpoint_lead_scale: float = 1.0) -> Policy:
+        """Return the policy with smaller steps of its commands.
+
+        Args:
+            action_scale: Size of the steps as a share of that in training, above 0 and at most 1: below 1 the robot
+                moves more slowly.
+            setpoint_lead_scale: How far commands may run ahead of the joints, likewise: with the stiffness of the
+                drives, this is the largest force that the robot exerts.
+
+        Raises:
+            TrainError: One of them is out of bounds.
+        """
+        for name, scale in (("action scale", action_scale), ("setpoint lead scale", setpoint_lead_scale)):
+            if not 0 < scale <= 1:
+                raise TrainError(f"the {name} is out of bounds", expected="above 0, at most 1", found=scale)
+        environment = self.run.cfg.environment
+        action = environment.action
+        action = replace(
+            action,
+            turn=action_scale * action.turn,
+            slide=action_scale * action.slide,
+            gripper=action_scale * action.gripper,
+            turn_lead=setpoint_lead_scale * action.turn_lead,
+            slide_lead=setpoint_lead_scale * action.slide_lead,
+        )
+        cfg = replace(self.run.cfg, environment=replace(environment, action=action))
+        return replace(self, run=replace(self.run, cfg=cfg))
+
+    def export(self, out: str | Path) -> dict[str, Any]:
+        """Write the policy as ONNX (``.onnx``) or TorchScript (``.pt``) and return its metadata.
+
+        Raises:
+            TrainError: The file has another ending.
+        """
+        from concent_warp.train.policy.export import export
+
+        return export(self.run, self.weights, Path(out))

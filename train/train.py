@@ -1,0 +1,88 @@
+"""Training: from a model and the contact events of a demonstration to a policy (paper, section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.model import Model
+from concent_warp.recording.recording import Recording
+from concent_warp.run_folder import plain, run_folder, write_settings
+from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.ppo import CHECKPOINT, Round
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.run import Run, train_run
+
+
+def train(
+    model: Model,
+    recording: Recording,
+    cfg: TrainCfg | None = None,
+    *,
+    events: ContactEventSequence | Mapping[str, ContactEventSequence] | None = None,
+    demonstration: str | None = None,
+    begin_with: Policy | None = None,
+    device: str | None = None,
+    seconds: float | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[Round], None] | None = None,
+) -> Policy:
+    """Train a policy by PPO to bring about the contact events of a demonstration.
+
+    With ``torchrun`` several processes train one policy together, each with worlds of its own.
+
+    Args:
+        model: The grounded model.
+        recording: Holds the demonstration.
+        cfg: Settings.
+        events: Contact event sequence of the demonstration, or of several by name; extracted where it is not given.
+        demonstration: Name of the demonstration; the first by default.
+        begin_with: Policy to start from; random weights by default.
+        device: Warp's name of the device; the first CUDA device by default where there is one.
+        seconds: Time after which to stop [s].
+        out: Run folder for checkpoints, curves and all that the policy was made from; None keeps it in memory.
+        resume: Continue the training in the run folder, as if it had not stopped.
+        overwrite: Replace an earlier run in the folder.
+        progress: Called after every iteration.
+
+    Raises:
+        TrainError: The settings do not fit the demonstration, the folder's training was begun with other settings, or
+            the losses are not finite any more.
+        ConcentError: The folder holds a run and neither `resume` nor `overwrite` is given.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> made = cw.load_policy("shape_sorter").run
+        >>> ppo = cw.PpoCfg(iterations=1, steps=2)
+        >>> cfg = cw.TrainCfg(environment=cw.EnvironmentCfg(worlds=2, stage="insert"), ppo=ppo)
+        >>> policy = cw.train(made.model, made.recording, cfg, events=made.events, device="cpu")
+        >>> policy.weights["iteration"]
+        1
+    """
+    cfg, ranks = cfg or TrainCfg(), Ranks.here()
+    name = recording[0].name if demonstration is None else demonstration
+    sequence = events.get(name) if isinstance(events, Mapping) else events
+    folder = None if out is None else Path(out)
+    claimed = nullcontext()
+    if folder is not None and ranks.first:
+        claimed = run_folder(folder, overwrite=overwrite, resume=resume)
+    with ranks.joined(ranks.device(device)), claimed:
+        if folder is not None and ranks.first:
+            write_settings(folder, {"demonstration": name, **plain(cfg)})
+        run = Run.new(model, recording, cfg, demonstration=name, events=sequence)
+        trainer, _ = train_run(
+            run,
+            folder,
+            device=device,
+            resume=resume,
+            report=progress,
+            seconds=seconds,
+            ranks=ranks,
+            begin_with=None if begin_with is None else begin_with.folder / CHECKPOINT,
+        )
+    return Policy(run, trainer.weights(), folder or Path())
