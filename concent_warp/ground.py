@@ -5,7 +5,6 @@ Fit the contact geometry, replay, extract the contact event sequence, compare wi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -17,19 +16,17 @@ import numpy as np
 from concent_warp.comparison.compare import compare
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.comparison.result import Comparison
-from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.extract import extract
+from concent_warp.events.extract_events import extract_events, save_events
 from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid
-from concent_warp.events.schedule import plot_schedule
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.files import write_text
+from concent_warp.files import write_json
 from concent_warp.fit.fit_geometry import FitCfg, Method, fit_geometry
 from concent_warp.fit.geometry.search import FitResult, Progress
 from concent_warp.model import Model
 from concent_warp.report.report import write_report
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.simulate.select import EngineName, make_engine
+from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
     from concent_warp.recording.recording import Recording
@@ -125,14 +122,14 @@ def ground(
     write_json(folder / "history.json", document)
     models = {BEFORE: start, NULL: without_object_contact(fit.model), AFTER: fit.model}
     models = {name: model for name, model in models.items() if model is not None}
-    events = extract_all(fit.model, recording)
+    events = extract_events(fit.model, recording)
     save_events(events, folder, plain_name=False)
     stages = {name: sequence.stages for name, sequence in events.items()}
     comparison = compare(models, recording, "mujoco", phases=stages)
     overlap = {}
     if truth is not None:
         overlap = {
-            BEFORE: contact_overlap(extract_all(start, recording), truth, start.scene.objects()),
+            BEFORE: contact_overlap(extract_events(start, recording), truth, start.scene.objects()),
             AFTER: contact_overlap(events, truth, start.scene.objects()),
         }
     document = comparison.to_json()
@@ -151,34 +148,6 @@ def ground(
     return Grounded(fit, comparison, events, overlap, fitted)
 
 
-def extract_all(
-    model: Model, recording: Recording, engine: EngineName = "mujoco", cfg: StagingCfg | None = None
-) -> dict[str, ContactEventSequence]:
-    """Return the contact event sequence of each demonstration."""
-    simulator = make_engine(engine, model)
-    return {d.name: extract(model, d, simulator, cfg) for d in recording.demonstrations}
-
-
-def event_paths(names: Sequence[str], folder: Path, *, plain_name: bool = True) -> list[tuple[Path, Path]]:
-    """Return the paths of the event file and the schedule plot of each demonstration.
-
-    They are ``events_<demonstration>.json`` and ``schedule_<demonstration>.png``; with `plain_name`, those of a single
-    demonstration are ``events.json`` and ``schedule.png``.
-    """
-    short = plain_name and len(names) == 1
-    suffixes = ["" if short else f"_{name.replace('/', '_')}" for name in names]
-    return [(folder / f"events{suffix}.json", folder / f"schedule{suffix}.png") for suffix in suffixes]
-
-
-def save_events(events: Mapping[str, ContactEventSequence], folder: Path, *, plain_name: bool = True) -> list[Path]:
-    """Write the event file and the schedule plot of each demonstration, and return all paths."""
-    paths = event_paths(list(events), folder, plain_name=plain_name)
-    for sequence, (file, plot) in zip(events.values(), paths, strict=True):
-        sequence.save(file)
-        plot_schedule(sequence, plot)
-    return [path for pair_of in paths for path in pair_of]
-
-
 def contact_overlap(
     events: Mapping[str, ContactEventSequence],
     truth: Mapping[str, tuple[np.ndarray, Frames]],
@@ -194,8 +163,3 @@ def contact_overlap(
             real = settle_frames(resample(frames, time, grid), OVERLAP_FRAME, sequence.settings)
             found[name] = iou(sequence_frames(sequence, grid), real, pairs).pooled
     return found
-
-
-def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file, in one piece or not at all."""
-    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")

@@ -21,9 +21,10 @@ import numpy as np
 import tyro
 
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
+from concent_warp.events.extract_events import extract_events
 from concent_warp.events.overlap import overlap
 from concent_warp.events.sequence import ContactEventSequence, Stage
-from concent_warp.ground import contact_overlap, extract_all
+from concent_warp.ground import contact_overlap
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -111,9 +112,9 @@ def digest(events: dict[str, ContactEventSequence]) -> list[str]:
 
 def repeated(model: Model, recording: Recording, args: Args) -> dict[str, Any]:
     """Extract again and again, here and in processes of their own, save and load, and count what differs."""
-    first = extract_all(model, recording)
+    first = extract_events(model, recording)
     reference = digest(first)
-    here = [digest(extract_all(model, recording)) for _ in range(args.repeats)]
+    here = [digest(extract_events(model, recording)) for _ in range(args.repeats)]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_hdf5(recording, folder / "demo.h5")
@@ -147,7 +148,7 @@ def repeated(model: Model, recording: Recording, args: Args) -> dict[str, Any]:
 
 def engines(model: Model, recording: Recording, seed: int) -> dict[str, Any]:
     """Compare the sequences of the two engines on one demonstration."""
-    one, other = (next(iter(extract_all(model, recording, engine).values())) for engine in ("mujoco", "warp"))
+    one, other = (next(iter(extract_events(model, recording, engine=engine).values())) for engine in ("mujoco", "warp"))
     found = overlap(one, other)
     stages = [[stage.name for stage in sequence.stages] for sequence in (one, other)]
     both = list(zip(one.stages, other.stages, strict=False))
@@ -180,7 +181,7 @@ def measure(args: Args) -> dict[str, Any]:
         recording = load_recording(file)
     scene = Scene(recording.scene)
     model = Model(scene, ContactGeometryCfg().build(scene)) if args.model is None else Model.load(args.model)
-    events = extract_all(model, recording)
+    events = extract_events(model, recording)
     names = list(events)
     frames = contact_overlap(
         events, {n: (t.time, t.contacts) for n, t in zip(names, truths, strict=True)}, scene.objects()

@@ -19,7 +19,7 @@ from concent_warp.comparison.table import markdown_table, rich_table
 from concent_warp.comparison.worst_spans import LEAST, alike
 from concent_warp.errors import EventsError
 from concent_warp.estimation.noise import WORDS
-from concent_warp.ground import extract_all
+from concent_warp.events.extract_events import extract_events
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
@@ -67,7 +67,7 @@ def run(arguments: Arguments) -> Comparison:
     events = {}
     if arguments.phases:
         try:
-            events = extract_all(models["model"], recording, arguments.engine)
+            events = extract_events(models["model"], recording, engine=arguments.engine)
         except EventsError as error:
             say(escape(f"No contact phases: {error}"))
     stages = {name: sequence.stages for name, sequence in events.items()}

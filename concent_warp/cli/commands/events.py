@@ -11,8 +11,8 @@ from concent_warp.cli.given_model import given_model
 from concent_warp.cli.summary import say_events
 from concent_warp.cli.terminal import say_written
 from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.extract_events import event_paths, extract_events, save_events
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.ground import event_paths, extract_all, save_events
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.select import EngineName
@@ -44,7 +44,7 @@ def run(arguments: Arguments) -> dict[str, ContactEventSequence]:
     for paths in event_paths([d.name for d in recording.demonstrations], arguments.out):
         for path in paths:
             claim_file(path, overwrite=arguments.overwrite)
-    found = extract_all(model, recording, arguments.engine, arguments.staging)
+    found = extract_events(model, recording, arguments.staging, engine=arguments.engine)
     make_folder(arguments.out)
     written = save_events(found, arguments.out)
     say_events(found)
