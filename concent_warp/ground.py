@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.comparison.result import Comparison
 from concent_warp.events.extract_events import extract_events, save_events
@@ -125,7 +125,7 @@ def ground(
     events = extract_events(fit.model, recording)
     save_events(events, folder, plain_name=False)
     stages = {name: sequence.stages for name, sequence in events.items()}
-    comparison = compare(models, recording, "mujoco", phases=stages)
+    comparison = compare_replays(models, recording, "mujoco", phases=stages)
     overlap = {}
     if truth is not None:
         overlap = {
@@ -137,7 +137,6 @@ def ground(
     write_report(
         folder / "report.html",
         recording,
-        models,
         comparison,
         events=events,
         fit=fit,

@@ -5,6 +5,7 @@ On disk one ``model.toml`` with files beside it.
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -15,9 +16,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
+from concent_warp.effects.registry import effect_class
 from concent_warp.effects.table import checked_values, effects_table, read_effects
 from concent_warp.errors import ModelError
 from concent_warp.files import write_text
+from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
@@ -42,6 +45,12 @@ class Model:
     """Scene, contact geometry, contact parameters and effects.
 
     Time step, integrator and solver are those of the scene's MJCF.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> model = cw.Model.from_recording(cw.load_recording(cw.example("servo")))
+        >>> model.add_effect("joint_friction", values={"torque[hinge]": 0.03}).effects[0].values
+        (0.03,)
     """
 
     scene: Scene
@@ -49,6 +58,11 @@ class Model:
     contact: ContactParameters = field(default_factory=ContactParameters)
     effects: tuple[AddedEffect, ...] = ()
     """Physical effects with the values of their parameters, in the order in which they were added."""
+
+    @staticmethod
+    def from_recording(recording: Recording) -> Model:
+        """Return the scene that a recording holds as a model, without contact geometry and effects."""
+        return Model(Scene(recording.scene, source=recording.source))
 
     def spec(self, collidable: np.ndarray | None = None) -> mujoco.MjSpec:
         """Return a fresh spec with the spheres attached, prepared for the effects; `finish` what is compiled from it.
@@ -95,17 +109,74 @@ class Model:
         added = AddedEffect(effect, checked_values(effect, base, values))
         return replace(self, effects=(*self.effects, added))
 
+    def add_effect(self, name: str, target: Sequence[str] = (), values: Mapping[str, float] | None = None) -> Model:
+        """Return a copy with one more effect, by its name in the library.
+
+        Args:
+            name: Name of the effect; `concent_warp.effects()` lists them.
+            target: Joints, actuators, bodies or sensors that it acts on; by default all that it may act on.
+            values: Values of its parameters by name, such as ``{"torque[joint1]": 0.1}``; those not named keep the
+                null value, at which the effect does nothing.
+
+        Raises:
+            ModelError: There is no such effect, target or parameter, a value is out of bounds, or the model has the
+                effect already.
+        """
+        kind, base, model = effect_class(name), self.compile(), self
+        chosen = [kind(*target)] if target else [kind(*names) for names in kind.targets(base)]
+        if not chosen:
+            expected = "the world" if kind.kind == "none" else f"a suitable {kind.kind}"
+            raise ModelError(f"there is nothing for {name} to act on", where=self.scene.source, expected=expected)
+        known: list[str] = []
+        for effect in chosen:
+            effect.check(base)
+            names = [p.name for p in effect.parameters(base)]
+            known += names
+            model = model.add(effect, {one: value for one, value in (values or {}).items() if one in names})
+        for wrong in set(values or {}) - set(known):
+            near = difflib.get_close_matches(wrong, known, n=1)
+            fix = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
+            raise ModelError(f"{name} has no parameter {wrong!r} here", fix=fix)
+        return model
+
+    def check_recording(self, recording: Recording) -> None:
+        """Check that a recording can be of this model.
+
+        Raises:
+            ModelError: Other actuators were commanded than the model has, or the initial state has another number of
+                positions.
+        """
+        compiled = self.scene.model
+        actuators = sorted(compiled.actuator(i).name for i in range(compiled.nu))
+        for demonstration in recording.demonstrations:
+            commanded = sorted(demonstration.action)
+            if commanded != actuators:
+                raise self._refusal(recording, f"actuators {commanded}", actuators)
+            if demonstration.qpos is not None and len(demonstration.qpos) != compiled.nq:
+                raise self._refusal(recording, f"{len(demonstration.qpos)} positions in the state", compiled.nq)
+
+    def _refusal(self, recording: Recording, expected: str, found: object) -> ModelError:
+        """Return the error that says how model and recording differ."""
+        return ModelError(
+            f"the model is of another robot or scene than the recording {recording.source}",
+            where=self.scene.source,
+            expected=expected,
+            found=found,
+            fix="give a model made from this recording's scene",
+        )
+
     def without(self, index: int) -> Model:
         """Return a copy without the effect at a position of `effects`."""
         return replace(self, effects=tuple(a for i, a in enumerate(self.effects) if i != index))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write `path` (``.toml``), the scene as ``.xml`` and the geometry as ``.npz`` beside it.
 
         Each file is written in one piece; the ``.toml`` last, so that it never names files that are not there.
         """
         import tomli_w
 
+        path = Path(path)
         document: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         document["scene"] = f"{path.stem}.scene.xml"
         write_text(path.with_name(document["scene"]), self.scene.xml)
@@ -118,11 +189,12 @@ class Model:
         write_text(path, tomli_w.dumps(document))
 
     @staticmethod
-    def load(path: Path) -> Model:
+    def load(path: str | Path) -> Model:
         """Read a ``model.toml``, or a plain MJCF (``.xml``) as a model without contact geometry.
 
         Raises `ModelError` or `SceneError` with one sentence that says what is wrong.
         """
+        path = Path(path)
         if path.suffix == ".xml":
             return Model(Scene.from_mjcf(path))
         if not path.is_file():

@@ -45,7 +45,8 @@ from benchmarks.diagnose.real_report import NAME as REAL
 from benchmarks.diagnose.sysid_toolbox import fit_toolbox
 from benchmarks.fit.held_out import noise_errors, spans_of
 from benchmarks.pages import ROOT, machine, read_data, write_data
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 

@@ -27,8 +27,8 @@ import tyro
 from benchmarks.diagnose.hidden_effects_data import DataSet, Kind, cases, make
 from benchmarks.diagnose.hidden_effects_report import write_again, write_report
 from benchmarks.pages import machine, machine_line
-from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnosis.diagnose import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
 from concent_warp.model import Model
@@ -119,7 +119,7 @@ def study(case: DataSet, out: Path, jobs: int = 1) -> dict[str, Any]:
     begun = time.perf_counter()
     try:
         cfg = DiagnosisCfg(jobs=jobs, seed=case.seed, explain=False)
-        found = diagnose_with_checkpoint(Model(data.scene), data.recording, out / "pieces" / case.name, cfg)
+        found = diagnose(Model(data.scene), data.recording, cfg, out=out / "pieces" / case.name)
         result |= found.to_json()
     except ConcentError as error:
         result |= {"error": str(error)}

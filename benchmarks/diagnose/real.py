@@ -34,8 +34,9 @@ import tyro
 from benchmarks.diagnose.real_report import NAME, write_report
 from benchmarks.fit.held_out import Spans, by_demonstration, change, cut_spans, prediction_errors
 from benchmarks.pages import ROOT, machine, read_data, write_data
-from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, silent
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.least_squares import FitCfg, Solver
@@ -191,8 +192,8 @@ def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
     title, model, seen, judges = case.title, case.model, case.seen, case.judges
     begin = time.perf_counter()
     cfg = DiagnosisCfg(additions=ADDITIONS[part], jobs=args.jobs, explain=False)
-    diagnosis = diagnose_with_checkpoint(
-        model, seen, args.pieces, cfg, lambda share, text: progress(title, begin, share, text)
+    diagnosis = diagnose(
+        model, seen, cfg, out=args.pieces, progress=lambda share, text: progress(title, begin, share, text)
     )
     spent = time.perf_counter() - begin
     print(f"\n{title}: {diagnosis.verdict}, {[f.name for f in diagnosis.accepted]}, {spent:.0f} s", flush=True)

@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_data, write_page
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.fit.newton.scale_factors import FactorCfg, factors
 from concent_warp.model import ContactParameters, Model

@@ -2,33 +2,111 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from concent_warp.comparison.contact_names import Partners
-from concent_warp.comparison.phases import Phase, StageLike, phases_by_body, stage_phases
+from concent_warp.comparison.phases import Phase, StageLike, phases_by_body, stage_phases, tell_a_task
 from concent_warp.comparison.residuals import instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.worst_spans import ranked, worst_places
-from concent_warp.errors import ModelError, RecordingError
+from concent_warp.errors import EventsError, ModelError, RecordingError
+from concent_warp.events.extract_events import extract_events
+from concent_warp.files import write_json
+from concent_warp.model import Model
 from concent_warp.simulate.replay import replay
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
-    from concent_warp.model import Model
+    from concent_warp.events.sequence import ContactEventSequence
     from concent_warp.recording.recording import Recording
 
 
+@dataclass(frozen=True)
+class CompareCfg:
+    """Settings of a comparison."""
+
+    phases: Literal["auto", "motion", "none"] = "auto"
+    """How time is divided: "auto" takes the contact stages of a task found in the replay of the last model and, where
+    there are none, phases of motion (free flight, impact, sliding, ...); "none" does not divide it."""
+    demonstrations: tuple[str, ...] = ()
+    """Demonstrations to compare on; all where empty."""
+    seed: int = 0
+    """Seed of the bootstrap."""
+
+
 def compare(
+    models: Model | Mapping[str, Model],
+    recording: Recording,
+    cfg: CompareCfg | None = None,
+    *,
+    events: Mapping[str, ContactEventSequence] | None = None,
+    engine: EngineName = "mujoco",
+    out: str | Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Comparison:
+    """Replay demonstrations in one or more models and compare what they predict with what was measured.
+
+    Each model keeps its own time step, integrator and solver.
+
+    Args:
+        models: A model, or several by name, the baseline first.
+        recording: What was commanded and measured.
+        cfg: Settings.
+        events: Contact event sequences by demonstration, whose stages divide the time; extracted from the replay of the
+            last model by default.
+        engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device; single replays are fastest in
+            C MuJoCo.
+        out: JSON file for all figures, SI units.
+        progress: Called with the share done, 0..1.
+
+    Raises:
+        ModelError: There is no model, or a model is of another robot than the recording.
+        RecordingError: There is no such demonstration, or it measures nothing, or what a model does not.
+        EngineError: A model cannot be simulated.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> model = cw.Model.from_recording(recording)
+        >>> better = model.add_effect("joint_friction", values={"torque[hinge]": 0.03})
+        >>> comparison = cw.compare({"before": model, "after": better}, recording)
+        >>> comparison.difference("hinge_position").verdict
+        'fallen'
+    """
+    cfg = cfg or CompareCfg()
+    named = {"model": models} if isinstance(models, Model) else dict(models)
+    for model in named.values():
+        model.check_recording(recording)
+    chosen = recording.only(cfg.demonstrations)
+    remarks: tuple[str, ...] = ()
+    if events is None and cfg.phases == "auto" and named:
+        try:
+            events = extract_events(list(named.values())[-1], chosen, engine=engine)
+        except EventsError as error:
+            remarks = (f"No contact stages: {error}",)
+    stages = {name: sequence.stages for name, sequence in (events or {}).items()}
+    moving = cfg.phases != "none" and not tell_a_task(stages)
+    found = compare_replays(named, chosen, engine, phases=None if moving else stages, seed=cfg.seed, progress=progress)
+    found = replace(found, events=events or {}, remarks=remarks)
+    if out is not None:
+        write_json(Path(out), found.to_json())
+    return found
+
+
+def compare_replays(
     models: Mapping[str, Model],
     recording: Recording,
-    engine: EngineName = "auto",
+    engine: EngineName = "mujoco",
     *,
     phases: Mapping[str, Sequence[StageLike]] | None = None,
     demonstrations: Sequence[str] | None = None,
     seed: int = 0,
+    progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Replay demonstrations in each model and compare what it predicts with what was measured.
 
@@ -43,6 +121,7 @@ def compare(
             of the last model instead (`phases_by_body`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
+        progress: Called with the share done, 0..1.
 
     Raises:
         ModelError: There is no model.
@@ -68,6 +147,8 @@ def compare(
             if name == last:
                 partners[d.name] = Partners.of_replay(model, compiled, rollout)
                 moving[d.name] = phases_by_body(model, compiled, rollout)
+            if progress is not None:
+                progress(len(found) / (len(models) * len(chosen)))
     if not any(found.values()):
         raise RecordingError("nothing was measured that could be compared with a model", where=recording.source)
     staged = phases or {}
@@ -82,7 +163,7 @@ def compare(
         for place in worst_places(found[last, d.name], moving.get(d.name, {None: ()}), partners[d.name], d.name)
     ]
     return Comparison(
-        models=tuple(models),
+        models=dict(models),
         demonstrations=tuple(d.name for d in chosen),
         residuals=found,
         phases=spans,

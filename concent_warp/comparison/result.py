@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,8 @@ from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.worst_spans import Place
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.estimation.noise import Source
+from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.model import Model
 
 CARRIED = (FREE, "pick")
 """Phases in which an object stands still or is carried: what it does then says little of its contact geometry."""
@@ -77,7 +79,8 @@ class Difference:
 class Comparison:
     """Residuals of some models on the same demonstrations. The first model is `before`, the last one `after`."""
 
-    models: tuple[str, ...]
+    models: Mapping[str, Model]
+    """By name, the baseline first."""
     demonstrations: tuple[str, ...]
     residuals: Mapping[tuple[str, str], tuple[Residual, ...]]
     """By model and demonstration; the same channels in the same order for each model."""
@@ -91,16 +94,20 @@ class Comparison:
     """Where the last model fails worst, the worst first."""
     staged: bool = True
     """Whether the phases are contact stages; else they are ways of moving."""
+    events: Mapping[str, ContactEventSequence] = field(default_factory=dict)
+    """Contact event sequences of the last model, by demonstration, where they were extracted."""
+    remarks: tuple[str, ...] = ()
+    """What to know about the comparison, a sentence each."""
 
     @property
     def before(self) -> str:
         """Name of the first model."""
-        return self.models[0]
+        return next(iter(self.models))
 
     @property
     def after(self) -> str:
         """Name of the last model."""
-        return self.models[-1]
+        return list(self.models)[-1]
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

@@ -17,56 +17,51 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from concent_warp.diagnosis.diagnose import Diagnosis, DiagnosisCfg, Procedure, Progress, silent
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.procedure import Procedure, Progress
 from concent_warp.diagnosis.search.profile_likelihood import Look
 from concent_warp.diagnosis.search.steps import Candidate, Node, Screened
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
-from concent_warp.errors import ConcentError
 from concent_warp.fit.effects.cross_validation import Sums
 from concent_warp.fit.effects.least_squares import Fit, Linear
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Recording
+from concent_warp.run_folder import make_folder, versions
+from concent_warp.simulate.select import EngineName
 
 T = TypeVar("T")
 KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums, Look)}
 """What results are made of, besides effects and models."""
 
 
-def diagnose_with_checkpoint(
-    model: Model,
-    recording: Recording,
-    folder: Path,
-    cfg: DiagnosisCfg | None = None,
-    progress: Progress | None = None,
-    versions: Mapping[str, str] | None = None,
-) -> Diagnosis:
-    """Find which effect a model lacks, see `concent_warp.diagnosis.diagnose.diagnose`; keep what is done in a folder.
+def checkpointed_procedure(
+    model: Model, recording: Recording, cfg: DiagnosisCfg, progress: Progress, engine: EngineName, folder: Path
+) -> Procedure:
+    """Return a diagnosis that keeps what is done in a folder; parts of other diagnoses in it are left alone.
 
-    Args:
-        model: The model.
-        recording: What was commanded and measured.
-        folder: Where finished pieces are kept; it is made if it is not there. Pieces of other diagnoses are left alone.
-        cfg: Settings.
-        progress: Called with the share done, 0..1, and what is being done.
-        versions: Of the programs that the results depend on.
+    Raises:
+        ConcentError: The folder cannot be made.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConcentError("the folder cannot be made", where=folder, found=error.strerror) from None
-    cfg = cfg or DiagnosisCfg()
-    key = fingerprint(model, recording, cfg, versions or {})
-    return CheckpointedProcedure(model, recording, cfg, progress or silent, folder, key).run()
+    make_folder(folder)
+    key = fingerprint(model, recording, cfg, versions() | {"engine": engine})
+    return CheckpointedProcedure(model, recording, cfg, progress, folder, key, engine)
 
 
 class CheckpointedProcedure(Procedure):
     """A diagnosis whose finished pieces are kept in a folder."""
 
     def __init__(
-        self, model: Model, recording: Recording, cfg: DiagnosisCfg, progress: Progress, folder: Path, key: str
+        self,
+        model: Model,
+        recording: Recording,
+        cfg: DiagnosisCfg,
+        progress: Progress,
+        folder: Path,
+        key: str,
+        engine: EngineName = "mujoco",
     ) -> None:
-        super().__init__(model, recording, cfg, progress)
+        super().__init__(model, recording, cfg, progress, engine)
         self.folder, self.key = folder, key
 
     def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:

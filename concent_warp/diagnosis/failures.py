@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
 from concent_warp.comparison.worst_spans import Place, alike
 from concent_warp.diagnosis.forces.describe import body_sentence, joint_sentence
@@ -56,7 +56,7 @@ def where(
     """
     started = with_starts(model, recording, windows, offsets)
     try:
-        found = compare({"model": model}, started, engine).places
+        found = compare_replays({"model": model}, started, engine).places
     except ConcentError:
         found = ()
     kept: dict[tuple, Place] = {}

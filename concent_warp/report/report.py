@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import concent_warp
 from concent_warp.comparison.bootstrap import RULE
 from concent_warp.comparison.result import Comparison, finite
+from concent_warp.diagnosis.forces.result import Location
+from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_text
 from concent_warp.report.diagnosis import bullet_list, diagnosis_section
@@ -32,9 +34,8 @@ alone, so that the page stays small."""
 
 
 def write_report(
-    path: Path,
+    path: str | Path,
     recording: Recording,
-    models: Mapping[str, Model],
     comparison: Comparison,
     *,
     events: Mapping[str, ContactEventSequence] | None = None,
@@ -42,26 +43,33 @@ def write_report(
     fitted: Sequence[str] = (),
     overlap: Mapping[str, Mapping[str, float]] | None = None,
     settings: Mapping[str, Any] | None = None,
-    diagnosis: Mapping[str, Any] | None = None,
-    location: Mapping[str, Any] | None = None,
+    diagnosis: Diagnosis | Mapping[str, Any] | None = None,
+    location: Location | Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report, in one piece or not at all.
 
     Args:
         path: The ``.html`` file.
         recording: What was commanded and measured.
-        models: The models of the comparison, by the same names.
-        comparison: Of these models on this recording.
-        events: Contact event sequences of the last model, by demonstration.
+        comparison: Of one or more models with this recording.
+        events: Contact event sequences of the last model, by demonstration; by default those of the comparison.
         fit: The fit that led from the first model to the last.
         fitted: Demonstrations that the fit has seen; empty where there was none.
         overlap: Overlap of contact frames with the truth, by model and demonstration, where the truth is known.
         settings: ``command``, ``versions`` and ``settings`` to show.
-        diagnosis: JSON object of a diagnosis (`concent_warp.report.diagnosis`).
-        location: JSON object of a location (`concent_warp.diagnosis.forces.result.Location.to_json`).
+        diagnosis: A diagnosis, or its JSON object.
+        location: Unexplained forces, or their JSON object.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> comparison = cw.compare(cw.Model.from_recording(recording), recording)
+        >>> cw.write_report("report.html", recording, comparison)
     """
-    events, overlap = events or {}, overlap or {}
-    shown_models = {name: models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
+    path, events, overlap = Path(path), events or comparison.events, overlap or {}
+    diagnosis = diagnosis.to_json() if isinstance(diagnosis, Diagnosis) else diagnosis
+    location = location.to_json() if isinstance(location, Location) else location
+    shown_models = {name: comparison.models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
     chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
     data = page_data(shown_models, chosen, comparison, events, fit)
     data["forces"] = forces(data, location)

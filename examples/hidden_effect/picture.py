@@ -13,7 +13,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 
@@ -26,7 +26,7 @@ def main(diagnosis: Path, recording: Path, before: Path, after: Path, out: Path)
     """Draw and save."""
     found = json.loads(diagnosis.read_text())
     first = [e for e in found["effects"] if e["step"] == 0][:MOST]
-    comparison = compare(
+    comparison = compare_replays(
         {"before": Model.load(before), "after": Model.load(after)}, load_recording(recording), "mujoco"
     )
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), width_ratios=[1, 1.25], layout="constrained")

@@ -2,7 +2,8 @@
 
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.model import Model
 
 RIVALS = ("length_scale", "time_base", "size", "gravity_tilt", "air_drag", "contact_compliance")

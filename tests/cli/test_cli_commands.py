@@ -70,7 +70,7 @@ def test_compare_prints_one_json_object_and_nothing_else(bench, capsys):
 def test_compare_shows_a_table_and_writes_a_report(bench, tmp_path, capsys):
     html = tmp_path / "r.html"
     arguments = ["compare", str(bench / "demo.h5"), "--model", str(bench / "inset.toml"), "--html", str(html)]
-    assert main([*arguments, "--markdown", "--no-phases"]) == 0
+    assert main([*arguments, "--markdown", "--phases", "none"]) == 0
     out = capsys.readouterr().out
     assert "| block_position | all |" in out
     assert "mean baseline" not in out

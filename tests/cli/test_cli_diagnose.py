@@ -106,10 +106,10 @@ def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, ca
         raise KeyboardInterrupt
 
     monkeypatch.setattr(CheckpointedProcedure, "fitted", interrupted)
-    arguments = ["--checkpoint", str(tmp_path / "kept")]
+    arguments = ["--out", str(tmp_path / "kept")]
     assert diagnose(swing / "demo.h5", *arguments) == 130
     error = capsys.readouterr().err
-    assert f"go on with: concent diagnose {swing / 'demo.h5'}" in error
+    assert f"continue with: concent diagnose {swing / 'demo.h5'}" in error
     assert "Traceback" not in error
     assert list((tmp_path / "kept").glob("*.npz"))
     monkeypatch.setattr(CheckpointedProcedure, "fitted", finish)
@@ -118,12 +118,12 @@ def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, ca
 
 
 def test_without_a_checkpoint_an_interruption_says_what_would_have_helped(swing, capsys, monkeypatch):
-    def interrupted(*_) -> Diagnosis:
+    def interrupted(*_, **__) -> Diagnosis:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", interrupted)
     assert diagnose(swing / "demo.h5") == 130
-    assert "--checkpoint FOLDER" in capsys.readouterr().err
+    assert "--out FOLDER" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("case", ["nothing measured", "one sample", "all missing", "clock backwards"])

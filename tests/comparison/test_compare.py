@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import Phase
 from concent_warp.comparison.table import markdown_table, rich_table
 from concent_warp.comparison.units import shown
@@ -67,7 +67,7 @@ def recorded(truth, names=("demo_0",), noise=1e-4):
 def comparison():
     truth = model(2)
     recording = recorded(truth, ("demo_0", "demo_1"))
-    return compare(
+    return compare_replays(
         {"wrong": model(6), "right": truth}, recording, "mujoco", phases={"demo_0": STAGES, "demo_1": STAGES}
     )
 
@@ -111,14 +111,14 @@ def test_before_is_the_first_model_and_the_fall_of_the_error_is_significant(comp
 
 def test_two_equal_models_differ_by_nothing():
     recording = recorded(model(2))
-    found = compare({"a": model(4), "b": model(4)}, recording, "mujoco").difference("rail")
+    found = compare_replays({"a": model(4), "b": model(4)}, recording, "mujoco").difference("rail")
     assert (found.mean, found.low, found.high, found.verdict) == (0, 0, 0, "unclear")
 
 
 def test_each_model_keeps_its_own_integrator():
     truth = model(2, "Euler")
     recording = recorded(truth)
-    found = compare({"other": model(2, "RK4"), "same": truth}, recording, "mujoco")
+    found = compare_replays({"other": model(2, "RK4"), "same": truth}, recording, "mujoco")
     assert found.summarise("same", "cart").max < 1e-9
     assert found.summarise("other", "cart").max > 1e-5
 
@@ -139,7 +139,7 @@ def test_json_is_valid_and_holds_every_channel_phase_and_model(comparison):
 
 def test_a_model_that_diverges_is_named_and_never_looks_good():
     recording = recorded(model(2))
-    found = compare({"good": model(2), "wild": model(-600)}, recording, "mujoco")
+    found = compare_replays({"good": model(2), "wild": model(-600)}, recording, "mujoco")
     assert 0 < found.diverged["wild", "demo_0"] < 2
     assert np.isinf(found.summarise("wild", "rail").mean)
     assert "diverged" in markdown_table(found)
@@ -148,7 +148,7 @@ def test_a_model_that_diverges_is_named_and_never_looks_good():
 
 
 def test_one_model_alone_has_no_difference_and_a_shorter_table():
-    found = compare({"only": model(3)}, recorded(model(2)), "mujoco")
+    found = compare_replays({"only": model(3)}, recorded(model(2)), "mujoco")
     assert found.to_json()["differences"] == []
     assert "change" not in markdown_table(found)
 
@@ -172,27 +172,27 @@ def test_numbers_are_shown_in_mm_and_degrees(value, unit, text):
 
 def test_only_the_named_demonstrations_are_compared():
     recording = recorded(model(2), ("demo_0", "demo_1"))
-    found = compare({"m": model(2)}, recording, "mujoco", demonstrations=["demo_1"])
+    found = compare_replays({"m": model(2)}, recording, "mujoco", demonstrations=["demo_1"])
     assert found.demonstrations == ("demo_1",)
     with pytest.raises(RecordingError, match="demo_7"):
-        compare({"m": model(2)}, recording, "mujoco", demonstrations=["demo_7"])
+        compare_replays({"m": model(2)}, recording, "mujoco", demonstrations=["demo_7"])
 
 
 def test_nothing_to_compare_is_an_error():
     with pytest.raises(ModelError, match="no model"):
-        compare({}, recorded(model(2)), "mujoco")
+        compare_replays({}, recorded(model(2)), "mujoco")
     with pytest.raises(ModelError, match="'elbow'"):
-        compare({"m": model(2)}, recorded(model(2)), "mujoco").summarise("m", "elbow")
+        compare_replays({"m": model(2)}, recorded(model(2)), "mujoco").summarise("m", "elbow")
 
 
 def test_a_recording_that_measures_nothing_or_what_the_model_lacks_is_an_error():
     recording = recorded(model(2))
     d = replace(recording[0], qpos=None, qvel=None)
     with pytest.raises(RecordingError, match="nothing was measured"):
-        compare({"m": model(2)}, replace(recording, demonstrations=(replace(d, measured={}),)), "mujoco")
+        compare_replays({"m": model(2)}, replace(recording, demonstrations=(replace(d, measured={}),)), "mujoco")
     bare = Model(Scene(model(2).scene.xml.replace('<jointpos name="rail" joint="rail"/>', "")))
     with pytest.raises(RecordingError, match="add that sensor"):
-        compare({"m": bare}, replace(recording, demonstrations=(d,)), "mujoco")
+        compare_replays({"m": bare}, replace(recording, demonstrations=(d,)), "mujoco")
 
 
 def test_a_summary_can_be_of_some_demonstrations(comparison):
@@ -203,13 +203,13 @@ def test_a_summary_can_be_of_some_demonstrations(comparison):
 
 
 def test_without_any_stage_times_are_not_told_apart():
-    found = compare({"m": model(2)}, recorded(model(2)), "mujoco", phases={"demo_0": ()})
+    found = compare_replays({"m": model(2)}, recorded(model(2)), "mujoco", phases={"demo_0": ()})
     assert found.phase_names == ()
     assert found.to_json()["headline"]["phases"] == []
 
 
 def test_without_stages_the_ways_of_moving_are_the_phases():
-    found = compare({"m": model(6)}, recorded(model(2)), "mujoco")
+    found = compare_replays({"m": model(6)}, recorded(model(2)), "mujoco")
     assert set(found.phase_names) == {"free"}
     assert found.contact_phases() == ()
     assert found.to_json()["phases_are"] == "ways of moving"
@@ -225,7 +225,7 @@ def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):
 
 def test_places_are_those_of_the_last_model(comparison):
     assert "rail" not in {c for p in comparison.places for c in p.channels}
-    swapped = compare({"right": model(2), "wrong": model(6)}, recorded(model(2)), "mujoco")
+    swapped = compare_replays({"right": model(2), "wrong": model(6)}, recorded(model(2)), "mujoco")
     assert "rail" in {c for p in swapped.places for c in p.channels}
 
 
@@ -250,7 +250,9 @@ def stale(recording):
     ("effect", "value", "changed"), [(ActuatorDelay("drive"), 0.06, delayed), (Latency("rail"), 0.05, stale)]
 )
 def test_effects_of_a_model_act_in_its_replay_and_in_what_it_reads(effect, value, changed):
-    found = compare({"without": model(2), "with": model(2).add(effect, [value])}, changed(recorded(model(2))), "mujoco")
+    found = compare_replays(
+        {"without": model(2), "with": model(2).add(effect, [value])}, changed(recorded(model(2))), "mujoco"
+    )
     without, added = (found.summarise(name, "rail") for name in ("without", "with"))
     assert without.mean > 20 * (added.noise or np.inf)
     assert added.mean < 1.2 * (added.noise or 0)

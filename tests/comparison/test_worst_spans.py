@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.worst_spans import LEAST, channel_places, ranked, smoothed, worst_places
@@ -158,7 +158,9 @@ def pushed():
         "demo_0", qpos=m.qpos0.copy(), qvel=np.zeros(m.nv), action={"drive": Channel(time, command)}, measured=measured
     )
     again = replace(demonstration, name="demo_1")
-    return compare({"model": Model(Scene(PUSH.format(stop=0.11)))}, Recording(PUSH, (demonstration, again)), "mujoco")
+    return compare_replays(
+        {"model": Model(Scene(PUSH.format(stop=0.11)))}, Recording(PUSH, (demonstration, again)), "mujoco"
+    )
 
 
 def test_the_worst_place_names_body_phase_partner_and_direction(pushed):

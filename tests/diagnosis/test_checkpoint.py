@@ -3,9 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis import diagnose as procedure
-from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint, load, save
-from concent_warp.diagnosis.diagnose import DiagnosisCfg
+from concent_warp.diagnosis import procedure
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.checkpoint import load, save
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search.steps import Screened
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
@@ -23,7 +24,7 @@ def recording():
 @pytest.fixture(scope="module")
 def done(recording, tmp_path_factory):
     folder = tmp_path_factory.mktemp("checkpoint") / "new"
-    return folder, diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+    return folder, diagnose(drawing(recording), recording, CFG, out=folder)
 
 
 def counted(monkeypatch):
@@ -42,7 +43,7 @@ def counted(monkeypatch):
 def test_a_second_run_reads_every_piece_and_ends_the_same(recording, done, monkeypatch):
     folder, first = done
     tasks = counted(monkeypatch)
-    again = diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+    again = diagnose(drawing(recording), recording, CFG, out=folder)
     assert tasks == []
     assert_same(again.to_json(), first.to_json())
     assert [a.values for a in again.model.effects] == [a.values for a in first.model.effects]
@@ -57,10 +58,10 @@ def test_an_interrupted_run_goes_on_to_the_same_end(recording, done, tmp_path, m
             raise Stop
 
     with pytest.raises(Stop):
-        diagnose_with_checkpoint(drawing(recording), recording, tmp_path, CFG, stop)
+        diagnose(drawing(recording), recording, CFG, out=tmp_path, progress=stop)
     assert len(list(tmp_path.glob("*.npz"))) >= 3
     tasks = counted(monkeypatch)
-    again = diagnose_with_checkpoint(drawing(recording), recording, tmp_path, CFG)
+    again = diagnose(drawing(recording), recording, CFG, out=tmp_path)
     assert "screen" not in tasks
     assert "fit_candidate" not in tasks
     assert_same(again.to_json(), done[1].to_json())
@@ -72,7 +73,7 @@ def test_damaged_pieces_are_done_again(recording, done, monkeypatch):
     pieces[0].write_bytes(b"nothing")
     pieces[1].write_bytes(pieces[1].read_bytes()[:200])
     tasks = counted(monkeypatch)
-    again = diagnose_with_checkpoint(drawing(recording), recording, folder, CFG)
+    again = diagnose(drawing(recording), recording, CFG, out=folder)
     assert len(tasks) == 2
     assert_same(again.to_json(), first.to_json())
 
@@ -89,7 +90,7 @@ def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monke
         model = model.add(effect_class("joint_friction")("hinge"))
     before = len(list(folder.glob("*.npz")))
     tasks = counted(monkeypatch)
-    diagnose_with_checkpoint(model, used, folder, cfg)
+    diagnose(model, used, cfg, out=folder)
     assert tasks
     assert len(list(folder.glob("*.npz"))) == before + len(tasks)
 
@@ -109,4 +110,4 @@ def test_what_is_kept_comes_back_as_it_was(recording, tmp_path):
 def test_a_folder_that_cannot_be_made_is_an_error(recording, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConcentError, match="cannot be made"):
-        diagnose_with_checkpoint(drawing(recording), recording, tmp_path / "file" / "folder", CFG)
+        diagnose(drawing(recording), recording, CFG, out=tmp_path / "file" / "folder")

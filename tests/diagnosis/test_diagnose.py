@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.model import Model
@@ -108,7 +109,7 @@ def test_readings_that_are_all_noise_are_said_to_be(stated):
 def test_progress_rises_and_says_what_is_done():
     seen = []
     recording = swung(damping=0.0)
-    diagnose(drawing(recording), recording, CFG, lambda share, text: seen.append((share, text)))
+    diagnose(drawing(recording), recording, CFG, progress=lambda share, text: seen.append((share, text)))
     shares = [share for share, _ in seen]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0

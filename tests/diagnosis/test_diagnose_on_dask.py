@@ -3,7 +3,8 @@
 import joblib
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from tests.diagnosis.same_results import assert_same
 from tests.scenes.swinging import drawing, swung
 

@@ -82,7 +82,7 @@ def test_recording_that_cannot_be_compared_has_no_places(monkeypatch: pytest.Mon
     def refuse(*_, **__):
         raise RecordingError("nothing was measured")
 
-    monkeypatch.setattr(module, "compare", refuse)
+    monkeypatch.setattr(module, "compare_replays", refuse)
     assert where(model(), recorded(3.0)) == []
 
 

@@ -2,7 +2,7 @@
 
 import os
 
-from concent_warp.diagnosis.diagnose import run_all
+from concent_warp.diagnosis.procedure import run_all
 from concent_warp.simulate.threads import at_most, simulations_at_a_time
 
 CPUS = len(os.sched_getaffinity(0))

@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.events.extract import extract
 from concent_warp.fit.geometry.search import FitResult
@@ -117,7 +117,7 @@ class Case:
         engine = MujocoEngine(self.after)
         self.events = {d.name: extract(self.after, d, engine) for d in self.recording.demonstrations}
         stages = {name: sequence.stages for name, sequence in self.events.items()}
-        self.comparison = compare(self.models, self.recording, "mujoco", phases=stages)
+        self.comparison = compare_replays(self.models, self.recording, "mujoco", phases=stages)
         keys = ("loss", "held_out", "best", "candidates")
         history = [
             {"generation": k + 1, **dict.fromkeys(keys, 0.005 / (k + 1)), "simulations": 8 * k, "seconds": 0.1 * k}
@@ -127,7 +127,6 @@ class Case:
         write_report(
             path,
             self.recording,
-            self.models,
             self.comparison,
             events=self.events,
             fit=self.fit,

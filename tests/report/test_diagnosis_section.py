@@ -3,7 +3,7 @@ from html import unescape
 
 import pytest
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.report.diagnosis import accepted, bars, diagnosis_section, headline
 from concent_warp.report.report import write_report
 
@@ -126,8 +126,8 @@ def test_names_of_a_diagnosis_cannot_become_markup():
 def test_the_section_stands_in_the_report(case, tmp_path):
     models = {"model": case.after}
     path = tmp_path / "r.html"
-    found = compare(models, case.recording, "mujoco")
-    write_report(path, case.recording, models, found, diagnosis=NAMED)
+    found = compare_replays(models, case.recording, "mujoco")
+    write_report(path, case.recording, found, diagnosis=NAMED)
     assert "The model lacks joint friction" in path.read_text()
-    write_report(path, case.recording, models, found)
+    write_report(path, case.recording, found)
     assert 'id="diagnosis"' not in path.read_text()

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.compare import compare
+from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.units import shown
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -66,7 +66,7 @@ def test_data_cannot_end_the_script_that_it_stands_in(case, tmp_path):
     assert renamed != case.recording.scene
     models = {"m</script>": Model(Scene(renamed))}
     path = tmp_path / "r.html"
-    write_report(path, case.recording, models, compare(models, case.recording, "mujoco"))
+    write_report(path, case.recording, compare_replays(models, case.recording, "mujoco"))
     assert "m</script>" not in path.read_text()
     assert embedded(path)["models"][0]["name"] == "m</script>"
 
@@ -134,7 +134,7 @@ def test_tracked_points_stand_in_for_a_pose_that_was_not_measured(case, tmp_path
     blind = replace(case.recording, demonstrations=(replace(d, measured={"rail": d.measured["rail"]}),))
     models = {"model": case.after}
     path = tmp_path / "r.html"
-    write_report(path, blind, models, compare(models, blind, "mujoco"))
+    write_report(path, blind, compare_replays(models, blind, "mujoco"))
     motion = embedded(path)["demonstrations"][0]["motion"]
     assert set(motion["measured"]) == {"pusher"}
     assert motion["points"]["block"]["count"] == 8
@@ -192,7 +192,7 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     swing = Demonstration("demo_0", qpos=np.array([1.0]), qvel=np.zeros(1), measured={"angle": noisy})
     recording = Recording(PENDULUM, (swing,))
     models = {"model": Model(Scene(PENDULUM))}
-    write_report(tmp_path / "r.html", recording, models, compare(models, recording, "mujoco"))
+    write_report(tmp_path / "r.html", recording, compare_replays(models, recording, "mujoco"))
     text = (tmp_path / "r.html").read_text()
     assert "as much as the measurement noise alone would leave" in text
     assert "Nowhere does the error stand above 3 times the noise" in text
@@ -205,12 +205,12 @@ def test_unexplained_forces_are_told_and_drawn_where_there_are_any(case, text, d
     assert [f["label"] for f in data["forces"]] == ["0.412 N, slide"]
     assert 'id="forces-view"' in text
     models = {"model": case.after}
-    found = compare(models, case.recording, "mujoco")
-    write_report(tmp_path / "r.html", case.recording, models, found, location={"arrows": [], "sentences": ["nothing"]})
+    found = compare_replays(models, case.recording, "mujoco")
+    write_report(tmp_path / "r.html", case.recording, found, location={"arrows": [], "sentences": ["nothing"]})
     page = (tmp_path / "r.html").read_text()
     assert "<li>nothing</li>" in page
     assert 'id="forces-view"' not in page
-    write_report(tmp_path / "r.html", case.recording, models, found)
+    write_report(tmp_path / "r.html", case.recording, found)
     assert 'id="lacking"' not in (tmp_path / "r.html").read_text()
 
 
@@ -229,7 +229,7 @@ def test_spheres_are_told_apart_by_what_became_of_them(case, data):
 def test_a_comparison_of_one_model_without_events_makes_a_report_too(case, tmp_path):
     models = {"model": Model(Scene(case.recording.scene))}
     path = tmp_path / "plain.html"
-    write_report(path, case.recording, models, compare(models, case.recording, "mujoco"))
+    write_report(path, case.recording, compare_replays(models, case.recording, "mujoco"))
     page = path.read_text()
     assert 'id="schedule"' not in page
     assert 'id="geometry-0"' not in page

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,16 +11,15 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
-from concent_warp.cli.given_model import check_fits
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.effects.registry import effect_class, effects
-from concent_warp.errors import ConcentError, ModelError
+from concent_warp.effects.registry import effects
+from concent_warp.errors import ConcentError
 from concent_warp.model import Model
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
-    from concent_warp.effects.effect import Effect, Parameter
+    from concent_warp.effects.effect import Parameter
     from concent_warp.fit.effects.fit import FittedEffects
 
 
@@ -65,17 +63,16 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
             raise ConcentError(f"{option} is missing", fix="see concent add --help, or --list for all effects")
     assert arguments.model is not None
     assert arguments.out is not None
-    kind = effect_class(arguments.effect)
     model = Model.load(arguments.model)
     check_out(arguments.out, arguments.overwrite)
-    added = with_effect(model, chosen(model, kind, arguments.target), assigned(arguments.set))
+    added = model.add_effect(arguments.effect, arguments.target, assigned(arguments.set))
     fitted = None
     if arguments.fit is not None:
         from concent_warp.fit.effects.fit import fit_effects
         from concent_warp.recording.load import load_recording
 
         recording = load_recording(arguments.fit).only(arguments.demonstrations)
-        check_fits(model, recording, arguments.model)
+        model.check_recording(recording)
         with work_progress("fitting") as progress:
             fitted = fit_effects(added, recording, progress, window=arguments.window, engine=arguments.engine)
         added = fitted.model
@@ -101,21 +98,6 @@ def check_out(path: Path, overwrite: bool) -> None:
     claim_file(path, overwrite=overwrite)
 
 
-def chosen(model: Model, kind: type[Effect], target: Sequence[str]) -> list[Effect]:
-    """Return the effect on the targets asked for, or on each selection that it may act on.
-
-    Raises:
-        ModelError: There is nothing in the model that it may act on.
-    """
-    if target:
-        return [kind(*target)]
-    found = [kind(*names) for names in kind.targets(model.compile())]
-    if not found:
-        what = "the world" if kind.kind == "none" else f"a suitable {kind.kind}"
-        raise ModelError(f"there is nothing for {kind.name} to act on", where=model.scene.source, expected=what)
-    return found
-
-
 def assigned(given: Sequence[str]) -> dict[str, float]:
     """Return parameters' values from ``name=value``.
 
@@ -132,28 +114,6 @@ def assigned(given: Sequence[str]) -> dict[str, float]:
         if not name:
             raise ConcentError("--set is not right", expected="name=value with a number", found=text)
     return found
-
-
-def with_effect(model: Model, new: Sequence[Effect], values: Mapping[str, float]) -> Model:
-    """Return the model with effects at some of their parameters' values.
-
-    Raises:
-        ModelError: A target or a parameter does not exist, or a value is out of bounds.
-    """
-    known: list[str] = []
-    for effect in new:
-        effect.check(model.compile())
-        names = [p.name for p in effect.parameters(model.compile())]
-        known += names
-        model = model.add(effect, {name: values[name] for name in names if name in values})
-    for name in values:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            raise ModelError(
-                f"{new[0].name} has no parameter {name!r} here",
-                fix=f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}",
-            )
-    return model
 
 
 def say_effects(model: Model | None) -> None:

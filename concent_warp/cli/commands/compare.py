@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from rich.markup import escape
@@ -12,14 +13,11 @@ from rich.markup import escape
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.summary import say_diverged
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.comparison.compare import compare
-from concent_warp.comparison.phases import tell_a_task
+from concent_warp.comparison.compare import CompareCfg, compare
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import markdown_table, rich_table
 from concent_warp.comparison.worst_spans import LEAST, alike
-from concent_warp.errors import EventsError
 from concent_warp.estimation.noise import WORDS
-from concent_warp.events.extract_events import extract_events
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 from concent_warp.simulate.select import EngineName
@@ -49,8 +47,9 @@ class Arguments:
     """Tell phases apart for joints and other sensors too, not only for bodies."""
     html: Path | None = None
     """Write a report with charts, replay and 3D views to this file."""
-    phases: bool = True
-    """Tell phases apart: contact stages found in the replay of the model or, without any, ways of moving."""
+    phases: Literal["auto", "motion", "none"] = "auto"
+    """How time is divided: auto takes the contact stages of a task found in the replay of the model and, without any,
+    phases of motion."""
     places: int = 5
     """How many of the worst places to name."""
     overwrite: bool = False
@@ -64,15 +63,9 @@ def run(arguments: Arguments) -> Comparison:
     models["model"] = given_model(arguments.model, recording)
     if arguments.html is not None:
         claim_file(arguments.html, overwrite=arguments.overwrite)
-    events = {}
-    if arguments.phases:
-        try:
-            events = extract_events(models["model"], recording, engine=arguments.engine)
-        except EventsError as error:
-            say(escape(f"No contact phases: {error}"))
-    stages = {name: sequence.stages for name, sequence in events.items()}
-    moving = arguments.phases and not tell_a_task(stages)
-    found = compare(models, recording, arguments.engine, phases=None if moving else stages)
+    found = compare(models, recording, CompareCfg(arguments.phases), engine=arguments.engine)
+    for remark in found.remarks:
+        say(escape(remark))
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     elif arguments.markdown:
@@ -88,7 +81,7 @@ def run(arguments: Arguments) -> Comparison:
 
         settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
         make_folder(arguments.html.parent)
-        write_report(arguments.html, recording, models, found, events=events, settings=settings)
+        write_report(arguments.html, recording, found, settings=settings)
         if not arguments.json:
             say_written(arguments.html)
     return found

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.markup import escape
@@ -13,9 +14,9 @@ from rich.markup import escape
 from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.comparison.compare import compare
-from concent_warp.diagnosis.checkpoint import diagnose_with_checkpoint
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, diagnose
+from concent_warp.comparison.compare import compare_replays
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
@@ -63,8 +64,8 @@ class Arguments:
     """Processes at a time; -1: one a CPU."""
     seed: int = 0
     """Seed of all that is drawn."""
-    checkpoint: Path | None = None
-    """Folder in which finished pieces are kept: the same command goes on from there after an interruption."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder in which finished parts are kept: the same command continues from there after an interruption."""
     overwrite: bool = False
     """Replace what --html and --apply name if it is there."""
 
@@ -91,10 +92,10 @@ def run(arguments: Arguments) -> Diagnosis:
         models = {"model": found.models[0]}
         if found.accepted:
             models = {"before": found.models[0], "after": found.model}
-        comparison = compare(models, recording, arguments.engine, seed=arguments.seed)
+        comparison = compare_replays(models, recording, arguments.engine, seed=arguments.seed)
         settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
         make_folder(arguments.html.parent)
-        write_report(arguments.html, recording, models, comparison, settings=settings, diagnosis=found.to_json())
+        write_report(arguments.html, recording, comparison, settings=settings, diagnosis=found.to_json())
         if not arguments.json:
             say_written(arguments.html)
     return found
@@ -131,29 +132,23 @@ def check_effects(model: Model, recording: Recording, names: Sequence[str]) -> N
 
 
 def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagnosis:
-    """Return the diagnosis; an interruption says how to go on."""
+    """Return the diagnosis; an interruption says how to continue."""
     cfg = DiagnosisCfg(
         effects=arguments.effects,
         window=arguments.window,
         additions=arguments.additions,
         gradient=arguments.gradient,
-        engine=arguments.engine,
         jobs=arguments.jobs,
         seed=arguments.seed,
     )
-    made = versions()
     try:
         with work_progress("diagnosing") as progress:
-            if arguments.checkpoint is None:
-                found = diagnose(model, recording, cfg, progress)
-            else:
-                found = diagnose_with_checkpoint(model, recording, arguments.checkpoint, cfg, progress, made)
+            return diagnose(model, recording, cfg, engine=arguments.engine, out=arguments.out, progress=progress)
     except KeyboardInterrupt:
-        advice = f"Finished pieces are kept; go on with: {command_line()}"
-        if arguments.checkpoint is None:
-            advice = "With --checkpoint FOLDER the same command would go on from here."
+        advice = f"Finished parts are kept; continue with: {command_line()}"
+        if arguments.out is None:
+            advice = "With --out FOLDER the same command would continue from here."
         raise KeyboardInterrupt(advice) from None
-    return replace(found, versions=made)
 
 
 def say_diagnosis(found: Diagnosis) -> None:

@@ -68,14 +68,14 @@ def run(arguments: Arguments) -> Location:
         plot_location(found, model, arguments.png)
         written.append(arguments.png)
     if arguments.html is not None:
-        from concent_warp.comparison.compare import compare
+        from concent_warp.comparison.compare import compare_replays
         from concent_warp.report.report import write_report
 
         models = {"model": model}
         settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
         make_folder(arguments.html.parent)
-        compared = compare(models, recording, arguments.engine)
-        write_report(arguments.html, recording, models, compared, settings=settings, location=found.to_json())
+        compared = compare_replays(models, recording, arguments.engine)
+        write_report(arguments.html, recording, compared, settings=settings, location=found.to_json())
         written.append(arguments.html)
     if written and not arguments.json:
         say_written(*written)

@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, diagnose, silent
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.gradient_start import GradientStarts, factor_of, moved
 from concent_warp.diagnosis.search.steps import fit_candidate, screen
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
@@ -111,4 +113,4 @@ def test_what_gradients_cannot_do_is_said_before_anything_is_fitted(slid):
         raise AssertionError(said)
 
     with pytest.raises(ModelError, match="contact geometry of spheres"):
-        diagnose(replace(model, geometry=None), recording, DiagnosisCfg(jobs=1, gradient=True), never)
+        diagnose(replace(model, geometry=None), recording, DiagnosisCfg(jobs=1, gradient=True), progress=never)

@@ -1,7 +1,8 @@
 import pytest
 
+from concent_warp.diagnosis.cfg import DiagnosisCfg
 from concent_warp.diagnosis.checkpoint import CheckpointedProcedure
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, silent
+from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, polish_candidate, screen, without
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks

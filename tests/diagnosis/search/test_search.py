@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, silent
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.evidence import alike
 from concent_warp.diagnosis.search.steps import (

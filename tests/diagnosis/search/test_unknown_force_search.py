@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.diagnose import DiagnosisCfg, Procedure, silent
+from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, screen
 from concent_warp.diagnosis.search.unknown_force import LEAST, best_force, forces, unknown_force
