@@ -1,3 +1,154 @@
-"""ConCent-Warp: contact-centric real-to-sim-to-real learning from one demonstration."""
+"""ConCent-Warp: contact-centric real-to-sim-to-real learning from one demonstration.
+
+The names below are the public interface; each is imported when it is first used, so that ``import concent_warp`` takes
+milliseconds. Functions take data first, then `cfg`, their settings, then keywords only: `engine`, where to write
+(`out`), and `progress`.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from inspect import Signature, signature
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "comparison.compare": ("CompareCfg", "compare"),
+    "comparison.result": ("Comparison",),
+    "deploy.cfg": ("EvaluateCfg", "PlayCfg", "RenderCfg"),
+    "deploy.evaluate": ("evaluate",),
+    "deploy.play": ("play",),
+    "deploy.render_dataset": ("Dataset", "render"),
+    "diagnosis.cfg": ("DiagnosisCfg",),
+    "diagnosis.diagnose": ("diagnose",),
+    "diagnosis.forces.locate": ("locate_forces",),
+    "diagnosis.forces.window_forces": ("WindowCfg",),
+    "diagnosis.result": ("Diagnosis", "Finding"),
+    "effects.effect": ("Effect", "Parameter"),
+    "effects.registry": ("effect_class", "effect_classes"),
+    "errors": (
+        *("ConcentError", "EngineError", "EventsError", "ModelError", "RecordingError"),
+        *("RenderError", "SceneError", "TrainError"),
+    ),
+    "events.cfg": ("StagingCfg",),
+    "events.extract_events": ("extract_events",),
+    "events.sequence": ("ContactEvent", "ContactEventSequence", "Stage"),
+    "examples": ("example",),
+    "fit.effects.fit": ("FitEffectsCfg", "FittedEffects", "fit_effects"),
+    "fit.fit_geometry": ("FitCfg", "fit_geometry"),
+    "fit.geometry.search": ("FitResult",),
+    "ground": ("GroundCfg", "Grounded", "ground"),
+    "model": ("Model", "load_model"),
+    "recording.formats.hdf5": ("write_hdf5",),
+    "recording.load": ("load_recording",),
+    "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "report.report": ("write_report",),
+    "scene.scene": ("Scene",),
+    "scene.spheres.build": ("ContactGeometryCfg",),
+    "scene.spheres.contact_geometry": ("ContactGeometry",),
+    "simulate.engine": ("Rollout",),
+    "simulate.replay_recording": ("replay",),
+    "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.policy.evaluate": ("Evaluation",),
+    "train.policy.load": ("Policy", "load_policy"),
+    "train.train": ("train",),
+}
+"""Public names by the module that defines them."""
+_MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_MODULE_OF)]  # pyright: ignore[reportUnsupportedDunderAll]
+
+if TYPE_CHECKING:
+    from concent_warp.comparison.compare import CompareCfg, compare
+    from concent_warp.comparison.result import Comparison
+    from concent_warp.deploy.cfg import EvaluateCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.evaluate import evaluate
+    from concent_warp.deploy.play import play
+    from concent_warp.deploy.render_dataset import Dataset, render
+    from concent_warp.diagnosis.cfg import DiagnosisCfg
+    from concent_warp.diagnosis.diagnose import diagnose
+    from concent_warp.diagnosis.forces.locate import locate_forces
+    from concent_warp.diagnosis.forces.window_forces import WindowCfg
+    from concent_warp.diagnosis.result import Diagnosis, Finding
+    from concent_warp.effects.effect import Effect, Parameter
+    from concent_warp.effects.registry import effect_class, effect_classes
+    from concent_warp.errors import (
+        ConcentError,
+        EngineError,
+        EventsError,
+        ModelError,
+        RecordingError,
+        RenderError,
+        SceneError,
+        TrainError,
+    )
+    from concent_warp.events.cfg import StagingCfg
+    from concent_warp.events.extract_events import extract_events
+    from concent_warp.events.sequence import ContactEvent, ContactEventSequence, Stage
+    from concent_warp.examples import example
+    from concent_warp.fit.effects.fit import FitEffectsCfg, FittedEffects, fit_effects
+    from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+    from concent_warp.fit.geometry.search import FitResult
+    from concent_warp.ground import GroundCfg, Grounded, ground
+    from concent_warp.model import Model, load_model
+    from concent_warp.recording.formats.hdf5 import write_hdf5
+    from concent_warp.recording.load import load_recording
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.report.report import write_report
+    from concent_warp.scene.scene import Scene
+    from concent_warp.scene.spheres.build import ContactGeometryCfg
+    from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+    from concent_warp.simulate.engine import Rollout
+    from concent_warp.simulate.replay_recording import replay
+    from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.policy.evaluate import Evaluation
+    from concent_warp.train.policy.load import Policy, load_policy
+    from concent_warp.train.train import train
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _ROOMS:
+        return import_module(f"{__name__}.{name}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_MODULE_OF]
+
+
+_ROOMS = ("ground", "render", "train")
+"""Functions that share their name with a module or a sub-package."""
+
+
+class _Room(ModuleType):
+    """A module that is called as the function of its name: ``concent_warp.train(...)``."""
+
+    @property
+    def _function(self) -> Any:
+        name = self.__name__.rpartition(".")[2]
+        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+    @property
+    def __signature__(self) -> Signature:
+        return signature(self._function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._function(*args, **kwargs)
+
+
+class _FrontDoor(ModuleType):
+    """This module: what is imported under the name of a function can be called as that function."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _ROOMS and isinstance(value, ModuleType):
+            value.__class__ = _Room
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _FrontDoor

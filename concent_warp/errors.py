@@ -8,6 +8,14 @@ class ConcentError(ValueError):
 
     The message is one sentence: where, what is wrong, what was expected and found, and what to do about it.
     Subclasses name the kind of thing that is wrong, so that a library user can catch one kind.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.load_recording("nowhere.h5")
+        ... except cw.ConcentError as error:
+        ...     type(error).__name__
+        'RecordingError'
     """
 
     def __init__(
@@ -30,28 +38,85 @@ class ConcentError(ValueError):
 
 
 class RecordingError(ConcentError):
-    """A recording file or folder that breaks the format or contradicts itself."""
+    """A recording file or folder that breaks the format or contradicts itself.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.load_recording("nowhere.h5")
+        ... except cw.RecordingError as error:
+        ...     str(error).startswith("nowhere.h5: no such recording")
+        True
+    """
 
 
 class SceneError(ConcentError):
-    """An MJCF, mesh or point cloud that cannot serve as a scene or an object."""
+    """An MJCF, mesh or point cloud that cannot serve as a scene or an object.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.load_model("nowhere.xml")
+        ... except cw.SceneError as error:
+        ...     str(error).startswith("nowhere.xml: no such MJCF file")
+        True
+    """
 
 
 class ModelError(ConcentError):
-    """A model file, contact geometry or parameter that cannot be used."""
+    """A model file, contact geometry or parameter that cannot be used.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.load_model("nowhere.toml")
+        ... except cw.ModelError as error:
+        ...     print(error)
+        nowhere.toml: no such model; expected a model.toml or an MJCF .xml.
+    """
 
 
 class EngineError(ConcentError):
-    """A simulation that an engine cannot run, or that did not stay finite or within its buffers."""
+    """A simulation that an engine cannot run, or that did not stay finite or within its buffers.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> issubclass(cw.EngineError, cw.ConcentError)
+        True
+    """
 
 
 class EventsError(ConcentError):
-    """A contact event sequence that cannot be extracted, read or compared."""
+    """A contact event sequence that cannot be extracted, read or compared.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> issubclass(cw.EventsError, cw.ConcentError)
+        True
+    """
 
 
 class RenderError(ConcentError):
-    """Splats, images or settings with which nothing can be rendered."""
+    """Splats, images or settings with which nothing can be rendered.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.render(cw.load_policy("shape_sorter"), "dataset", cw.RenderCfg(episodes=0))
+        ... except cw.RenderError as error:
+        ...     print(error)
+        episodes, worlds, rate and flow steps are to be at least 1.
+    """
 
 
 class TrainError(ConcentError):
-    """A training that cannot be set up, gone on with or evaluated."""
+    """A training that cannot be set up, gone on with or evaluated.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.load_policy("dishwasher")
+        ... except cw.TrainError as error:
+        ...     str(error).startswith("no such policy")
+        True
+    """

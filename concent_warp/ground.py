@@ -24,7 +24,6 @@ from concent_warp.fit.fit_geometry import FitCfg, Method, fit_geometry
 from concent_warp.fit.geometry.search import FitResult, Progress
 from concent_warp.model import Model
 from concent_warp.report.report import write_report
-from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName
 
@@ -39,13 +38,17 @@ OVERLAP_FRAME = 0.01
 
 @dataclass(frozen=True)
 class GroundCfg:
-    """Settings of the main job."""
+    """Settings of the main job.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.GroundCfg(fit=cw.FitCfg(generations=30), method="gradient+es").method
+        'gradient+es'
+    """
 
     geometry: ContactGeometryCfg = field(default_factory=ContactGeometryCfg)
     """The starting geometry."""
     fit: FitCfg = field(default_factory=FitCfg)
-    engine: EngineName = "auto"
-    """Engine of the fit: "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to fit; all where empty. The comparison is about all in any case."""
     method: Method = "es"
@@ -54,7 +57,16 @@ class GroundCfg:
 
 @dataclass(frozen=True)
 class Grounded:
-    """What the main job found."""
+    """What the main job found.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> run = cw.load_policy("shape_sorter").run
+        >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
+        >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
+        >>> sorted(result.events)
+        ['demo_0']
+    """
 
     fit: FitResult
     comparison: Comparison
@@ -69,57 +81,60 @@ class Grounded:
 
 def ground(
     recording: Recording,
-    folder: Path,
+    out: str | Path,
     cfg: GroundCfg | None = None,
     *,
     start: Model | None = None,
     truth: Mapping[str, tuple[np.ndarray, Frames]] | None = None,
     settings: Mapping[str, Any] | None = None,
+    engine: EngineName = "auto",
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Grounded:
-    """Run the main job and write its results to a folder.
+    """Run the main job on a recording: fit, contact events, comparison, report.
 
     Files: ``start.toml`` and ``model.toml`` with what belongs to them, ``checkpoint.npz``, ``history.json``,
     ``events_<demonstration>.json`` and ``schedule_<demonstration>.png``, ``comparison.json``, ``report.html``.
 
     Args:
         recording: What was commanded and measured.
-        folder: An existing folder.
+        out: Folder for the results.
         cfg: Settings.
         start: Model to start from; by default spheres are laid on the objects of the recording's scene.
         truth: When pairs of bodies really touched, with the times [s] (T,) of these frames, by demonstration, where it
             is known.
         settings: What the report shows as settings.
-        resume: Go on from the folder's checkpoint.
+        engine: Engine of the fit: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device.
+        resume: Continue from the folder's checkpoint.
         progress: Called after each generation of the fit.
 
     Raises:
         RecordingError: There is no such demonstration, or it cannot be replayed.
         ConcentError: The model cannot be built, simulated or fitted.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> run = cw.load_policy("shape_sorter").run
+        >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
+        >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
+        >>> result.comparison.after
+        'after'
     """
-    cfg = cfg or GroundCfg()
+    cfg, folder = cfg or GroundCfg(), Path(out)
     fitted = tuple(d.name for d in recording.only(cfg.demonstrations).demonstrations)
-    if start is None:
-        scene = Scene(recording.scene, source=recording.source)
-        start = Model(scene, cfg.geometry.build(scene))
-    start.save(folder / "start.toml")
     fit = fit_geometry(
-        start,
+        Model.from_recording(recording) if start is None else start,
         recording,
         cfg.fit,
+        start=cfg.geometry,
         demonstrations=fitted,
         method=cfg.method,
-        engine=cfg.engine,
-        checkpoint=folder / "checkpoint.npz",
+        engine=engine,
+        out=folder,
         resume=resume,
         progress=progress,
     )
-    fit.model.save(folder / "model.toml")
-    document = {"stopped": fit.stopped, "generations": fit.history}
-    if fit.gradients is not None:
-        document |= {"gradients": {"helped": fit.gradients.helped, "remark": fit.gradients.remark}}
-    write_json(folder / "history.json", document)
+    start = fit.start
     models = {BEFORE: start, NULL: without_object_contact(fit.model), AFTER: fit.model}
     models = {name: model for name, model in models.items() if model is not None}
     events = extract_events(fit.model, recording)

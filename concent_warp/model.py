@@ -113,7 +113,7 @@ class Model:
         """Return a copy with one more effect, by its name in the library.
 
         Args:
-            name: Name of the effect; `concent_warp.effects()` lists them.
+            name: Name of the effect; `concent_warp.effect_classes()` lists them.
             target: Joints, actuators, bodies or sensors that it acts on; by default all that it may act on.
             values: Values of its parameters by name, such as ``{"torque[joint1]": 0.1}``; those not named keep the
                 null value, at which the effect does nothing.
@@ -252,3 +252,19 @@ def contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameter
         else:
             values[name] = value
     return ContactParameters(**values)
+
+
+def load_model(path: str | Path) -> Model:
+    """Read a ``model.toml`` as `Model.save` writes it, or an MJCF (``.xml``) as a model without contact geometry.
+
+    Raises:
+        ModelError: The file is missing, damaged or of another version.
+        SceneError: MuJoCo cannot compile the scene.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.Model.from_recording(cw.load_recording(cw.example("servo"))).save("model.toml")
+        >>> cw.load_model("model.toml").effects
+        ()
+    """
+    return Model.load(path)

@@ -219,7 +219,13 @@ class RandomisationCfg:
 
 @dataclass(frozen=True)
 class EnvironmentCfg:
-    """The vectorised environment."""
+    """The vectorised environment.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.EnvironmentCfg(stage="insert", worlds=4096).worlds
+        4096
+    """
 
     worlds: int = 4096
     """Environments side by side."""
@@ -284,7 +290,13 @@ class EnvironmentCfg:
 
 @dataclass(frozen=True)
 class PpoCfg:
-    """PPO as in rsl-rl; networks and action distribution as in the paper, appendix C."""
+    """PPO as in rsl-rl; networks and action distribution as in the paper, appendix C.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.PpoCfg(iterations=200, learning_rate=1e-3).iterations
+        200
+    """
 
     iterations: int = 300
     """Rounds of collecting and updating."""
@@ -326,7 +338,14 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """A whole training."""
+    """A whole training.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.TrainCfg(environment=cw.EnvironmentCfg(stage="insert"), ppo=cw.PpoCfg(iterations=100))
+        >>> cfg.environment.stage
+        'insert'
+    """
 
     seed: int = 0
     """Seed of everything drawn at random."""

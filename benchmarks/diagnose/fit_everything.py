@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.fit.effects.least_squares import FitCfg, Solver, projected
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver, projected
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
@@ -33,7 +33,7 @@ def fit_everything(model: Model, recording: Recording) -> tuple[Model, list[Blam
     """Fit all effects that a model could lack, with the initial states; return the model and what is off its null."""
     effects = candidates(model, {c for d in recording.demonstrations for c in d.measured})
     prediction = Prediction(model, effects, observe(model, recording), threads=1)
-    solver = Solver(prediction, FitCfg(iterations=ITERATIONS))
+    solver = Solver(prediction, LeastSquaresCfg(iterations=ITERATIONS))
     # A limit that is infinite where it does nothing starts at its upper bound, far away.
     fit = solver.fit(np.where(np.isfinite(prediction.start), prediction.start, solver.high))
     pieces = projected(fit)

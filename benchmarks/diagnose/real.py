@@ -39,7 +39,7 @@ from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.least_squares import FitCfg, Solver
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
@@ -283,7 +283,7 @@ def chosen(name: str) -> Effect:
 def fitted(model: Model, added: Sequence[Effect], windows: Sequence[Window]) -> Model:
     """Return a model with more effects, all parameters fitted to windows together with the initial states."""
     prediction = Prediction(model, added, windows, threads=1)
-    solver = Solver(prediction, FitCfg(iterations=15))
+    solver = Solver(prediction, LeastSquaresCfg(iterations=15))
     return prediction.model(solver.polish(solver.fit()).values)
 
 

@@ -28,7 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CompareCfg:
-    """Settings of a comparison."""
+    """Settings of a comparison.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.CompareCfg(phases="motion").phases
+        'motion'
+    """
 
     phases: Literal["auto", "motion", "none"] = "auto"
     """How time is divided: "auto" takes the contact stages of a task found in the replay of the last model and, where

@@ -77,7 +77,17 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Residuals of some models on the same demonstrations. The first model is `before`, the last one `after`."""
+    """Residuals of some models on the same demonstrations. The first model is `before`, the last one `after`.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> comparison = cw.compare(cw.Model.from_recording(recording), recording)
+        >>> comparison.channels
+        ('hinge_position', 'marker_position')
+        >>> round(comparison.summarise("model", "hinge_position").ratio)  # error over noise
+        8
+    """
 
     models: Mapping[str, Model]
     """By name, the baseline first."""

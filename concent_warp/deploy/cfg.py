@@ -31,7 +31,14 @@ class RealityWorldCfg:
 
 @dataclass(frozen=True)
 class EvaluateCfg(RealityWorldCfg):
-    """Settings of an evaluation."""
+    """Settings of an evaluation.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.EvaluateCfg(hide=("joint_friction=1.2",))
+        >>> cw.evaluate(cw.load_policy("shape_sorter"), cfg, world="reality", episodes=1).success.shape
+        (1,)
+    """
 
     action_scale: float = 1.0
     """Size of the steps of the robot's commands, as a share of those that the policy was trained with: below 1 it moves
@@ -45,7 +52,13 @@ class EvaluateCfg(RealityWorldCfg):
 
 @dataclass(frozen=True)
 class PlayCfg(RealityWorldCfg):
-    """Settings of the live view."""
+    """Settings of the live view.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.PlayCfg(port=8090, states=4).port
+        8090
+    """
 
     action_scale: float = 1.0
     """Size of the steps of the robot's commands, as for concent evaluate."""
@@ -69,7 +82,13 @@ class PlayCfg(RealityWorldCfg):
 
 @dataclass(frozen=True)
 class RenderCfg:
-    """Settings of rendering."""
+    """Settings of rendering.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.RenderCfg(episodes=5, size=64, cameras=("base",)).size
+        64
+    """
 
     episodes: int = 20
     """Initial states of the policy, of which each makes an episode."""

@@ -47,6 +47,13 @@ def play(
     Raises:
         TrainError: A setting is out of bounds.
         ConcentError: The address cannot be served on.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.PlayCfg(port=8790, states=1, speed=4.0)
+        >>> outcomes = cw.play(cw.load_policy("shape_sorter"), cfg, episodes=1)
+        >>> len(outcomes)
+        1
     """
     cfg = cfg or PlayCfg()
     player, drawn = make_player(policy, cfg, world=world, seed=seed, device=device)

@@ -39,7 +39,15 @@ FREE = ("out", "resume", "overwrite", "source", "episodes", "worlds", "films", "
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set that was written."""
+    """A data set that was written.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.RenderCfg(size=32, cameras=("base",))
+        >>> dataset = cw.render(cw.load_policy("shape_sorter").run.recording, "dataset", cfg, format="robomimic")
+        >>> dataset.episodes
+        1
+    """
 
     folder: Path
     format: Format

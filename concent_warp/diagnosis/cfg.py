@@ -7,7 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DiagnosisCfg:
-    """Settings of a diagnosis."""
+    """Settings of a diagnosis.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.DiagnosisCfg(effects=("joint_friction", "joint_damping"), additions=1).additions
+        1
+    """
 
     level: float = 0.05
     """Probability of naming an effect where nothing is missing."""

@@ -15,7 +15,7 @@ from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
 from concent_warp.comparison.worst_spans import Place, alike
 from concent_warp.diagnosis.forces.describe import body_sentence, joint_sentence
-from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import Location
 from concent_warp.errors import ConcentError
 from concent_warp.simulate.select import EngineName
@@ -112,7 +112,7 @@ def located(model: Model, recording: Recording, engine: EngineName, seconds: flo
 
     pool = ProcessPoolExecutor(max_workers=1)
     try:
-        return pool.submit(locate, model, recording, engine).result(timeout=seconds)
+        return pool.submit(locate_forces, model, recording, engine=engine).result(timeout=seconds)
     except (ConcentError, BrokenProcessPool, TooLong, ValueError, np.linalg.LinAlgError, mujoco.FatalError):
         return None
     finally:

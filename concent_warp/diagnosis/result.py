@@ -23,7 +23,16 @@ VERDICTS: dict[Verdict, str] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect with its evidence."""
+    """An effect with its evidence.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> cfg = cw.DiagnosisCfg(effects=("joint_friction",), jobs=1, explain=False)
+        >>> finding = cw.diagnose(cw.Model.from_recording(recording), recording, cfg).effects[0]
+        >>> finding.name, finding.accepted, finding.gain > 0.9
+        ('joint_friction', True, True)
+    """
 
     name: str
     target: tuple[str, ...]
@@ -116,7 +125,16 @@ class Detectable:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Which physical effect a model lacks."""
+    """Which physical effect a model lacks.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> cfg = cw.DiagnosisCfg(effects=("joint_friction",), jobs=1, explain=False)
+        >>> diagnosis = cw.diagnose(cw.Model.from_recording(recording), recording, cfg)
+        >>> [effect.name for effect in diagnosis.accepted], diagnosis.model.effects[0].effect.name
+        (['joint_friction'], 'joint_friction')
+    """
 
     verdict: Verdict
     effects: tuple[Finding, ...]

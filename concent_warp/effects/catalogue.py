@@ -8,7 +8,7 @@ from typing import get_args
 import mujoco
 
 from concent_warp.effects.effect import Effect, Family
-from concent_warp.effects.registry import OURS, effects
+from concent_warp.effects.registry import OURS, effect_classes
 
 TITLES = {
     "joints": "Joints and drives",
@@ -36,8 +36,8 @@ def catalogue(m: mujoco.MjModel) -> str:
 
 def row(effect: type[Effect], m: mujoco.MjModel) -> str:
     """Return a row of the table."""
-    known = [f"`{name}`" for name in effect.confusions if name in effects()]
-    others = [name.replace("_", " ") for name in effect.confusions if name not in effects()]
+    known = [f"`{name}`" for name in effect.confusions if name in effect_classes()]
+    others = [name.replace("_", " ") for name in effect.confusions if name not in effect_classes()]
     cells = [
         f"`{effect.name}` on {ACTS_ON[effect.kind]}",
         effect.summary,

@@ -42,7 +42,15 @@ OBJECTS = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect."""
+    """One number of an effect.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> model = cw.Model.from_recording(cw.load_recording(cw.example("servo")))
+        >>> parameter = cw.effect_class("joint_friction")("hinge").parameters(model.compile())[0]
+        >>> parameter.name, parameter.unit, parameter.null
+        ('torque[hinge]', 'N m', 0.0)
+    """
 
     name: str
     """Name, with what it belongs to in brackets where there are several: ``torque[joint1]``."""
@@ -62,7 +70,15 @@ class Parameter:
 
 
 class Effect:
-    """A physical effect on a selection of joints, actuators, bodies, geoms or sensors of some model."""
+    """A physical effect on a selection of joints, actuators, bodies, geoms or sensors of some model.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> model = cw.Model.from_recording(cw.load_recording(cw.example("servo")))
+        >>> effect = cw.effect_class("joint_friction")("hinge")
+        >>> [p.name for p in effect.parameters(model.compile())]
+        ['torque[hinge]']
+    """
 
     name: ClassVar[str]
     """What users type."""

@@ -53,11 +53,16 @@ OURS: tuple[type[Effect], ...] = (
 
 
 @cache
-def effects() -> dict[str, type[Effect]]:
-    """Return all effects by name.
+def effect_classes() -> dict[str, type[Effect]]:
+    """Return all effects by name: those of the library, then those that packages register.
 
     Raises:
         ModelError: A package registers what cannot be imported, something else than an effect, or a name that is taken.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> "joint_friction" in cw.effect_classes()
+        True
     """
     found: dict[str, type[Effect]] = {effect.name: effect for effect in OURS}
     for entry in entry_points(group=GROUP):
@@ -82,10 +87,15 @@ def effect_class(name: str) -> type[Effect]:
 
     Raises:
         ModelError: There is none.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.effect_class("joint_friction").family
+        'joints'
     """
     import difflib
 
-    known = effects()
+    known = effect_classes()
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)

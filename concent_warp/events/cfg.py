@@ -12,7 +12,13 @@ from concent_warp.errors import EventsError
 
 @dataclass(frozen=True)
 class StagingCfg:
-    """How contacts are filtered and how stages and their target events are found."""
+    """How contacts are filtered and how stages and their target events are found.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.StagingCfg(blip=0.05).blip
+        0.05
+    """
 
     gap: float = 0.05
     """Breaks of a contact shorter than this are closed [s]."""

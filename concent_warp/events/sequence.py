@@ -75,7 +75,15 @@ class ContactPair:
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """e_s: who touches whom in the configuration that a stage is to achieve."""
+    """e_s: who touches whom in the configuration that a stage is to achieve.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> events = cw.load_policy("shape_sorter").run.events
+        >>> event = events.stages[-1].event
+        >>> len(event.pairs) > 0
+        True
+    """
 
     time: float
     """Middle of the window it was read from [s]."""
@@ -89,7 +97,14 @@ class ContactEvent:
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the S stages: from one new kind of contact to the next."""
+    """One of the S stages: from one new kind of contact to the next.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> events = cw.load_policy("shape_sorter").run.events
+        >>> events.stages[0].name
+        'pick'
+    """
 
     name: str
     """"pick", "align" or "insert" where the contact is of that kind, else "contact <a>-<b>"; unique in a sequence."""
@@ -105,7 +120,15 @@ class Stage:
 
 @dataclass(frozen=True)
 class ContactEventSequence:
-    """All contacts of one demonstration, its stages and their target events."""
+    """All contacts of one demonstration, its stages and their target events.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> events = cw.load_policy("shape_sorter").run.events
+        >>> [(stage.name, round(stage.start, 1)) for stage in events.stages]
+        [...]
+        >>> events.save("events.json")
+    """
 
     demonstration: str
     """Name of the demonstration."""
@@ -145,8 +168,9 @@ class ContactEventSequence:
         """
         return min(self.stage_at(time) + 1, len(self.stages) - 1)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a JSON file, in one piece or not at all; the same sequence gives the same bytes."""
+        path = Path(path)
         partial = path.with_name(f".{path.name}.partial")
         partial.write_text(self.to_json(), encoding="utf-8")
         partial.replace(path)
@@ -165,12 +189,13 @@ class ContactEventSequence:
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
     @staticmethod
-    def load(path: Path) -> ContactEventSequence:
+    def load(path: str | Path) -> ContactEventSequence:
         """Read what `save` wrote.
 
         Raises:
             EventsError: The file is missing, is not such a file, or contradicts itself.
         """
+        path = Path(path)
         if not path.is_file():
             raise EventsError("no such contact event sequence", where=path, expected="a .json file")
         try:

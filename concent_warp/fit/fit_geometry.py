@@ -7,15 +7,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from concent_warp.errors import ModelError, RecordingError
+from concent_warp.errors import RecordingError
 from concent_warp.estimation.object_tracks import Segment, whole
 from concent_warp.estimation.windows import hold_out, windows
+from concent_warp.files import write_json
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.search import FitResult, Progress, Search, SearchCfg
 from concent_warp.fit.newton.descent import GradientCfg
 from concent_warp.fit.newton.warm_start import Warming
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.run_folder import CHECKPOINT, make_folder
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.select import EngineName
 
 Method = Literal["es", "gradient", "gradient+es"]
@@ -24,7 +27,13 @@ Method = Literal["es", "gradient", "gradient+es"]
 
 @dataclass(frozen=True)
 class FitCfg(SearchCfg):
-    """Settings of a fit of contact geometry."""
+    """Settings of a fit of contact geometry.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.FitCfg(generations=30, held_out=0.2).generations
+        30
+    """
 
     gradient: GradientCfg = field(default_factory=GradientCfg)
     """Settings of the gradients, for the methods that use them."""
@@ -33,37 +42,55 @@ class FitCfg(SearchCfg):
 def fit_geometry(
     model: Model,
     recording: Recording,
-    cfg: FitCfg,
+    cfg: FitCfg | None = None,
     *,
+    start: ContactGeometryCfg | None = None,
     demonstrations: Sequence[str] | None = None,
     segments: Sequence[Segment] | None = None,
     method: Method = "es",
     engine: EngineName = "auto",
-    checkpoint: Path | None = None,
+    out: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitResult:
     """Move the spheres of a model so that replaying a recording reproduces the observed motion.
 
     Args:
-        model: Model with a starting contact geometry.
+        model: Model; where it has no contact geometry, spheres are laid on the objects of its scene.
         recording: What was commanded and observed.
         cfg: Settings.
+        start: How spheres are laid on the objects of a model without contact geometry.
         demonstrations: Names of the demonstrations to fit; all by default.
         segments: Stretches to simulate instead of whole demonstrations.
         method: Evolution strategy, gradients through Newton, or the latter as a start for the former. Where gradients
             do not help, the evolution strategy is taken in any case; `FitResult.gradients` says so.
-        engine: "mujoco", "warp" or "auto".
-        checkpoint: File that holds the state of the fit after each generation; that of the gradients lies beside it.
-        resume: Go on from the checkpoint, to the same result as without the interruption.
+        engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device.
+        out: Folder for ``start.toml``, ``checkpoint.npz`` after each generation, and at the end ``model.toml`` and
+            ``history.json``.
+        resume: Continue from the folder's checkpoint, to the same result as without the interruption.
         progress: Called after each generation.
 
     Raises:
-        ModelError: The model has no contact geometry, or the checkpoint belongs to another fit.
+        ModelError: The scene has no objects to lay spheres on, or the checkpoint belongs to another fit.
         RecordingError: The recording does not observe any movable object.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> run = cw.load_policy("shape_sorter").run
+        >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
+        >>> fit.stopped
+        'all 1 generations done'
     """
+    cfg = cfg or FitCfg()
+    model.check_recording(recording)
     if model.geometry is None:
-        raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
+        model = model.with_geometry((start or ContactGeometryCfg()).build(model.scene))
+    folder = None if out is None else Path(out)
+    checkpoint = None
+    if folder is not None:
+        make_folder(folder)
+        model.save(folder / "start.toml")
+        checkpoint = folder / CHECKPOINT
     shown: list[Demonstration] = []
     if segments is None:
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
@@ -81,7 +108,19 @@ def fit_geometry(
             search.checkpoint().save(checkpoint)
         if progress is not None:
             progress(search.progress())
-    return search.result()
+    found = search.result()
+    if folder is not None:
+        save_fit(found, folder)
+    return found
+
+
+def save_fit(fit: FitResult, folder: Path) -> None:
+    """Write ``model.toml`` and ``history.json``: why the fit ended, each generation, what gradients did."""
+    fit.model.save(folder / "model.toml")
+    document = {"stopped": fit.stopped, "generations": fit.history}
+    if fit.gradients is not None:
+        document |= {"gradients": {"helped": fit.gradients.helped, "remark": fit.gradients.remark}}
+    write_json(folder / "history.json", document)
 
 
 def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> list[Segment]:

@@ -26,6 +26,12 @@ def load_recording(path: Path | str) -> Recording:
 
     Raises:
         RecordingError: The path is missing, of no known kind, or what is there cannot be used.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> round(recording[0].duration)  # s
+        4
     """
     path = Path(path)
     if path.is_dir():

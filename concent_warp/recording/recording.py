@@ -16,7 +16,15 @@ from concent_warp.errors import RecordingError
 
 @dataclass(frozen=True)
 class Channel:
-    """One commanded or measured signal."""
+    """One commanded or measured signal.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> import numpy as np
+        >>> channel = cw.Channel(np.array([0.0, 0.01]), np.array([[0.0], [0.1]]), noise_std=0.001)
+        >>> channel.value.shape
+        (2, 1)
+    """
 
     time: np.ndarray
     """Clock readings [s], shape (T,), strictly increasing."""
@@ -30,7 +38,15 @@ class Channel:
 
 @dataclass(frozen=True)
 class PointTrack:
-    """Tracked surface points of one body, in the world frame."""
+    """Tracked surface points of one body, in the world frame.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> import numpy as np
+        >>> track = cw.PointTrack(np.array([0.0, 0.1]), np.zeros((2, 3, 3)), np.ones((2, 3), dtype=bool))
+        >>> track.value.shape  # times, points, coordinates
+        (2, 3, 3)
+    """
 
     time: np.ndarray
     """Clock readings [s], shape (T,)."""
@@ -60,7 +76,14 @@ class ImageStream:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One execution of a task, or one toss, swing or push: everything recorded between start and stop."""
+    """One execution of a task, or one toss, swing or push: everything recorded between start and stop.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> demonstration = cw.load_recording(cw.example("servo"))[0]
+        >>> demonstration.name, list(demonstration.action), list(demonstration.measured)
+        ('demo_0', ['servo'], ['hinge_position', 'marker_position'])
+    """
 
     name: str
     task: str = ""
@@ -87,7 +110,14 @@ class Demonstration:
 
 @dataclass(frozen=True)
 class Recording:
-    """One or more demonstrations in the same scene."""
+    """One or more demonstrations in the same scene.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> [demonstration.name for demonstration in recording.demonstrations]
+        ['demo_0']
+    """
 
     scene: str
     """Self-contained MJCF text of the scene."""

@@ -16,7 +16,14 @@ OBJECTS_TEXT = "concent_objects"
 
 @dataclass(frozen=True)
 class Scene:
-    """Self-contained MJCF text."""
+    """Self-contained MJCF text.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> scene = cw.Scene("<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>")
+        >>> scene.model.nq
+        7
+    """
 
     xml: str
     source: str = "<memory>"

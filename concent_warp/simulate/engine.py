@@ -71,6 +71,13 @@ class Rollout:
 
     Arrays are NumPy from `MujocoEngine` and torch tensors on the simulation device from `WarpEngine`; `numpy()` gives
     a rollout of NumPy arrays.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> rollout = cw.replay(cw.Model.from_recording(recording), recording)["demo_0"]
+        >>> rollout.qpos.shape == (1, len(rollout.time), 1)
+        True
     """
 
     step: np.ndarray

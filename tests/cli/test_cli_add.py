@@ -1,7 +1,7 @@
 import pytest
 
 from concent_warp.cli import main
-from concent_warp.effects.registry import effects
+from concent_warp.effects.registry import effect_classes
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
@@ -71,7 +71,7 @@ def test_the_list_has_every_effect_with_units_and_with_a_model_where_each_may_ac
     monkeypatch.setenv("COLUMNS", "240")
     assert main(["add", "--list"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in effects())
+    assert all(name in listed for name in effect_classes())
     assert "N m s/rad" in listed
     assert main(["add", "--list", "--model", str(swing / "scene.xml")]) == 0
     there = capsys.readouterr().out

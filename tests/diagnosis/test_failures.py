@@ -6,7 +6,7 @@ import pytest
 
 from concent_warp.diagnosis import failures as module
 from concent_warp.diagnosis.failures import located, where, with_starts
-from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
@@ -64,7 +64,7 @@ def test_right_model_has_no_place():
 
 
 def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "located", lambda *args: locate(*args[:3]))
+    monkeypatch.setattr(module, "located", lambda *args: locate_forces(*args[:2], engine=args[2]))
     found = where(model(), recorded(3.0), seconds=60)
     assert found[0]["start"] is not None
     assert found[-1]["channel"] == "rail"

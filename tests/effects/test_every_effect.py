@@ -5,7 +5,7 @@ import pytest
 from small_worlds import Motion, move
 
 from concent_warp.effects.effect import Effect, written
-from concent_warp.effects.registry import effect_class, effects
+from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -61,7 +61,7 @@ SCENES = {
 MODELS = {scene: Model(Scene(xml)) for scene, (xml, _) in SCENES.items()}
 FOUND: list[tuple[str, Effect]] = [
     (scene, cls(*target))
-    for cls in effects().values()
+    for cls in effect_classes().values()
     for scene, model in MODELS.items()
     for target in cls.targets(model.compile())
 ]
@@ -93,7 +93,7 @@ def plain() -> dict[str, Motion]:
     return {scene: move(MODELS[scene], 0.6, **motion) for scene, (_, motion) in SCENES.items()}
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_every_effect_applies_somewhere(name):
     assert any(effect.name == name for _, effect in FOUND)
 
@@ -116,7 +116,7 @@ def test_null_wind_is_still_air():
     np.testing.assert_allclose(still.qpos, drag.qpos, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_typical_values_change_what_is_measured_somewhere(name, plain):
     largest = 0.0
     for scene, effect in FOUND:
@@ -162,7 +162,7 @@ def test_values_as_fields_and_laws_of_variants_do_the_same_as_in_the_model(scene
     np.testing.assert_allclose(varied.qpos[0], added.qpos, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_saved_model_is_the_same_when_loaded(name, tmp_path):
     model, effect = first_case(name)
     for values in (None, typical(effect, model)):
@@ -179,16 +179,16 @@ def test_saved_model_is_the_same_when_loaded(name, tmp_path):
                 np.testing.assert_allclose(getattr(b, field), value, rtol=1e-5, atol=1e-9, err_msg=field)
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_confusions_and_words_are_there(name):
-    cls = effects()[name]
-    assert set(cls.confusions) <= set(effects())
+    cls = effect_classes()[name]
+    assert set(cls.confusions) <= set(effect_classes())
     assert name not in cls.confusions
     assert all(getattr(cls, text).strip() for text in ("summary", "source", "signature", "family", "kind"))
     assert set(cls.engines) <= {"mujoco", "warp"}
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_parameters_have_bounds_around_their_null_values(name):
     model, effect = first_case(name)
     rows = effect.parameters(model.compile())
@@ -208,7 +208,7 @@ def one_sentence(error: ConcentError, *words: str) -> None:
     assert all(word in text for word in words), text
 
 
-@pytest.mark.parametrize("name", effects())
+@pytest.mark.parametrize("name", effect_classes())
 def test_wrong_target_value_or_name_gives_one_clear_sentence(name):
     model, effect = first_case(name)
     m = model.compile()

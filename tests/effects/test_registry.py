@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from concent_warp.effects.catalogue import catalogue
-from concent_warp.effects.registry import effects
+from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
@@ -43,15 +43,15 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         (tmp_path / "own_effects.py").write_text(OWN)
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.delitem(sys.modules, "own_effects", raising=False)
-        effects.cache_clear()
+        effect_classes.cache_clear()
 
     yield install_package
-    effects.cache_clear()
+    effect_classes.cache_clear()
 
 
 def test_effect_of_an_installed_package_is_added_saved_and_loaded(install, tmp_path):
     install("CableSpring")
-    model = Model(ShapeSorterCfg().build()).add(effects()["cable_spring"]("joint4"), [0.8])
+    model = Model(ShapeSorterCfg().build()).add(effect_classes()["cable_spring"]("joint4"), [0.8])
     model.save(tmp_path / "model.toml")
     loaded = Model.load(tmp_path / "model.toml").compile()
     assert loaded.jnt_stiffness[loaded.joint("joint4").id] == 0.8
@@ -63,7 +63,7 @@ def test_effect_of_an_installed_package_is_added_saved_and_loaded(install, tmp_p
 def test_entry_point_that_cannot_be_used_is_named(install, what, words):
     install(what)
     with pytest.raises(ModelError, match=words) as raised:
-        effects()
+        effect_classes()
     assert f"own_effects:{what}" in str(raised.value)
 
 

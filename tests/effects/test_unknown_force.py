@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.effects.registry import effects
+from concent_warp.effects.registry import effect_classes
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce
 
 LOOSE = """
@@ -78,4 +78,4 @@ def test_at_size_null_it_does_nothing_and_it_is_not_registered():
     parameters = effect.parameters(mujoco.MjModel.from_xml_string(LOOSE))
     assert len(parameters) == law.count
     assert applied(law, [p.null for p in parameters]) == pytest.approx(0.0)
-    assert effect.name not in effects()
+    assert effect.name not in effect_classes()

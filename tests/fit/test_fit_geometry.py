@@ -81,8 +81,8 @@ def test_an_interrupted_fit_resumes_to_the_same_result(drop, swollen, fitted, tm
 
     file = tmp_path / "checkpoint.npz"
     with pytest.raises(KeyboardInterrupt):
-        fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, progress=kill)
-    resumed = fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, resume=True)
+        fit_geometry(swollen, drop, CFG, engine="mujoco", out=file.parent, progress=kill)
+    resumed = fit_geometry(swollen, drop, CFG, engine="mujoco", out=file.parent, resume=True)
     np.testing.assert_array_equal(resumed.model.geometry.position, fitted.model.geometry.position)
     assert [h["loss"] for h in resumed.history] == [h["loss"] for h in fitted.history]
 
@@ -96,9 +96,9 @@ def test_the_seed_decides_the_result(drop, swollen, fitted):
 
 def test_a_checkpoint_of_other_settings_is_refused(drop, swollen, tmp_path):
     file = tmp_path / "checkpoint.npz"
-    fit_geometry(swollen, drop, replace(CFG, generations=1), engine="mujoco", checkpoint=file)
+    fit_geometry(swollen, drop, replace(CFG, generations=1), engine="mujoco", out=file.parent)
     with pytest.raises(ModelError, match="other settings"):
-        fit_geometry(swollen, drop, CFG, engine="mujoco", checkpoint=file, resume=True)
+        fit_geometry(swollen, drop, CFG, engine="mujoco", out=file.parent, resume=True)
 
 
 def test_a_file_that_is_no_checkpoint_is_refused(tmp_path):
@@ -132,9 +132,12 @@ def test_a_recording_that_observes_nothing_is_refused(drop, swollen):
         fit_geometry(swollen, blind, CFG)
 
 
-def test_a_model_without_spheres_is_refused(drop, swollen):
-    with pytest.raises(ModelError, match="no contact geometry"):
-        fit_geometry(swollen.with_geometry(None), drop, CFG)
+def test_spheres_are_laid_on_the_objects_of_a_model_without_any(drop, swollen):
+    bare = swollen.with_geometry(None)
+    start = ContactGeometryCfg(count=24, candidates=500)
+    found = fit_geometry(bare, drop, replace(CFG, generations=1), start=start, engine="mujoco")
+    assert found.start.geometry is not None
+    np.testing.assert_array_equal(found.start.geometry.position, start.build(bare.scene).position)
 
 
 def test_the_true_geometry_scores_best(drop, swollen):

@@ -8,7 +8,7 @@ import pytest
 
 from concent_warp.effects.effect import Effect, Parameter, written
 from concent_warp.effects.force_model import Law
-from concent_warp.effects.registry import effects
+from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -44,7 +44,7 @@ STEPS = 100
 QVEL = np.array([0.5, -1.0, 0, 0, 0, *[0] * 6, 0.5, 0.4, 0, 0, 0, 3, 0.3, 0.1, 0, 0, 10, 5])
 """Arm, lift and fingers, block, puck, ball."""
 AIR = ("air_drag", "wind")
-ON_MOTION = tuple(name for name, cls in effects().items() if cls.family != "measurement" and name not in AIR)
+ON_MOTION = tuple(name for name, cls in effect_classes().items() if cls.family != "measurement" and name not in AIR)
 
 
 def commands(m) -> np.ndarray:
@@ -70,7 +70,7 @@ def typical(effect: Effect, m) -> list[float]:
 def on_every_target(model: Model, names: Sequence[str]) -> list[Effect]:
     """Return effects that fields, laws and commands can express, on each target."""
     m = model.compile()
-    found = [cls(*target) for name in names for cls in [effects()[name]] for target in cls.targets(m)]
+    found = [cls(*target) for name in names for cls in [effect_classes()[name]] for target in cls.targets(m)]
     return [effect for effect in found if not effect.edits]
 
 
@@ -134,7 +134,7 @@ def test_every_effect_changes_the_motion_alike_on_a_gpu(names):
 
 def test_engines_agree_on_a_model_that_holds_many_effects():
     model = Model(Scene(SCENE))
-    for cls in [effects()[name] for name in ON_MOTION]:
+    for cls in [effect_classes()[name] for name in ON_MOTION]:
         targets = cls.targets(model.compile())
         effect = cls(*(("puck",) if ("puck",) in targets else targets[0]))
         model = model.add(effect, typical(effect, model.compile()))
@@ -187,8 +187,8 @@ def test_law_without_a_kernel_says_so():
 
 
 def test_drag_that_mujoco_warp_would_get_wrong_is_refused():
-    model = Model(Scene(SCENE)).add(effects()["air_drag"]("puck"), [20.0])
-    shifted = WarpEngine(model.add(effects()["center_of_mass"]("puck"), [0.01, 0, 0]), device="cpu")
+    model = Model(Scene(SCENE)).add(effect_classes()["air_drag"]("puck"), [20.0])
+    shifted = WarpEngine(model.add(effect_classes()["center_of_mass"]("puck"), [0.01, 0, 0]), device="cpu")
     with pytest.raises(EngineError, match=r"drag is wrong .*\['puck'\]; use MujocoEngine"):
         shifted.run(Variants(1), commands(shifted.compiled)[:2])
     engine = WarpEngine(model, device="cpu")

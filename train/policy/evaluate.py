@@ -24,7 +24,14 @@ FAILURES = ("dropped", "severe", "diverged")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Outcomes of E episodes."""
+    """Outcomes of E episodes.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> result = cw.evaluate(cw.load_policy("shape_sorter"), world="simulation", episodes=2, device="cpu")
+        >>> result.counts()
+        {'success': 2}
+    """
 
     success: np.ndarray
     """Whether each ended with object 1 in place, shape (E,) bool."""

@@ -104,3 +104,21 @@ class Policy:
         from concent_warp.train.policy.export import export
 
         return export(self.run, self.weights, Path(out))
+
+
+def load_policy(source: str | Path) -> Policy:
+    """Load a policy, see `Policy.load`.
+
+    Args:
+        source: Run folder of a training, a checkpoint file in one, or the name of a policy that comes with the package:
+            "shape_sorter" inserts, "pick_align_insert" does the whole task.
+
+    Raises:
+        TrainError: There is no such training or policy, or the file is no checkpoint.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.load_policy("pick_align_insert").run.cfg.environment.stage
+        'all'
+    """
+    return Policy.load(source)

@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.effects.registry import effects
+from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ConcentError
 from concent_warp.model import Model
 from concent_warp.run_folder import claim_file, make_folder
@@ -68,13 +68,14 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     added = model.add_effect(arguments.effect, arguments.target, assigned(arguments.set))
     fitted = None
     if arguments.fit is not None:
-        from concent_warp.fit.effects.fit import fit_effects
+        from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
         from concent_warp.recording.load import load_recording
 
         recording = load_recording(arguments.fit).only(arguments.demonstrations)
         model.check_recording(recording)
         with work_progress("fitting") as progress:
-            fitted = fit_effects(added, recording, progress, window=arguments.window, engine=arguments.engine)
+            cfg = FitEffectsCfg(window=arguments.window)
+            fitted = fit_effects(added, recording, cfg, engine=arguments.engine, progress=progress)
         added = fitted.model
     make_folder(arguments.out.parent)
     added.save(arguments.out)
@@ -128,7 +129,7 @@ def say_effects(model: Model | None) -> None:
     for name in columns:
         table.add_column(name, no_wrap=name == "effect")
     family = ""
-    for kind in effects().values():
+    for kind in effect_classes().values():
         if family and kind.family != family:
             table.add_section()
         family = kind.family

@@ -56,10 +56,17 @@ def run(arguments: Arguments) -> Grounded:
         names = tuple(d.name for d in recording.demonstrations)
         say(f"recorded {len(names)} demonstrations")
         truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
-        cfg = GroundCfg(arguments.geometry, arguments.fit, arguments.engine, names[: len(arguments.seeds)])
+        cfg = GroundCfg(arguments.geometry, arguments.fit, names[: len(arguments.seeds)])
         with fit_progress() as progress:
             found = ground(
-                recording, folder, cfg, truth=truth, settings=settings, resume=arguments.resume, progress=progress
+                recording,
+                folder,
+                cfg,
+                truth=truth,
+                settings=settings,
+                engine=arguments.engine,
+                resume=arguments.resume,
+                progress=progress,
             )
     say_grounded(found, folder)
     return found

@@ -20,7 +20,7 @@ from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
-from concent_warp.fit.effects.fit import fit_effects
+from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
@@ -200,9 +200,8 @@ def save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording) 
             say(escape(f"No effect was accepted: {path} was not written."))
         return
     with work_progress("fitting") as progress:
-        fitted = fit_effects(
-            found.model, recording, progress, window=arguments.window, engine=arguments.engine, seed=arguments.seed
-        )
+        cfg = FitEffectsCfg(window=arguments.window, seed=arguments.seed)
+        fitted = fit_effects(found.model, recording, cfg, engine=arguments.engine, progress=progress)
     make_folder(path.parent)
     fitted.model.save(path)
     if not arguments.json:

@@ -61,14 +61,20 @@ def run(arguments: Arguments) -> Grounded:
         geometry=arguments.geometry,
         fit=arguments.fit,
         method=arguments.method,
-        engine=arguments.engine,
         demonstrations=arguments.demonstrations,
     )
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
         settings = write_settings(folder, arguments)
         with fit_progress() as progress:
             found = ground(
-                recording, folder, cfg, start=start, settings=settings, resume=arguments.resume, progress=progress
+                recording,
+                folder,
+                cfg,
+                start=start,
+                settings=settings,
+                engine=arguments.engine,
+                resume=arguments.resume,
+                progress=progress,
             )
     say_grounded(found, folder)
     return found

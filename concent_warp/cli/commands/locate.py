@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
-from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import Location
 from concent_warp.diagnosis.forces.window_forces import WindowCfg
 from concent_warp.errors import RecordingError
@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> Location:
     for path in (arguments.html, arguments.png):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
-    found = locate(model, recording, arguments.engine, cfg=WindowCfg(arguments.window))
+    found = locate_forces(model, recording, WindowCfg(arguments.window), engine=arguments.engine)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     else:

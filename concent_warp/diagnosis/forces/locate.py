@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
 from concent_warp.diagnosis.forces.result import DETECTABLE, Location
 from concent_warp.diagnosis.forces.window_forces import WindowCfg, Windows, window_forces, window_length
 from concent_warp.estimation.measured_motion import Motion, measured_motion
+from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
@@ -28,35 +30,49 @@ BEYOND_NOISE = 1.7
 contacts change within windows."""
 
 
-def locate(
+def locate_forces(
     model: Model,
     recording: Recording,
-    engine: EngineName = "auto",
-    *,
     cfg: WindowCfg | None = None,
-    demonstrations: Sequence[str] | None = None,
+    *,
+    engine: EngineName = "mujoco",
+    out: str | Path | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Location:
-    """Find where a model lacks forces.
+    """Find the forces that a model lacks: by joint, and on which place of which object.
 
     Args:
         model: The model.
         recording: What was commanded and measured.
-        engine: Which engine simulates, see `make_engine`.
         cfg: How demonstrations are cut into windows.
-        demonstrations: Names of those to use; None takes all.
+        engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device.
+        out: JSON file for all figures, SI units.
+        progress: Called with the share done, 0..1.
 
     Raises:
         RecordingError: There is no such demonstration, or nothing in it that a force could be told from.
         EngineError: The model cannot be simulated.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> forces = cw.locate_forces(cw.Model.from_recording(recording), recording)
+        >>> [joint.joint for joint in forces.joints if joint.significant]
+        ['hinge']
     """
     cfg = cfg or WindowCfg()
     simulator = make_engine(engine, model)
-    chosen = recording.only(demonstrations or ()).demonstrations
+    chosen = recording.demonstrations
     motions = [measured_motion(model, d, simulator) for d in chosen]
+    report = progress or ignore
+    report(0.1)
     if cfg.length is None:
         # One length for all, so that their forces can be taken together.
         cfg = replace(cfg, length=max(map(window_length, motions)))
-    windows = [window_forces(d.name, simulator, m, cfg) for d, m in zip(chosen, motions, strict=True)]
+    windows = []
+    for k, (d, motion) in enumerate(zip(chosen, motions, strict=True)):
+        windows.append(window_forces(d.name, simulator, motion, cfg))
+        report(0.1 + 0.6 * (k + 1) / len(chosen))
     features = [joint_features(w, m) for w, m in zip(windows, motions, strict=True)]
     joints = [joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in all_joints(motions)]
     bodies = [body_force(model, name, motions, windows, cfg.seed) for name in all_bodies(motions)]
@@ -68,7 +84,15 @@ def locate(
     bodies = [judged(f, ok, f.ratio > BEYOND_NOISE) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
     joints.sort(key=lambda f: (not f.significant, -f.ratio))
     bodies.sort(key=lambda f: (not f.significant, -f.ratio))
-    return Location(windows[0].length, tuple(joints), tuple(bodies))
+    found = Location(windows[0].length, tuple(joints), tuple(bodies))
+    if out is not None:
+        write_json(Path(out), found.to_json())
+    return found
+
+
+def ignore(share: float) -> None:
+    """Do nothing with the progress."""
+    del share
 
 
 def all_joints(motions: Sequence[Motion]) -> list[tuple[str, str, int]]:

@@ -33,7 +33,13 @@ WEIGHTS = 30 * SHARES**2 * (1 - SHARES) ** 2 / np.sum(30 * SHARES**2 * (1 - SHAR
 
 @dataclass(frozen=True)
 class WindowCfg:
-    """How a demonstration is cut."""
+    """How a demonstration is cut.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.WindowCfg(0.1).length
+        0.1
+    """
 
     length: float | None = None
     """Length of a window [s]; by default 0.1 s for joints alone, 0.12 s with free bodies, whose readings are coarser,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from concent_warp.effects.effect import Effect
-from concent_warp.effects.registry import effect_class, effects
+from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.model import Model
 
 
@@ -21,7 +21,7 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
         ModelError: There is no such effect.
     """
     m = model.compile()
-    chosen = [effect_class(name) for name in names] if names else list(effects().values())
+    chosen = [effect_class(name) for name in names] if names else list(effect_classes().values())
     found: list[Effect] = []
     for kind in chosen:
         for target in kind.targets(m):

@@ -14,7 +14,7 @@ import numpy as np
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
 from concent_warp.fit.effects.initial_states import ROUNDS
-from concent_warp.fit.effects.least_squares import Fit, FitCfg, Linear, Solver, projected
+from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import HUBER, huber, huber_limit, huber_weight, trust
@@ -240,7 +240,7 @@ def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
     return float(2 * sum(huber(r, base.limit).sum() for r in residuals))
 
 
-def fit_candidate(base: Node, screened: Screened, cfg: FitCfg | None = None) -> Candidate:
+def fit_candidate(base: Node, screened: Screened, cfg: LeastSquaresCfg | None = None) -> Candidate:
     """Fit a candidate together with the model's own parameters and the initial states."""
     solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine), cfg)
     if screened.measured:

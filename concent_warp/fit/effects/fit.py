@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
-from concent_warp.fit.effects.least_squares import PRIOR, Fit, FitCfg, Linear, Solver, projected
+from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, Trial
@@ -43,7 +44,15 @@ class ChannelError:
 
 @dataclass(frozen=True)
 class FittedEffects:
-    """A model whose effects were fitted."""
+    """A model whose effects were fitted.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> fitted = cw.fit_effects(cw.Model.from_recording(recording).add_effect("joint_damping"), recording)
+        >>> fitted.after < fitted.before
+        True
+    """
 
     model: Model
     """The model with the values and their 95 % intervals."""
@@ -64,15 +73,32 @@ class FittedEffects:
         return 1.0 - (self.after / max(self.before, 1e-12)) ** 2
 
 
+@dataclass(frozen=True)
+class FitEffectsCfg:
+    """Settings of a fit of effect parameters.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.FitEffectsCfg(window=0.5).window
+        0.5
+    """
+
+    window: float | None = None
+    """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
+    least_squares: LeastSquaresCfg = field(default_factory=LeastSquaresCfg)
+    """Settings of the least squares."""
+    seed: int = 0
+    """Seed of the disturbances that determine how long windows may be."""
+
+
 def fit_effects(
     model: Model,
     recording: Recording,
-    progress: Callable[[float, str], None] | None = None,
+    cfg: FitEffectsCfg | None = None,
     *,
-    cfg: FitCfg | None = None,
-    window: float | None = None,
     engine: EngineName = "mujoco",
-    seed: int = 0,
+    out: str | Path | None = None,
+    progress: Callable[[float, str], None] | None = None,
 ) -> FittedEffects:
     """Fit all parameters of a model's effects together with the initial states.
 
@@ -81,23 +107,32 @@ def fit_effects(
     Args:
         model: The model with effects, at the values to start from.
         recording: What was commanded and measured.
+        cfg: Settings.
+        engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device; C MuJoCo is the faster one for
+            many short simulations.
+        out: File (``.toml``) for the fitted model.
         progress: Called with the share done, 0..1, and what is being done.
-        cfg: Settings of the fit.
-        window: Length of a window [s]; by default as long as the motion allows.
-        engine: Which engine simulates.
-        seed: Of the disturbances that tell how long windows may be.
 
     Raises:
         ModelError: The model has no effects, or does not stay finite on the recording.
         RecordingError: There is too little to fit to, or it does not fit the model.
         EngineError: The model cannot be simulated.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> model = cw.Model.from_recording(recording).add_effect("joint_friction")
+        >>> fitted = cw.fit_effects(model, recording)
+        >>> [f"{p.name} = {p.value:.3f} {p.unit}" for p in fitted.parameters[0]]
+        ['torque[hinge] = 0.030 N m']
     """
+    cfg = cfg or FitEffectsCfg()
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
     said = progress or silent
     said(0.0, "cutting windows")
-    windows = observe(model, recording, length=window, engine=engine, seed=seed)
-    solver = Solver(Prediction(model, (), windows, engine=engine), cfg)
+    windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed)
+    solver = Solver(Prediction(model, (), windows, engine=engine), cfg.least_squares)
     check_finite(solver.p, model.scene.source)
     said(0.1, "initial states")
     start = solver.p.start
@@ -116,7 +151,7 @@ def fit_effects(
     before, after = noise_ratio(given), noise_ratio(found)
     if after > max(before, AT_NOISE):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
-    return FittedEffects(
+    fitted = FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
         tuple(tuple(parameters[part]) for part in solver.p.split),
         before,
@@ -125,6 +160,9 @@ def fit_effects(
         fit.converged,
         tuple(remarks),
     )
+    if out is not None:
+        fitted.model.save(out)
+    return fitted
 
 
 def silent(share: float, text: str) -> None:

@@ -42,7 +42,7 @@ REFIT_ROUNDS = 2
 
 
 @dataclass(frozen=True)
-class FitCfg:
+class LeastSquaresCfg:
     """Settings of a fit of effect parameters."""
 
     iterations: int = 10
@@ -99,10 +99,10 @@ class _State:
 class Solver:
     """Fits the parameters of one prediction."""
 
-    def __init__(self, prediction: Prediction, cfg: FitCfg | None = None) -> None:
+    def __init__(self, prediction: Prediction, cfg: LeastSquaresCfg | None = None) -> None:
         """Prepare to fit `prediction`."""
         self.p = prediction
-        self.cfg = cfg or FitCfg()
+        self.cfg = cfg or LeastSquaresCfg()
         self.scale = np.array([q.scale for q in prediction.parameters])
         self.low = np.array([q.low for q in prediction.parameters])
         self.high = np.array([q.high for q in prediction.parameters])
@@ -328,7 +328,7 @@ class Solver:
             offsets: Errors of the initial states in units of their spread.
             starts: See `Fit.starts`; computed where not given.
             progress: Called with the share done, 0..1.
-            refits: See `FitCfg.refits`; by default as there.
+            refits: See `LeastSquaresCfg.refits`; by default as there.
         """
         values = self.inside(self.p.start if values is None else values)
         offsets = [np.zeros(len(w.spread)) for w in self.p.windows] if offsets is None else list(offsets)

@@ -99,7 +99,15 @@ class Progress:
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a fit found."""
+    """What a fit found.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> run = cw.load_policy("shape_sorter").run
+        >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
+        >>> len(fit.history), fit.mask.shape
+        (1, (512,))
+    """
 
     model: Model
     """The model with the fitted geometry."""

@@ -53,7 +53,7 @@ def read_hdf5(path: Path) -> Recording:
     return recording
 
 
-def write_hdf5(recording: Recording, path: Path) -> None:
+def write_hdf5(recording: Recording, path: str | Path) -> None:
     """Validate a recording and write it, in one piece or not at all.
 
     The file appears under its name only when it is whole; a killed process leaves at most a hidden ``.partial`` file,
@@ -61,6 +61,13 @@ def write_hdf5(recording: Recording, path: Path) -> None:
 
     Raises:
         RecordingError: The recording breaks a rule of `validate`, or the file cannot be written.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> cw.write_hdf5(recording, "copy.h5")
+        >>> cw.load_recording("copy.h5")[0].name
+        'demo_0'
     """
     path = Path(path)
     validate(recording)

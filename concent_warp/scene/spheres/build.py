@@ -27,7 +27,15 @@ SMALLEST = 0.05
 
 @dataclass(frozen=True)
 class ContactGeometryCfg:
-    """How the spheres are laid."""
+    """How the spheres are laid.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> scene = cw.load_policy("shape_sorter").run.model.scene
+        >>> geometry = cw.ContactGeometryCfg(count=64, candidates=2000).build(scene)
+        >>> len(geometry.radius)
+        64
+    """
 
     count: int = 512
     """Spheres of all objects together. More follow the shape more closely and cost simulation time."""

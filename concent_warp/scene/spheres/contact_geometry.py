@@ -23,7 +23,14 @@ GROUP = 3
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """S spheres on B bodies."""
+    """S spheres on B bodies.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> geometry = cw.load_policy("shape_sorter").run.model.geometry
+        >>> geometry.bodies, geometry.position.shape
+        (('block', 'box'), (512, 3))
+    """
 
     bodies: tuple[str, ...]
     """Names of the bodies, in the order of `body`."""
@@ -95,8 +102,9 @@ class ContactGeometry:
             friction=np.concatenate([part.friction for part in parts]),
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write an ``.npz`` file, in one piece or not at all."""
+        path = Path(path)
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("wb") as file:
             np.savez_compressed(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.forces import features
-from concent_warp.diagnosis.forces.locate import locate
+from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.window_forces import WindowCfg
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
@@ -17,7 +17,7 @@ FORCE, POINT = np.array([0.0, -0.5, 0.2]), np.array([0.02, 0.03, -0.01])
 
 
 def located(recording, cfg=QUICK):
-    return locate(Model(Scene(recording.scene)), recording, "mujoco", cfg=cfg)
+    return locate_forces(Model(Scene(recording.scene)), recording, cfg)
 
 
 def of(body, name):

@@ -1,7 +1,7 @@
 import pytest
 
 from concent_warp.diagnosis.search.candidates import candidates, held, label
-from concent_warp.effects.registry import effect_class, effects
+from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -16,7 +16,7 @@ def swing():
 def test_every_effect_that_may_act_on_a_model_is_a_candidate():
     found = candidates(swing(), {"angle", "turned"})
     m = swing().compile()
-    expected = {name for name, kind in effects().items() if kind.targets(m)}
+    expected = {name for name, kind in effect_classes().items() if kind.targets(m)}
     assert {e.name for e in found} == expected
     assert "joint_friction" in expected
     assert "rolling_friction" not in expected

@@ -111,7 +111,9 @@ def test_a_model_without_effects_is_refused(recording):
 
 def test_progress_rises_to_one(recording):
     seen = []
-    fit_effects(model_with(recording, "joint_damping"), recording, lambda share, text: seen.append((share, text)))
+    fit_effects(
+        model_with(recording, "joint_damping"), recording, progress=lambda share, text: seen.append((share, text))
+    )
     shares = [share for share, _ in seen]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0

@@ -119,12 +119,12 @@ def test_an_interrupted_descent_resumes_to_the_same_result(pushed, thick, tmp_pa
     whole_run = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco")
     file = tmp_path / "checkpoint.npz"
     with pytest.raises(KeyboardInterrupt):
-        fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco", checkpoint=file, progress=kill)
-    resumed = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco", checkpoint=file, resume=True)
+        fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco", out=file.parent, progress=kill)
+    resumed = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco", out=file.parent, resume=True)
     np.testing.assert_array_equal(resumed.model.geometry.position, whole_run.model.geometry.position)
     other = replace(cfg, gradient=replace(SMALL, prior=1.0))
     with pytest.raises(ModelError, match="other settings"):
-        fit_geometry(thick, pushed, other, method="gradient", engine="mujoco", checkpoint=file, resume=True)
+        fit_geometry(thick, pushed, other, method="gradient", engine="mujoco", out=file.parent, resume=True)
 
 
 def test_without_help_from_gradients_the_strategy_goes_on_alone(pushed, thick):
