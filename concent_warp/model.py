@@ -222,7 +222,7 @@ class Model:
             )
         scene = Scene.from_mjcf(path.parent / document["scene"])
         geometry = ContactGeometry.load(path.parent / document["geometry"]) if "geometry" in document else None
-        model = Model(scene, geometry, contact_parameters(document.get("contact", {}), path))
+        model = Model(scene, geometry, _contact_parameters(document.get("contact", {}), path))
         if geometry is not None:
             missing = [b for b in geometry.bodies if mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, b) < 0]
             if missing:
@@ -232,7 +232,7 @@ class Model:
         return model
 
 
-def contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameters:
+def _contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameters:
     """Read the ``[contact]`` table of a model file, strictly."""
     known = {f.name: f for f in fields(ContactParameters)}
     if unknown := sorted(set(table) - set(known)):

@@ -54,7 +54,7 @@ def run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> Iterat
         ConcentError: It holds a run and neither `overwrite` nor `resume` was asked for, or holds other things.
     """
     new = not folder.exists()
-    claim_folder(folder, overwrite=overwrite, resume=resume)
+    _claim_folder(folder, overwrite=overwrite, resume=resume)
     try:
         yield
     except ConcentError:
@@ -63,7 +63,7 @@ def run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> Iterat
         raise
 
 
-def claim_folder(folder: Path, *, overwrite: bool, resume: bool) -> None:
+def _claim_folder(folder: Path, *, overwrite: bool, resume: bool) -> None:
     """Check that a run may write to a folder, make it, and empty it where that was asked, see `run_folder`."""
     if folder.exists() and not folder.is_dir():
         raise ConcentError("this is a file", where=folder, expected="a folder for the results")
@@ -113,7 +113,7 @@ def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[st
         stored = tomllib.loads(path.read_text())
     except (OSError, ValueError):
         return
-    before, now = flat(stored.get("settings", {})), flat(settings)
+    before, now = _flat(stored.get("settings", {})), _flat(settings)
     differing = [n for n in sorted(before | now) if n.split(".")[0] not in free and before.get(n) != now.get(n)]
     if differing:
         raise ConcentError(
@@ -121,36 +121,36 @@ def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[st
             where=path.parent,
             expected=", ".join(f"{name} {before.get(name)}" for name in differing),
             found=", ".join(f"{name} {now.get(name)}" for name in differing),
-            fix=f"go on with `{resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
+            fix=f"go on with `{_resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
         )
 
 
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return found
 
 
 def command_line() -> str:
     """Return the command that is running, as one would type it."""
-    return shlex.join([*program(), *INVOCATION.get()])
+    return shlex.join([*_program(), *INVOCATION.get()])
 
 
 def resuming_command() -> str:
     """Return the command that goes on with the run that is running."""
-    return resuming([*program(), *INVOCATION.get()])
+    return _resuming([*_program(), *INVOCATION.get()])
 
 
-def program() -> list[str]:
+def _program() -> list[str]:
     """Return what comes before a command's name: "concent", or what starts it in several processes."""
     if (count := processes()[1]) == 1:
         return ["concent"]
     return ["torchrun", "--nproc-per-node", str(count), "-m", "concent_warp"]
 
 
-def resuming(command: Sequence[str]) -> str:
+def _resuming(command: Sequence[str]) -> str:
     """Return a command so changed that it goes on with what it began."""
     return shlex.join([*(part for part in command if part not in ("--overwrite", "--resume")), "--resume"])
 

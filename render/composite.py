@@ -48,7 +48,7 @@ class Layers:
         return Layers(*(getattr(self, name)[world : world + 1].detach().cpu().clone() for name in names))
 
 
-def composed(
+def _composed(
     background: torch.Tensor, objects: torch.Tensor, alpha: torch.Tensor, shadow: torch.Tensor
 ) -> torch.Tensor:
     """Return the image of the layers: the background in the shadow, the objects over it; shapes as in `Layers`."""
@@ -164,5 +164,5 @@ class HybridCamera:
             objects, alpha = layer.rgb, layer.alpha
             if self._shadows is not None:
                 shadow = self._shadows.render(places, eyes, self._intrinsics, solid.depth)
-        image = composed(background, objects, alpha, shadow)
+        image = _composed(background, objects, alpha, shadow)
         return Layers(whole.rgb, background, objects, alpha, shadow, image)

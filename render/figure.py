@@ -64,7 +64,7 @@ def decomposition(samples: Sequence[Layers], cameras: Sequence[str], path: Path)
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), len(COLUMNS), squeeze=False)
     for r, (c, sample) in enumerate(rows):
-        for k, picture in enumerate(columns(sample, c)):
+        for k, picture in enumerate(_columns(sample, c)):
             axis = axes[r, k]
             axis.imshow(picture)
             axis.set_xticks([])
@@ -78,7 +78,7 @@ def decomposition(samples: Sequence[Layers], cameras: Sequence[str], path: Path)
     partial.replace(path)
 
 
-def columns(sample: Layers, camera: int) -> list[np.ndarray]:
+def _columns(sample: Layers, camera: int) -> list[np.ndarray]:
     """Return the pictures of a row, each shape (H, W, 3), 0..1: objects and shadows on white."""
     alpha = sample.alpha[0, camera, ..., None]
     objects = sample.objects[0, camera] + (1 - alpha)

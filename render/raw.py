@@ -52,7 +52,7 @@ class Stage:
 
         self.model, self.worlds, self.device = model, worlds, wp.get_device(device)
         with wp.ScopedDevice(self.device):
-            drawn = bare(model)
+            drawn = _bare(model)
             data = mjw.make_data(drawn, nworld=worlds, nconmax=1, njmax=1)
             try:
                 self.simulator: tuple[Any, Any] = mjw.put_model(drawn), data
@@ -64,7 +64,7 @@ class Stage:
             self.mocap = (wp.to_torch(data.mocap_pos), wp.to_torch(data.mocap_quat)) if model.nmocap else None
             """Places of what is fixed where a world has it [m] (W, nmocap, 3) and wxyz (W, nmocap, 4)."""
             self.position, self.quaternion = wp.to_torch(data.xpos), wp.to_torch(data.xquat)
-            """Body origins [m] (W, nbody, 3) and orientations wxyz (W, nbody, 4), world frame, after `place`."""
+            """Body origins [m] (W, nbody, 3) and orientations wxyz (W, nbody, 4), world frame, after `_place`."""
             self.camera_position, self._camera_matrix = wp.to_torch(data.cam_xpos), wp.to_torch(data.cam_xmat)
         self._place = Launches(self._pose, self.device)
 
@@ -86,8 +86,8 @@ class Stage:
         """Return poses of cameras, position [m] and wxyz, looking along -z with y up, shape (W, C, 7)."""
         import torch
 
-        rows = camera_ids(self.model, cameras)
-        return torch.cat([self.camera_position[:, rows], matrix_quaternions(self._camera_matrix[:, rows])], dim=-1)
+        rows = _camera_ids(self.model, cameras)
+        return torch.cat([self.camera_position[:, rows], _matrix_quaternions(self._camera_matrix[:, rows])], dim=-1)
 
     def _pose(self) -> None:
         """Launch what poses follow from the positions."""
@@ -128,10 +128,10 @@ class RawCamera:
 
         if min(size) < 1:
             raise RenderError("the size of images is not right", expected="at least 1 x 1", found=size)
-        rows = camera_ids(stage.model, cameras)
+        rows = _camera_ids(stage.model, cameras)
         self.stage, self.cameras, self.size = stage, tuple(cameras), size
         height, width = size
-        shown = grouped(stage.model, leave_out, objects)
+        shown = _grouped(stage.model, leave_out, objects)
         with wp.ScopedDevice(stage.device):
             self._context = mjw.create_render_context(
                 shown, nworld=stage.worlds, cam_res=(width, height), cam_active=rows, render_rgb=True,
@@ -152,7 +152,7 @@ class RawCamera:
 
     def intrinsics(self) -> np.ndarray:
         """Return the pinhole matrices of the cameras [px], shape (C, 3, 3)."""
-        return intrinsics(self.stage.model, self.cameras, self.size)
+        return _intrinsics(self.stage.model, self.cameras, self.size)
 
     def _trace(self) -> None:
         """Launch the ray tracer."""
@@ -195,7 +195,7 @@ class Launches:
         self._graph = captured.graph
 
 
-def bare(model: mujoco.MjModel) -> mujoco.MjModel:
+def _bare(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy without what only moves a model, as the ray tracer's simulator may not know it."""
     drawn = copy.copy(model)
     drawn.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -203,7 +203,7 @@ def bare(model: mujoco.MjModel) -> mujoco.MjModel:
     return drawn
 
 
-def grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["visual", "spheres"]) -> mujoco.MjModel:
+def _grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["visual", "spheres"]) -> mujoco.MjModel:
     """Return a copy whose geoms are in group SHOWN where they are to be seen, in HIDDEN otherwise.
 
     Geoms in MuJoCo's groups 0 to 2 are seen as a rule; of bodies with contact spheres, the spheres where that is asked.
@@ -235,7 +235,7 @@ def body_id(model: mujoco.MjModel, name: str) -> int:
     return found
 
 
-def camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
+def _camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
     """Return the ids of cameras.
 
     Raises:
@@ -247,21 +247,21 @@ def camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
     return [names.index(name) for name in cameras]
 
 
-def intrinsics(model: mujoco.MjModel, cameras: Sequence[str], size: tuple[int, int]) -> np.ndarray:
+def _intrinsics(model: mujoco.MjModel, cameras: Sequence[str], size: tuple[int, int]) -> np.ndarray:
     """Return pinhole matrices [px] of cameras given by their field of view, shape (C, 3, 3).
 
     (0, 0) is the centre of the first pixel.
     """
     height, width = size
     found = np.tile(np.eye(3), (len(cameras), 1, 1))
-    for matrix, row in zip(found, camera_ids(model, cameras), strict=True):
+    for matrix, row in zip(found, _camera_ids(model, cameras), strict=True):
         focal = height / 2 / np.tan(np.radians(float(model.cam_fovy[row])) / 2)
         matrix[0, 0] = matrix[1, 1] = focal
         matrix[:2, 2] = (width - 1) / 2, (height - 1) / 2
     return found
 
 
-def matrix_quaternions(matrices: torch.Tensor) -> torch.Tensor:
+def _matrix_quaternions(matrices: torch.Tensor) -> torch.Tensor:
     """Return unit quaternions wxyz (..., 4) of rotation matrices (..., 3, 3).
 
     Of the four rows of q q^T, each 4 q_i q, that of the largest number is taken (Shepperd, J. Guid. Control 1, 1978).

@@ -52,7 +52,7 @@ class Shadows:
         self._generator = generator
         self._shape = (worlds, cameras, cfg.lights, height, width)
         self.rasteriser = Rasteriser(
-            [caster(o, cfg.splats) for o in objects], width, height, worlds, cameras * cfg.lights, device=device,
+            [_caster(o, cfg.splats) for o in objects], width, height, worlds, cameras * cfg.lights, device=device,
             margin=cfg.margin, ground=cfg.ground,
         )  # fmt: skip
         self.directions = torch.zeros(worlds, cfg.lights, 3, device=self.rasteriser.device)
@@ -122,7 +122,7 @@ def shaded(image: torch.Tensor, shadow: torch.Tensor) -> torch.Tensor:
     return image * (1 - shadow[..., None])
 
 
-def caster(splats: Splats, count: int) -> Splats:
+def _caster(splats: Splats, count: int) -> Splats:
     """Return at most `count` black splats that cover what all do, grown for the gaps that the others leave."""
     chosen = splats
     if len(splats) > count:

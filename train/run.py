@@ -115,7 +115,7 @@ def train_run(
     with ranks.agreeing():
         if folder is not None and ranks.first:
             if resume:
-                check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
+                _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
             run.save(folder)
         task, where, seed = run.task(), ranks.device(device), ranks.seed(run.cfg.seed)
         states = draw_states(task, run.cfg.environment.reset, seed, device=where)
@@ -129,7 +129,7 @@ def train_run(
     return trainer, trainer.learn(report, seconds=seconds)
 
 
-def check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
+def _check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
     """Refuse settings that differ from those that a training was begun with."""
 
     def flat(value: object, prefix: str = "") -> dict[str, object]:

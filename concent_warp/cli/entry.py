@@ -37,7 +37,7 @@ PATIENCE = 10.0
 """How long other processes wait for the first one to say what is wrong [s]."""
 
 
-def usage() -> str:
+def _usage() -> str:
     """Return the text of ``concent --help``."""
     lines = [f"  {name:<13}{text}" for name, text in COMMANDS.items()]
     return "\n".join(
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage())
+        print(_usage())
         return 0
     if arguments[0] == "--version":
         print(f"concent {concent_warp.__version__}")
@@ -72,21 +72,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] not in COMMANDS:
         print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
         return ERROR
-    code = run(arguments[0], arguments[1:])
+    code = _run(arguments[0], arguments[1:])
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        return leave_pipe()
+        return _leave_pipe()
     return code
 
 
-def leave_pipe() -> int:
+def _leave_pipe() -> int:
     """Give up standard output, which its reader has closed as `head` does, and return the exit code for that."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return CLOSED
 
 
-def run(command: str, arguments: Sequence[str]) -> int:
+def _run(command: str, arguments: Sequence[str]) -> int:
     """Run one command."""
     try:
         import tyro
@@ -104,31 +104,31 @@ def run(command: str, arguments: Sequence[str]) -> int:
         )
         module.run(settings)
     except ConcentError as error:
-        complain(f"concent {command}: {error}")
+        _complain(f"concent {command}: {error}")
         return ERROR
     except BrokenPipeError:
-        return leave_pipe()
+        return _leave_pipe()
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
-        complain(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.")
+        _complain(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.")
         return ERROR
     except KeyboardInterrupt as interrupt:
         if processes()[0] == 0:
             print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
         return INTERRUPTED
     except SystemExit as end:  # tyro ends the process after a wrong option or --help
-        let_the_first_speak()
+        _let_the_first_speak()
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0
 
 
-def complain(sentence: str) -> None:
+def _complain(sentence: str) -> None:
     """Write to standard error; of several processes, which one error stops all, the first that comes to it."""
-    let_the_first_speak()
+    _let_the_first_speak()
     print(sentence, file=sys.stderr)
 
 
-def let_the_first_speak() -> None:
+def _let_the_first_speak() -> None:
     """Wait for the first of several processes, which says what is wrong with all and ends them by leaving."""
     if processes()[0] > 0:
         time.sleep(PATIENCE)

@@ -27,7 +27,7 @@ def work_progress(title: str) -> Iterator[Callable[[float, str], None]]:
         yield lambda share, text: update(share, text, None)
 
 
-def number(value: float) -> str:
+def _number(value: float) -> str:
     """Return a parameter's value as text."""
     return f"{value:.4g}" if np.isfinite(value) else "none" if value > 0 else "-none"
 
@@ -35,7 +35,7 @@ def number(value: float) -> str:
 def value_and_interval(p: FittedParameter) -> str:
     """Return a parameter as text, such as ``torque 0.0301 [0.0298, 0.0305] N m``; its owner in brackets is left out."""
     unit = "" if p.unit == "-" else f" {p.unit}"
-    return f"{p.name.split('[')[0]} {number(p.value)} [{number(p.low)}, {number(p.high)}]{unit}"
+    return f"{p.name.split('[')[0]} {_number(p.value)} [{_number(p.low)}, {_number(p.high)}]{unit}"
 
 
 def say_fitted(fitted: FittedEffects) -> None:
@@ -47,8 +47,8 @@ def say_fitted(fitted: FittedEffects) -> None:
         table.add_column(name, justify="right" if name in ("value", "95 % interval", "none at") else "left")
     for added, group in zip(fitted.model.effects, fitted.parameters, strict=True):
         for k, p in enumerate(group):
-            interval = f"{number(p.low)} to {number(p.high)}"
-            cells = [added.effect.name if k == 0 else "", p.name, number(p.value), interval, p.unit, number(p.null)]
+            interval = f"{_number(p.low)} to {_number(p.high)}"
+            cells = [added.effect.name if k == 0 else "", p.name, _number(p.value), interval, p.unit, _number(p.null)]
             table.add_row(*map(escape, cells), end_section=k + 1 == len(group))
     say(table)
     table = Table(header_style="bold")
@@ -66,5 +66,5 @@ def say_fitted(fitted: FittedEffects) -> None:
 def say_added(effects: Sequence[AddedEffect], names: Sequence[Sequence[str]]) -> None:
     """Write the values that effects were added with; `names` are those of their parameters with units."""
     for added, parameters in zip(effects, names, strict=True):
-        values = ", ".join(f"{name} {number(value)}" for name, value in zip(parameters, added.values, strict=True))
+        values = ", ".join(f"{name} {_number(value)}" for name, value in zip(parameters, added.values, strict=True))
         say(escape(f"{added.effect.name}: {values}"))

@@ -16,7 +16,7 @@ DEFAULT = "shape_sorter"
 """The policy that ``--pretrained`` without a name means."""
 
 
-def named(arguments: list[str]) -> str:
+def _named(arguments: list[str]) -> str:
     """Return the name among at most one argument."""
     if len(arguments) > 1:
         raise ValueError("at most one name")
@@ -28,7 +28,7 @@ Pretrained = Annotated[
     PrimitiveConstructorSpec(
         nargs="*",
         metavar="[NAME]",
-        instance_from_str=named,
+        instance_from_str=_named,
         is_instance=lambda value: value is None or isinstance(value, str),
         str_from_instance=lambda value: [] if value is None else [value],
     ),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
 
-def console(*, stderr: bool = False) -> Console:
+def _console(*, stderr: bool = False) -> Console:
     """Return the console for results, or for progress and remarks, which go to standard error."""
     from rich.console import Console
 
@@ -25,7 +25,7 @@ def console(*, stderr: bool = False) -> Console:
 
 def say(message: RenderableType) -> None:
     """Write a remark or a table to standard output; text may carry rich's markup."""
-    console().print(message)
+    _console().print(message)
 
 
 def say_written(*paths: Path) -> None:
@@ -56,7 +56,7 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
     What is given is to be called with the share done, 0..1, the text, and the seconds left, None to estimate them from
     the share. Where there is no terminal, plain lines come now and then.
     """
-    out = console(stderr=True)
+    out = _console(stderr=True)
     begun = time.monotonic()
     if not out.is_terminal:
         last = -PLAIN_PERIOD
@@ -66,7 +66,7 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
             spent = time.monotonic() - begun
             if share > 0 and spent - last >= PLAIN_PERIOD:
                 last = spent
-                out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{time_left(share, spent, left)}")
+                out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{_time_left(share, spent, left)}")
 
         yield plain
         return
@@ -77,7 +77,7 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
         task = bar.add_task(title, total=1.0, text="")
 
         def update(share: float, text: str, left: float | None) -> None:
-            remaining = time_left(share, time.monotonic() - begun, left)
+            remaining = _time_left(share, time.monotonic() - begun, left)
             bar.update(task, completed=share, text=f"{text}{remaining}".lstrip(", "))
 
         yield update
@@ -87,7 +87,7 @@ PLAIN_PERIOD = 5.0
 """Time between lines of progress where there is no terminal [s]."""
 
 
-def time_left(share: float, spent: float, left: float | None) -> str:
+def _time_left(share: float, spent: float, left: float | None) -> str:
     """Return the time left as words, empty while it is not known."""
     if left is None:
         if share <= 0.02:

@@ -28,7 +28,7 @@ RULE = (
 """The rule in one sentence."""
 
 
-def autocorrelation_time(series: np.ndarray) -> float:
+def _autocorrelation_time(series: np.ndarray) -> float:
     """Return the integrated autocorrelation time of `series` (n,) in samples, at least 1.
 
     1 + 2 sum of rho_k, summed up to the first autocorrelation that is not positive; n over it is the effective number
@@ -44,16 +44,16 @@ def autocorrelation_time(series: np.ndarray) -> float:
     return float(max(1.0, 1 + 2 * rho[1:first].sum()))
 
 
-def block_length(series: np.ndarray) -> int:
+def _block_length(series: np.ndarray) -> int:
     """Return the length of the blocks for `series` (n,) in samples, by the rule above."""
     n = len(series)
-    wanted = max(np.ceil(2 * autocorrelation_time(series)), np.ceil(n ** (1 / 3)))
+    wanted = max(np.ceil(2 * _autocorrelation_time(series)), np.ceil(n ** (1 / 3)))
     return int(max(1, min(wanted, n // 4)))
 
 
 def effective_count(parts: Sequence[np.ndarray]) -> float:
     """Return the effective number of samples of series (n_d,): each length over its autocorrelation time, summed."""
-    return float(sum(len(part) / autocorrelation_time(part) for part in parts if len(part)))
+    return float(sum(len(part) / _autocorrelation_time(part) for part in parts if len(part)))
 
 
 def mean_interval(parts: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float]:
@@ -66,14 +66,14 @@ def mean_interval(parts: Sequence[np.ndarray], seed: int = 0) -> tuple[float, fl
         return np.nan, np.nan
     if not all(np.isfinite(part).all() for part in parts):
         return np.inf, np.inf
-    draw = drawn_demonstrations if len(parts) >= WHOLE else drawn_blocks
+    draw = _drawn_demonstrations if len(parts) >= WHOLE else _drawn_blocks
     means = draw(parts, np.random.default_rng(seed))
     tail = 50 * (1 - LEVEL)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)
 
 
-def drawn_demonstrations(parts: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+def _drawn_demonstrations(parts: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """Return the means of replicates that draw whole demonstrations, shape (DRAWS,)."""
     total = np.array([part.sum() for part in parts])
     count = np.array([len(part) for part in parts])
@@ -81,11 +81,11 @@ def drawn_demonstrations(parts: Sequence[np.ndarray], rng: np.random.Generator) 
     return total[chosen].sum(axis=1) / count[chosen].sum(axis=1)
 
 
-def drawn_blocks(parts: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+def _drawn_blocks(parts: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     """Return the means of replicates that draw blocks within each demonstration, shape (DRAWS,)."""
     total = np.zeros(DRAWS)
     for part in parts:
-        n, length = len(part), block_length(part)
+        n, length = len(part), _block_length(part)
         running = np.concatenate([[0.0], np.cumsum(np.concatenate([part, part[:length]]))])
         block_sum = running[length : length + n] - running[:n]
         start = rng.integers(n, size=(DRAWS, -(-n // length)))

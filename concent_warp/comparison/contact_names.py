@@ -70,7 +70,7 @@ class Partners:
         if body not in self.roles.bodies:
             return None
         row = self.roles.bodies.index(body)
-        group = subtree(self.compiled, row)
+        group = _subtree(self.compiled, row)
         step = self.touches.step * self.motion.timestep
         mine = np.isin(self.touches.body, group)
         chosen = np.asarray((mine.sum(axis=1) == 1) & (step >= start) & (step <= end))
@@ -118,7 +118,7 @@ class Partners:
         """Return the side, edge or corner of a body that contacts are at, empty where they are within it."""
         if body == 0:
             return ""
-        low, high = box_of(self.compiled, body)
+        low, high = _box_of(self.compiled, body)
         half = (high - low) / 2
         if (half <= 0).any():
             return ""
@@ -128,7 +128,7 @@ class Partners:
         return f"{' '.join(sides)} {('side', 'edge', 'corner')[len(sides) - 1]}" if sides else ""
 
 
-def subtree(compiled: mujoco.MjModel, body: int) -> list[int]:
+def _subtree(compiled: mujoco.MjModel, body: int) -> list[int]:
     """Return the ids of a body and of all that it carries."""
     found = {body}
     for b in range(body + 1, compiled.nbody):
@@ -137,7 +137,7 @@ def subtree(compiled: mujoco.MjModel, body: int) -> list[int]:
     return sorted(found)
 
 
-def box_of(compiled: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+def _box_of(compiled: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the box about the geoms of a body [m], (3,) each, in its frame; both zero without geoms."""
     corners = []
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

@@ -102,12 +102,12 @@ def tell_a_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
     return any(len(found) > 1 and any(ROBOT in s.bodies for s in found) for found in stages.values())
 
 
-def replay_phases(model: Model, demonstration: Demonstration, engine: Engine) -> tuple[Phase, ...]:
+def _replay_phases(model: Model, demonstration: Demonstration, engine: Engine) -> tuple[Phase, ...]:
     """Return the ways of moving over a demonstration's replay; one span over all where it does not stay finite."""
-    return motion_phases(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
+    return _motion_phases(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
 
 
-def motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> tuple[Phase, ...]:
+def _motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> tuple[Phase, ...]:
     """Return the ways of moving over a replay, without gaps; see `phases_by_body` for the arguments."""
     return phases_by_body(model, compiled, rollout)[None]
 
@@ -130,9 +130,9 @@ def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> 
     movable = np.flatnonzero(compiled.body_weldid != 0)
     watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
     speeds = Speeds.of(motion, compiled)
-    states = {roles.bodies[b]: body_state(b, touches, motion, speeds, roles) for b in watched}
+    states = {roles.bodies[b]: _body_state(b, touches, motion, speeds, roles) for b in watched}
     together = np.min([*states.values(), np.full(motion.steps, len(MOTIONS) - 1)], axis=0)
-    return {None: spans(together, motion.timestep), **{b: spans(s, motion.timestep) for b, s in states.items()}}
+    return {None: _spans(together, motion.timestep), **{b: _spans(s, motion.timestep) for b, s in states.items()}}
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class Speeds:
             linear = angular = np.zeros((1, *motion.position.shape[1:]))
         else:
             linear, angular = (np.concatenate([v, v[-1:]]) for v in (linear, angular))
-        return Speeds(linear, angular, reaches(compiled))
+        return Speeds(linear, angular, _reaches(compiled))
 
     def at(self, body: np.ndarray, step: np.ndarray, arm: np.ndarray) -> np.ndarray:
         """Return velocities [m/s], shape (C, 3), of points at `arm` (C, 3) [m] from the origins of `body` (C,)."""
@@ -187,7 +187,7 @@ class Speeds:
         return change
 
 
-def reaches(compiled: mujoco.MjModel) -> np.ndarray:
+def _reaches(compiled: mujoco.MjModel) -> np.ndarray:
     """Return how far the geoms of each body reach from its frame's origin [m], shape (nbody,)."""
     reach = np.zeros(compiled.nbody)
     far = np.linalg.norm(compiled.geom_pos, axis=1) + compiled.geom_rbound
@@ -195,21 +195,21 @@ def reaches(compiled: mujoco.MjModel) -> np.ndarray:
     return reach
 
 
-def body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, roles: Roles) -> np.ndarray:
+def _body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, roles: Roles) -> np.ndarray:
     """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
     dt, steps = motion.timestep, motion.steps
     rows = touches[np.asarray((touches.body == body).any(axis=1))]
     touching = windowed(rows.frames(steps).astype(float), steps_of(HOLD / 2, dt)) > 0
     state = np.full(steps, MOTIONS.index(FREE))
     state[touching] = MOTIONS.index(STICK)
-    state[touching & (slip(rows, motion, speeds) > SLIDING)] = MOTIONS.index(SLIDE)
+    state[touching & (_slip(rows, motion, speeds) > SLIDING)] = MOTIONS.index(SLIDE)
     still = drop_blips(speeds.fastest(body) < RESTING, steps_of(LASTING, dt))
     state[still] = MOTIONS.index(REST)
     hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
     if len(hands.step) and roles.body_role[body] != "robot":
         held = hands.frames(steps) & opposed(hands, steps, steps_of(GRASP_WINDOW, dt), SQUEEZE)
         state[held] = MOTIONS.index(GRASPED)
-    state = prevailing(state, steps_of(HOLD, dt))
+    state = _prevailing(state, steps_of(HOLD, dt))
     width = steps_of(JOLT_WINDOW, dt)
     jolted = touching & (speeds.jolt(body, width) > JOLT * width * dt)
     lasting = steps_of(AFTERMATH, dt)
@@ -218,7 +218,7 @@ def body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, role
     return state
 
 
-def slip(rows: Touches, motion: Motion, speeds: Speeds) -> np.ndarray:
+def _slip(rows: Touches, motion: Motion, speeds: Speeds) -> np.ndarray:
     """Return the mean tangential speed of contacts [m/s], weighted by force, over windows of `HOLD`, shape (K,)."""
     total = np.zeros((motion.steps, 2))
     if len(rows.step):
@@ -232,12 +232,12 @@ def slip(rows: Touches, motion: Motion, speeds: Speeds) -> np.ndarray:
     return total[:, 0] / np.maximum(total[:, 1], 1e-12)
 
 
-def prevailing(state: np.ndarray, width: int) -> np.ndarray:
+def _prevailing(state: np.ndarray, width: int) -> np.ndarray:
     """Return for each step the state (K,) that most of the `width` steps about it are in."""
     return windowed(np.eye(len(MOTIONS))[state], width).argmax(axis=1)
 
 
-def spans(state: np.ndarray, timestep: float) -> tuple[Phase, ...]:
+def _spans(state: np.ndarray, timestep: float) -> tuple[Phase, ...]:
     """Return the spans of equal `state` (K,); the first has no beginning and the last no end."""
     edges = np.flatnonzero(np.diff(state)) + 1
     starts = [-np.inf, *(edges * timestep).tolist()]

@@ -86,7 +86,7 @@ def residuals(
     for added in effects:
         read = added.effect.measure(compiled, read, added.array)
     found = [
-        sensor_residual(compiled, read, name, channel, demonstration.name, known.get(name))
+        _sensor_residual(compiled, read, name, channel, demonstration.name, known.get(name))
         for name, channel in demonstration.measured.items()
     ]
     for body, track in demonstration.points.items():
@@ -96,7 +96,7 @@ def residuals(
                 where=demonstration.name,
                 expected=f"one of {list(rollout.bodies)}",
             )
-        found.append(point_residual(rollout, body, track))
+        found.append(_point_residual(rollout, body, track))
     return tuple(found)
 
 
@@ -110,7 +110,7 @@ def instrument_noise(compiled: mujoco.MjModel, demonstrations: Sequence[Demonstr
     return found
 
 
-def sensor_residual(
+def _sensor_residual(
     compiled: mujoco.MjModel, read: Reader, name: str, channel: Channel, where: str, noise: Noise | None = None
 ) -> Residual:
     """Return the residual of one sensor; `read` tells what it reads at given times in the model's world."""
@@ -144,16 +144,16 @@ def sensor_residual(
         body=body_of(compiled, row),
         time=channel.time,
         value=value,
-        error=lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
-        noise=None if std is None else std * mean_norm(value.shape[1]),
+        error=_lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
+        noise=None if std is None else std * _mean_norm(value.shape[1]),
         std=std,
         source=noise.source,
-        extent=extent(channel.value, kind),
+        extent=_extent(channel.value, kind),
         local=int(compiled.sensor_type[row]) in LOCAL,
     )
 
 
-def extent(value: np.ndarray, kind: Kind) -> float:
+def _extent(value: np.ndarray, kind: Kind) -> float:
     """Return how far readings (T, dim) move: diagonal of their box, of orientations the largest turn from the first."""
     valid = value[np.asarray(np.isfinite(value).all(axis=1))]
     if not len(valid):
@@ -163,7 +163,7 @@ def extent(value: np.ndarray, kind: Kind) -> float:
     return float(np.linalg.norm(np.ptp(valid, axis=0)))
 
 
-def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
+def _point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
     """Return the residual of a point track: each material point against where the model's body carries it.
 
     Where a point sits on the body is the mean of its first `ANCHOR_FRAMES` observations, brought into the body frame by
@@ -188,7 +188,7 @@ def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
     some = np.asarray(measured.any(axis=1))
     value[~some] = np.nan
     error = np.where(some, (share * distance).sum(axis=1), np.nan)
-    noise = point_noise(local, anchor, sightings)
+    noise = _point_noise(local, anchor, sightings)
     return Residual(
         channel=f"{body} points",
         kind="points",
@@ -196,15 +196,15 @@ def point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
         body=body,
         time=track.time,
         value=value,
-        error=lost(error, position, some),
+        error=_lost(error, position, some),
         noise=noise,
-        std=None if noise is None else noise / mean_norm(3),
+        std=None if noise is None else noise / _mean_norm(3),
         source="unknown" if noise is None else "points",
-        extent=extent(value + position, "points"),
+        extent=_extent(value + position, "points"),
     )
 
 
-def point_noise(local: np.ndarray, anchor: np.ndarray, sightings: np.ndarray) -> float | None:
+def _point_noise(local: np.ndarray, anchor: np.ndarray, sightings: np.ndarray) -> float | None:
     """Return the mean distance that the scatter of `local` (F, M, 3) about `anchor` (M, 3) [m] leaves, if it tells.
 
     The anchors are means of `sightings` (M,) observations, so they err too.
@@ -214,15 +214,15 @@ def point_noise(local: np.ndarray, anchor: np.ndarray, sightings: np.ndarray) ->
         return None
     square = np.nansum((local[:, several] - anchor[several]) ** 2)
     std = np.sqrt(square / (3 * (sightings[several] - 1).sum()))
-    return float(std * np.sqrt(1 + np.mean(1 / sightings[several])) * mean_norm(3))
+    return float(std * np.sqrt(1 + np.mean(1 / sightings[several])) * _mean_norm(3))
 
 
-def lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+def _lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return `error` (T,), infinite where something was `measured` (T,) and `predicted` (T, dim) is not finite."""
     diverged = measured & ~np.isfinite(predicted).all(axis=1)
     return np.where(diverged, np.inf, np.where(measured, error, np.nan))
 
 
-def mean_norm(dim: int) -> float:
+def _mean_norm(dim: int) -> float:
     """Return the mean length of a vector of `dim` independent standard normal numbers (chi distribution)."""
     return float(np.sqrt(2) * gamma((dim + 1) / 2) / gamma(dim / 2))

@@ -181,7 +181,7 @@ class Comparison:
         weight = sum(n for _, n in noises)
         sources: list[Source] = [r.source for r, _ in found if r.noise is not None]
         noise = float(sum(noise * n for noise, n in noises) / weight) if weight else None
-        mean = statistic(np.mean, pooled)
+        mean = _statistic(np.mean, pooled)
         return Summary(
             model=model,
             channel=channel,
@@ -192,9 +192,9 @@ class Comparison:
             mean=mean,
             low=low,
             high=high,
-            rms=statistic(lambda e: np.sqrt(np.mean(e**2)), pooled),
-            p95=statistic(lambda e: np.percentile(e, 95), pooled),
-            max=statistic(np.max, pooled),
+            rms=_statistic(lambda e: np.sqrt(np.mean(e**2)), pooled),
+            p95=_statistic(lambda e: np.percentile(e, 95), pooled),
+            max=_statistic(np.max, pooled),
             noise=noise,
             ratio=mean / noise if noise else None,
             source=sources[0] if sources else "unknown",
@@ -215,7 +215,7 @@ class Comparison:
         first, second = (self.errors(model, channel, phases, demonstrations) for model in (before, after))
         with np.errstate(invalid="ignore"):
             parts = [b - a for a, b in zip(first, second, strict=True)]
-            mean = statistic(np.mean, np.concatenate(second)) - (base := statistic(np.mean, np.concatenate(first)))
+            mean = _statistic(np.mean, np.concatenate(second)) - (base := _statistic(np.mean, np.concatenate(first)))
         finite = bool(np.isfinite(mean))
         low, high = mean_interval(parts, self.seed) if finite else (mean, mean)
         share = mean / base if finite and base else np.nan
@@ -272,7 +272,7 @@ class Comparison:
         return {**asdict(found), "verdict": found.verdict}
 
 
-def statistic(function: Any, values: np.ndarray) -> float:
+def _statistic(function: Any, values: np.ndarray) -> float:
     """Return `function` of values (n,); NaN of none, infinite where one of them is."""
     if not len(values):
         return np.nan

@@ -21,7 +21,7 @@ def mean_and_interval(summary: Summary) -> str:
     return f"{mean} [{shown(summary.low, summary.unit)}, {shown(summary.high, summary.unit)}]"
 
 
-def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
+def _cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table as text.
 
     Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
@@ -45,14 +45,14 @@ def cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[st
         row = ["" if phase else channel, last.phase, unit_shown(last.unit), str(last.count)]
         row += [mean_and_interval(summary) for summary in summaries]
         if several:
-            row.append(change(comparison, channel, phase))
+            row.append(_change(comparison, channel, phase))
         row += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
         row.append("-" if last.ratio is None else times(last.ratio))
         rows.append(row)
     return header, rows
 
 
-def change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str:
+def _change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str:
     """Return the change of the mean error in percent and the interval of the difference."""
     found = comparison.difference(channel, phase)
     if not np.isfinite(found.share):
@@ -68,7 +68,7 @@ def rich_table(comparison: Comparison, *, every_phase: bool = False) -> Table:
     """Return the table for a terminal."""
     from rich.table import Table
 
-    header, rows = cells(comparison, every_phase=every_phase)
+    header, rows = _cells(comparison, every_phase=every_phase)
     table = Table(header_style="bold")
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < 3 else "right", no_wrap=i == 0)
@@ -79,6 +79,6 @@ def rich_table(comparison: Comparison, *, every_phase: bool = False) -> Table:
 
 def markdown_table(comparison: Comparison, *, every_phase: bool = False) -> str:
     """Return the table as Markdown."""
-    header, rows = cells(comparison, every_phase=every_phase)
+    header, rows = _cells(comparison, every_phase=every_phase)
     rule = [":---" if i < 3 else "---:" for i in range(len(header))]
     return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows)) + "\n"

@@ -117,9 +117,9 @@ def worst_places(
     found = [
         place
         for residual in residuals
-        for place in channel_places(residual, phases.get(residual.body, phases[None]), partners, demonstration)
+        for place in _channel_places(residual, phases.get(residual.body, phases[None]), partners, demonstration)
     ]
-    return merged(sorted(found, key=severity, reverse=True))
+    return _merged(sorted(found, key=_severity, reverse=True))
 
 
 def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
@@ -132,7 +132,7 @@ def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
         seen.setdefault(alike(place), set()).add(place.demonstration)
     kept: list[Place] = []
     count: dict[tuple, int] = {}
-    for place in sorted(places, key=severity, reverse=True):
+    for place in sorted(places, key=_severity, reverse=True):
         count[alike(place)] = count.get(alike(place), 0) + 1
         if count[alike(place)] <= EACH and len(kept) < most:
             kept.append(replace(place, recurs=len(seen[alike(place)])))
@@ -144,12 +144,12 @@ def alike(place: Place) -> tuple:
     return place.channels[0], place.phase, place.against[:1]
 
 
-def severity(place: Place) -> tuple[float, float]:
+def _severity(place: Place) -> tuple[float, float]:
     """Return a key that is larger for worse places; known noise counts before unknown."""
     return (np.inf if not np.isfinite(place.error) else -1.0 if place.ratio is None else place.ratio), place.error
 
 
-def channel_places(
+def _channel_places(
     residual: Residual, phases: Sequence[Phase], partners: Partners | None, demonstration: str
 ) -> Iterator[Place]:
     """Yield the places of one channel."""
@@ -159,8 +159,8 @@ def channel_places(
     if (lost := np.isinf(residual.error)).any():
         first, last = float(residual.time[lost.argmax()]), float(residual.time[-1])
         rows = np.flatnonzero(lost)
-        yield described(residual, rows, first, first, phases, partners, demonstration, last)
-    level = smoothed(residual.time, np.where(lost, np.nan, residual.error) / floor)
+        yield _described(residual, rows, first, first, phases, partners, demonstration, last)
+    level = _smoothed(residual.time, np.where(lost, np.nan, residual.error) / floor)
     above = level >= LEAST
     taken = np.zeros(len(level), dtype=bool)
     for _ in range(EACH):
@@ -168,18 +168,18 @@ def channel_places(
         if not np.isfinite(peak := left.max()):
             return
         top = int(left.argmax())
-        start, end = run_at(above & ~taken & (level >= peak / 2), top)
-        onset = run_at(above, top)[0]
-        taken[slice(*downhill(level, start, end))] = True
+        start, end = _run_at(above & ~taken & (level >= peak / 2), top)
+        onset = _run_at(above, top)[0]
+        taken[slice(*_downhill(level, start, end))] = True
         if end - start < FEWEST:
             continue
         rows, (at, since) = np.arange(start, end), residual.time[[top, onset]].tolist()
-        place = described(residual, rows, at, since, phases, partners, demonstration)
+        place = _described(residual, rows, at, since, phases, partners, demonstration)
         growth = np.diff(np.maximum.accumulate(level[onset : top + 1]), prepend=0.0)
-        yield replace(place, arose=main_phase(residual.time[onset : top + 1], growth, phases))
+        yield replace(place, arose=_main_phase(residual.time[onset : top + 1], growth, phases))
 
 
-def smoothed(time: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+def _smoothed(time: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the root mean square of `ratio` (T,) over centred windows; 0 where nothing was measured.
 
     Args:
@@ -195,14 +195,14 @@ def smoothed(time: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     return np.sqrt(square / np.maximum(count, 1))[: len(time)]
 
 
-def run_at(mask: np.ndarray, row: int) -> tuple[int, int]:
+def _run_at(mask: np.ndarray, row: int) -> tuple[int, int]:
     """Return first and one-past-last row of the run of True in `mask` (T,) that holds `row`."""
     spans = runs(mask)
     start, end = spans[(spans[:, 0] <= row) & (row < spans[:, 1])][0]
     return int(start), int(end)
 
 
-def downhill(level: np.ndarray, start: int, end: int) -> tuple[int, int]:
+def _downhill(level: np.ndarray, start: int, end: int) -> tuple[int, int]:
     """Return a span of `level` (T,) widened to where it stops falling, so that its shoulders are no places."""
     least = level[start]
     while start > 0 and level[start - 1] < 1.1 * least + SLACK:
@@ -215,7 +215,7 @@ def downhill(level: np.ndarray, start: int, end: int) -> tuple[int, int]:
     return start, end
 
 
-def described(
+def _described(
     residual: Residual,
     rows: np.ndarray,
     peak: float,
@@ -229,13 +229,13 @@ def described(
     start, end = float(residual.time[rows[0]]), float(residual.time[rows[-1]]) if end is None else end
     error = residual.error[rows]
     rms = float(np.sqrt(np.nanmean(error**2)))
-    text, vector = direction(residual, rows)
+    text, vector = _direction(residual, rows)
     touching = None if partners is None or residual.body is None else partners.of(residual.body, start, end)
     return Place(
         demonstration=demonstration,
         channels=(residual.channel,),
         body=residual.body,
-        phase=main_phase(residual.time[rows], np.nan_to_num(error, posinf=1.0), phases),
+        phase=_main_phase(residual.time[rows], np.nan_to_num(error, posinf=1.0), phases),
         start=start,
         end=end,
         peak=peak,
@@ -250,7 +250,7 @@ def described(
     )
 
 
-def main_phase(time: np.ndarray, error: np.ndarray, phases: Sequence[Phase]) -> str | None:
+def _main_phase(time: np.ndarray, error: np.ndarray, phases: Sequence[Phase]) -> str | None:
     """Return the name of the phase in which errors (n,) at `time` (n,) weigh most."""
     weight: dict[str, float] = {}
     for phase in phases:
@@ -259,7 +259,7 @@ def main_phase(time: np.ndarray, error: np.ndarray, phases: Sequence[Phase]) -> 
     return max(weight, key=lambda name: weight[name]) if weight else None
 
 
-def direction(residual: Residual, rows: np.ndarray) -> tuple[str, tuple[float, ...]]:
+def _direction(residual: Residual, rows: np.ndarray) -> tuple[str, tuple[float, ...]]:
     """Return where the measurement lies as seen from the model, in words and as a vector of length 0 to 1."""
     value = residual.value[rows]
     value = value[np.asarray(np.isfinite(value).all(axis=1))]
@@ -273,13 +273,13 @@ def direction(residual: Residual, rows: np.ndarray) -> tuple[str, tuple[float, .
         return f"measured {side} the model" if steady else "to and fro", vector
     if len(mean) != 3:
         return "", vector
-    axes = named_axes(mean, signed=True) if steady else named_axes(np.sqrt((value**2).mean(axis=0)), signed=False)
+    axes = _named_axes(mean, signed=True) if steady else _named_axes(np.sqrt((value**2).mean(axis=0)), signed=False)
     turning = residual.unit.startswith("rad") or residual.unit == "N m"
     along = f"{'about' if turning else 'along'} {'its own ' if residual.local else ''}{axes}"
     return along if steady else f"to and fro {along}", vector
 
 
-def named_axes(vector: np.ndarray, *, signed: bool) -> str:
+def _named_axes(vector: np.ndarray, *, signed: bool) -> str:
     """Return the one or two axes along which a vector (3,) mostly points."""
     order = np.argsort(-np.abs(vector))
     count = 1 if abs(vector[order[0]]) >= ONE_AXIS * np.linalg.norm(vector) else 2
@@ -287,7 +287,7 @@ def named_axes(vector: np.ndarray, *, signed: bool) -> str:
     return " and ".join(names)
 
 
-def merged(places: Sequence[Place]) -> list[Place]:
+def _merged(places: Sequence[Place]) -> list[Place]:
     """Return `places`, the worst first, with those of one body that overlap by half of the shorter made one."""
     kept: list[Place] = []
     for place in places:

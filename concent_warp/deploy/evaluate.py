@@ -61,7 +61,7 @@ def evaluate(
     cfg = cfg or EvaluateCfg()
     check(cfg, world, episodes)
     default = Path("videos") if policy.pretrained else policy.folder / "videos"
-    videos = video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
+    videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
     run = policy.run
     task = run.task()
@@ -75,11 +75,11 @@ def evaluate(
     states_seen = EpisodeStates(len(videos))
     found = run_episodes(environment, policy.act_in(environment), states, progress=progress, watch=states_seen)
     if videos:
-        write_videos(videos, states_seen, reality_world(task, settings, cfg), task, states, environment.control_step)
+        _write_videos(videos, states_seen, reality_world(task, settings, cfg), task, states, environment.control_step)
     return replace(found, videos=tuple(videos))
 
 
-def video_files(cfg: EvaluateCfg, folder: Path, *, overwrite: bool) -> list[Path]:
+def _video_files(cfg: EvaluateCfg, folder: Path, *, overwrite: bool) -> list[Path]:
     """Return the files of the videos that are asked for.
 
     Raises:
@@ -106,7 +106,7 @@ class EpisodeStates:
                 self.states[episode].append(state.copy())
 
 
-def write_videos(
+def _write_videos(
     files: list[Path], episodes: EpisodeStates, world: TaskWorld, task: Task, starts: InitialStates, period: float
 ) -> None:
     """Film episodes that began with `starts` and whose states are a period apart [s]."""

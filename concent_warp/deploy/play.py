@@ -56,7 +56,7 @@ def play(
         1
     """
     cfg = cfg or PlayCfg()
-    player, drawn = make_player(policy, cfg, world=world, seed=seed, device=device)
+    player, drawn = _make_player(policy, cfg, world=world, seed=seed, device=device)
     task = player.environment.task
     assert task.model.geometry is not None
     view = LiveView(drawn, task.model.geometry, task.collidable, host=cfg.host, port=cfg.port, speed=cfg.speed)
@@ -65,7 +65,7 @@ def play(
         view.look_at(objects.mean(axis=0), cfg.eye)
         if serving is not None:
             serving(view.address)
-        watch(player, view, episodes, cfg)
+        _watch(player, view, episodes, cfg)
     except KeyboardInterrupt:
         return player.ended
     finally:
@@ -73,7 +73,7 @@ def play(
     return player.ended
 
 
-def make_player(
+def _make_player(
     policy: Policy, cfg: PlayCfg, *, world: WorldName, seed: int = 0, device: str = "cpu"
 ) -> tuple[Player, mujoco.MjModel]:
     """Return the policy in its world, and the model to draw.
@@ -100,16 +100,16 @@ def make_player(
     return Player(environment, policy.act_in(environment), cfg.states), drawn
 
 
-def watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -> None:
+def _watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -> None:
     """Show the policy as the page's controls have it, until so many episodes have ended."""
     wishes, period = view.wishes, player.environment.control_step
     due = time.monotonic()
-    show(player, view, player.moment())
+    _show(player, view, player.moment())
     while episodes is None or len(player.ended) < episodes:
         if wishes.reset:
             wishes.reset = False
             player.begin()
-            show(player, view, player.moment())
+            _show(player, view, player.moment())
         if not (wishes.running or wishes.step):
             view.changed.wait(cfg.poll)
             view.changed.clear()
@@ -121,11 +121,11 @@ def watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) ->
             view.tell(f"**{outcome}**  \n{counted(player.ended)}")
             due += cfg.pause / wishes.speed
         due = max(due + period / wishes.speed, time.monotonic())
-        wait_until(due, view)
-        show(player, view, player.moment())
+        _wait_until(due, view)
+        _show(player, view, player.moment())
 
 
-def wait_until(due: float, view: LiveView) -> None:
+def _wait_until(due: float, view: LiveView) -> None:
     """Wait until a time, or until a control is used."""
     while (left := due - time.monotonic()) > 0:
         if view.changed.wait(left):
@@ -133,7 +133,7 @@ def wait_until(due: float, view: LiveView) -> None:
             return
 
 
-def show(player: Player, view: LiveView, moment: Moment) -> None:
+def _show(player: Player, view: LiveView, moment: Moment) -> None:
     """Draw a moment and say what it is."""
     view.show(moment.position, moment.quaternion, moment.touching, moment.pairs)
     touching = int(moment.touching.sum())

@@ -100,15 +100,15 @@ def render(
         raise RenderError("episodes, worlds, rate and flow steps are to be at least 1")
     if cfg.figure is not None:
         claim_file(cfg.figure, overwrite=overwrite)
-    check_replaced(out, overwrite=overwrite)
+    _check_replaced(out, overwrite=overwrite)
     to = Destination(out, cfg, format, device, resume, overwrite)
     with run_folder(out, overwrite=False, resume=resume or overwrite):
         from concent_warp.recording.recording import Recording
 
-        film = film_recording if isinstance(source, Recording) else film_policy
-        filming = film(source, to, progress or ignore)  # pyright: ignore[reportArgumentType]
+        film = _film_recording if isinstance(source, Recording) else _film_policy
+        filming = film(source, to, progress or _ignore)  # pyright: ignore[reportArgumentType]
         count = filming.writer.finish()
-    return Dataset(out, format, count, filming.dropped, draw_figure(cfg, filming))
+    return Dataset(out, format, count, filming.dropped, _draw_figure(cfg, filming))
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,12 @@ class Destination:
     overwrite: bool
 
 
-def ignore(share: float) -> None:
+def _ignore(share: float) -> None:
     """Do nothing with the progress."""
     del share
 
 
-def check_replaced(folder: Path, *, overwrite: bool) -> None:
+def _check_replaced(folder: Path, *, overwrite: bool) -> None:
     """Check that what is to be replaced is a data set.
 
     Raises:
@@ -140,7 +140,7 @@ def check_replaced(folder: Path, *, overwrite: bool) -> None:
         raise RenderError("the folder holds a run, but no data set", where=folder, fix="choose another folder")
 
 
-def film_policy(policy: Policy, to: Destination, progress: Callable[[float], None]) -> Filming:
+def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], None]) -> Filming:
     """Render the episodes of a policy."""
     import torch
 
@@ -158,13 +158,13 @@ def film_policy(policy: Policy, to: Destination, progress: Callable[[float], Non
     rate = round(1 / environment.control_step)
     if abs(rate * environment.control_step - 1) > 1e-6:
         raise RenderError("a video wants a whole number of frames a second", found=1 / environment.control_step)
-    camera, model = hybrid_camera(cfg, task.model, worlds, to.device)
-    joints, layout = addressed(model, camera, rate)
-    writer = dataset_writer(to, layout)
-    filming = new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
+    camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
+    joints, layout = _addressed(model, camera, rate)
+    writer = _dataset_writer(to, layout)
+    filming = _new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
     left = [row for row in range(cfg.episodes) if not writer.has(row)]
     physics, length = environment.physics, int(environment.max_episode_length)
-    with leaving(filming):
+    with _leaving(filming):
         for first in range(0, len(left), worlds):
             rows = left[first : first + worlds]
             start(environment, rows)
@@ -185,7 +185,7 @@ def film_policy(policy: Policy, to: Destination, progress: Callable[[float], Non
     return filming
 
 
-def film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> Filming:
+def _film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> Filming:
     """Render the measured motion of the demonstrations of a recording, each an episode."""
     from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
@@ -196,11 +196,11 @@ def film_recording(recording: Recording, to: Destination, progress: Callable[[fl
     cfg = to.cfg
     model = Model(Scene(recording.scene, source=recording.source))
     engine = MujocoEngine(model, threads=1)
-    camera, compiled = hybrid_camera(cfg, model, 1, to.device)
-    joints, layout = addressed(compiled, camera, cfg.rate)
-    writer = dataset_writer(to, layout)
-    filming = new_filming(to, camera, writer, cfg.task or recording[0].task or "do the task", cfg.rate)
-    with leaving(filming):
+    camera, compiled = _hybrid_camera(cfg, model, 1, to.device)
+    joints, layout = _addressed(compiled, camera, cfg.rate)
+    writer = _dataset_writer(to, layout)
+    filming = _new_filming(to, camera, writer, cfg.task or recording[0].task or "do the task", cfg.rate)
+    with _leaving(filming):
         for k, demonstration in enumerate(recording.demonstrations):
             if writer.has(k):
                 continue
@@ -218,7 +218,7 @@ def film_recording(recording: Recording, to: Destination, progress: Callable[[fl
 
 
 @contextmanager
-def leaving(filming: Filming) -> Iterator[None]:
+def _leaving(filming: Filming) -> Iterator[None]:
     """Discard the episodes that have not ended when something goes wrong."""
     try:
         yield
@@ -227,7 +227,9 @@ def leaving(filming: Filming) -> Iterator[None]:
         raise
 
 
-def hybrid_camera(cfg: RenderCfg, given: Model, worlds: int, device: str | None) -> tuple[HybridCamera, mujoco.MjModel]:
+def _hybrid_camera(
+    cfg: RenderCfg, given: Model, worlds: int, device: str | None
+) -> tuple[HybridCamera, mujoco.MjModel]:
     """Return what renders, and the scene's model with the cameras."""
     import warp as wp
 
@@ -265,7 +267,7 @@ def hybrid_camera(cfg: RenderCfg, given: Model, worlds: int, device: str | None)
     return camera, model
 
 
-def addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[np.ndarray, EpisodeLayout]:
+def _addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[np.ndarray, EpisodeLayout]:
     """Return where the joints of one degree of freedom are in qpos, and the layout of a data set of them."""
     from concent_warp.render.dataset.layout import EpisodeLayout
 
@@ -281,7 +283,7 @@ def addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[n
     return model.jnt_qposadr[joints], layout
 
 
-def dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
+def _dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
     """Return the data set, new or to be continued; an earlier one is replaced only here, where all input is valid."""
     if to.overwrite and not to.resume:
         for path in to.out.iterdir():
@@ -299,7 +301,7 @@ def dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
     return LeRobotWriter(to.out, layout, codec=to.cfg.codec)
 
 
-def new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> Filming:
+def _new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> Filming:
     """Return what takes the frames to the data set."""
     from concent_warp.render.filming import FILMS, Filming
 
@@ -307,7 +309,7 @@ def new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, ta
     return Filming(camera, writer, task, films=films, first_films=to.cfg.films, rate=rate)
 
 
-def draw_figure(cfg: RenderCfg, filming: Filming) -> Path | None:
+def _draw_figure(cfg: RenderCfg, filming: Filming) -> Path | None:
     """Write the figure that is asked for, and return its path; None where no frame was rendered in this call."""
     if cfg.figure is None or not len(filming.album):
         return None

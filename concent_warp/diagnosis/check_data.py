@@ -43,12 +43,12 @@ def check_data(recording: Recording) -> list[str]:
                 found.append(f"{where}: the reading never changes.")
             stated = channel.noise_std
             beyond = alone if stated is None else values.std(axis=0).max(initial=0.0) > SCATTER * stated
-            if beyond and like_noise(values):
+            if beyond and _like_noise(values):
                 found.append(f"{where}: the readings scatter like noise, no motion shows in them.")
     return found
 
 
-def like_noise(values: np.ndarray) -> bool:
+def _like_noise(values: np.ndarray) -> bool:
     """Return whether readings (T, dim) change from sample to sample as much as if each were drawn by itself."""
     if len(values) < ENOUGH:
         return False

@@ -44,7 +44,7 @@ def checkpointed_procedure(
         ConcentError: The folder cannot be made.
     """
     make_folder(folder)
-    key = fingerprint(model, recording, cfg, versions() | {"engine": engine})
+    key = _fingerprint(model, recording, cfg, versions() | {"engine": engine})
     return CheckpointedProcedure(model, recording, cfg, progress, folder, key, engine)
 
 
@@ -67,85 +67,85 @@ class CheckpointedProcedure(Procedure):
     def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
         """Yield results in the tasks' order: those in the folder from there, and others as they are done."""
         paths = [self.folder / f"{self.piece(work, task)}.npz" for task in tasks]
-        known = {i: found for i, path in enumerate(paths) if (found := load(path, self.model)) is not None}
+        known = {i: found for i, path in enumerate(paths) if (found := _load(path, self.model)) is not None}
         fresh = iter(super().results(work, [task for i, task in enumerate(tasks) if i not in known]))
         for i, path in enumerate(paths):
             if i in known:
                 yield known[i]
                 continue
             result = next(fresh)
-            save(path, result)
+            _save(path, result)
             yield result
 
     def piece(self, work: Callable[..., Any], task: Sequence[Any]) -> str:
         """Return the name of a piece of work: a hash of the diagnosis, the work, and all that it is given."""
         digest = hashlib.sha256(f"{self.key} {work.__name__}".encode())
         for item in task:
-            add(digest, item)
+            _add(digest, item)
         return digest.hexdigest()[:32]
 
 
-def fingerprint(model: Model, recording: Recording, cfg: DiagnosisCfg, versions: Mapping[str, str]) -> str:
+def _fingerprint(model: Model, recording: Recording, cfg: DiagnosisCfg, versions: Mapping[str, str]) -> str:
     """Return a hash of a model, a recording, the settings that results depend on, and versions."""
     digest = hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode())
-    add(digest, replace(cfg, jobs=1))
+    _add(digest, replace(cfg, jobs=1))
     digest.update(model.scene.xml.encode())
     if model.geometry is not None:
-        add(digest, model.geometry)
-    add(digest, model.contact)
+        _add(digest, model.geometry)
+    _add(digest, model.contact)
     for d in recording.demonstrations:
-        add(digest, [d.name, d.qpos, d.qvel])
+        _add(digest, [d.name, d.qpos, d.qvel])
         for channels in (d.action, d.measured):
             for name, channel in channels.items():
-                add(digest, [name, channel])
+                _add(digest, [name, channel])
     return digest.hexdigest()
 
 
-def add(digest: Any, item: Any) -> None:
+def _add(digest: Any, item: Any) -> None:
     """Add a value to a hash; of a node, the model's effects and the initial states."""
     if isinstance(item, Node):
-        add(digest, [item.model, item.fit.values, list(item.fit.offsets), item.limit, item.errors])
+        _add(digest, [item.model, item.fit.values, list(item.fit.offsets), item.limit, item.errors])
     elif isinstance(item, Model):
-        add(digest, [[a.effect, list(a.values)] for a in item.effects])
+        _add(digest, [[a.effect, list(a.values)] for a in item.effects])
     elif isinstance(item, Effect):
-        add(digest, [item.name, list(item.target)])
+        _add(digest, [item.name, list(item.target)])
     elif isinstance(item, np.ndarray):
         digest.update(f"{item.dtype}{item.shape}".encode())
         digest.update(np.ascontiguousarray(item).tobytes())
     elif isinstance(item, Channel):
-        add(digest, [item.time, item.value, repr(item.noise_std)])
+        _add(digest, [item.time, item.value, repr(item.noise_std)])
     elif is_dataclass(item) and not isinstance(item, type):
-        add(digest, [getattr(item, f.name) for f in fields(item)])
+        _add(digest, [getattr(item, f.name) for f in fields(item)])
     elif isinstance(item, list | tuple):
         digest.update(f"[{len(item)}".encode())
         for part in item:
-            add(digest, part)
+            _add(digest, part)
     else:
         digest.update(f"{type(item).__name__}:{item!r};".encode())
 
 
-def save(path: Path, result: Any) -> None:
+def _save(path: Path, result: Any) -> None:
     """Write a result, in one piece or not at all."""
     arrays: dict[str, np.ndarray] = {}
-    text = json.dumps(taken_apart(result, arrays))
+    text = json.dumps(_taken_apart(result, arrays))
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with partial.open("wb") as file:
         np.savez(file, tree=np.array(text), **arrays)  # pyright: ignore[reportArgumentType]
     partial.replace(path)
 
 
-def load(path: Path, base: Model) -> Any:
+def _load(path: Path, base: Model) -> Any:
     """Return a result that was written, None where there is none or it is damaged."""
     if not path.is_file():
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            return put_together(json.loads(str(file["tree"])), file, base)
+            return _put_together(json.loads(str(file["tree"])), file, base)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Return a value as JSON holds it, its arrays aside."""
     if isinstance(value, np.ndarray):
         name = f"a{len(arrays)}"
@@ -154,16 +154,16 @@ def taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, Effect):
         return {"effect": value.name, "target": list(value.target)}
     if isinstance(value, Model):
-        return {"model": [taken_apart(a, arrays) for a in value.effects]}
+        return {"model": [_taken_apart(a, arrays) for a in value.effects]}
     if isinstance(value, AddedEffect):
-        return {"added": taken_apart(value.effect, arrays), "values": list(value.values)}
+        return {"added": _taken_apart(value.effect, arrays), "values": list(value.values)}
     if type(value).__name__ in KINDS:
         return {
             "kind": type(value).__name__,
-            "fields": {f.name: taken_apart(getattr(value, f.name), arrays) for f in fields(value)},
+            "fields": {f.name: _taken_apart(getattr(value, f.name), arrays) for f in fields(value)},
         }
     if isinstance(value, tuple | list):
-        return [taken_apart(item, arrays) for item in value]
+        return [_taken_apart(item, arrays) for item in value]
     if isinstance(value, np.generic):
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
@@ -171,10 +171,10 @@ def taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     raise TypeError(f"no way to keep a {type(value).__name__}")
 
 
-def put_together(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> Any:
-    """Return what `taken_apart` was given; models are on the scene and the geometry of `base`."""
+def _put_together(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> Any:
+    """Return what `_taken_apart` was given; models are on the scene and the geometry of `base`."""
     if isinstance(tree, list):
-        return tuple(put_together(item, arrays, base) for item in tree)
+        return tuple(_put_together(item, arrays, base) for item in tree)
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
@@ -182,8 +182,8 @@ def put_together(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> An
     if "effect" in tree:
         return effect_class(tree["effect"])(*tree["target"])
     if "model" in tree:
-        return replace(base, effects=tuple(put_together(item, arrays, base) for item in tree["model"]))
+        return replace(base, effects=tuple(_put_together(item, arrays, base) for item in tree["model"]))
     if "added" in tree:
-        return AddedEffect(put_together(tree["added"], arrays, base), tuple(tree["values"]))
-    parts = {name: put_together(item, arrays, base) for name, item in tree["fields"].items()}
+        return AddedEffect(_put_together(tree["added"], arrays, base), tuple(tree["values"]))
+    parts = {name: _put_together(item, arrays, base) for name, item in tree["fields"].items()}
     return KINDS[tree["kind"]](**parts)

@@ -54,7 +54,7 @@ def where(
         offsets: Errors of the windows' initial states in units of their spread, one (2 nv,) a window.
         seconds: Longest that the search for forces may take; they are left out where it takes longer or fails.
     """
-    started = with_starts(model, recording, windows, offsets)
+    started = _with_starts(model, recording, windows, offsets)
     try:
         found = compare_replays({"model": model}, started, engine).places
     except ConcentError:
@@ -63,13 +63,13 @@ def where(
     for place in found:
         kept.setdefault(alike(place), place)
     several = len(recording.demonstrations) > 1
-    said = [place_entry(p, several) for p in list(kept.values())[:MOST_PLACES]]
-    if seconds > 0 and (location := located(model, recording, engine, seconds)) is not None:
-        said += force_entries(location)[:MOST_FORCES]
+    said = [_place_entry(p, several) for p in list(kept.values())[:MOST_PLACES]]
+    if seconds > 0 and (location := _located(model, recording, engine, seconds)) is not None:
+        said += _force_entries(location)[:MOST_FORCES]
     return finite(said)
 
 
-def with_starts(
+def _with_starts(
     model: Model, recording: Recording, windows: Sequence[Window], offsets: Sequence[np.ndarray]
 ) -> Recording:
     """Return a recording whose demonstrations start where windows from time 0 were fitted to start."""
@@ -88,7 +88,7 @@ def with_starts(
     return replace(recording, demonstrations=tuple(moved))
 
 
-def place_entry(place: Place, several: bool) -> dict[str, Any]:
+def _place_entry(place: Place, several: bool) -> dict[str, Any]:
     """Return a place of the error; the sentence names the demonstration where there are `several`."""
     return {
         "demonstration": place.demonstration,
@@ -103,7 +103,7 @@ def place_entry(place: Place, several: bool) -> dict[str, Any]:
     }
 
 
-def located(model: Model, recording: Recording, engine: EngineName, seconds: float) -> Location | None:
+def _located(model: Model, recording: Recording, engine: EngineName, seconds: float) -> Location | None:
     """Return where forces are missing, None where that cannot be told or takes longer than `seconds`.
 
     In a process of its own, so that it can be stopped.
@@ -119,7 +119,7 @@ def located(model: Model, recording: Recording, engine: EngineName, seconds: flo
         pool.shutdown(wait=False, kill_workers=True)
 
 
-def force_entries(location: Location) -> list[dict[str, Any]]:
+def _force_entries(location: Location) -> list[dict[str, Any]]:
     """Return the forces that stand out, those farthest above noise first."""
     blank = dict.fromkeys(("demonstration", "channel", "phase", "start", "end", "body", "direction"))
     found = []

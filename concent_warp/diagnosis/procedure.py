@@ -113,7 +113,7 @@ class Procedure:
         told = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
         if told >= set(noise):
             return self.fitted_baseline(noise)
-        seen = quiet_ratios(self.fitted_baseline(noise, rough=True))
+        seen = _quiet_ratios(self.fitted_baseline(noise, rough=True))
         larger = {c: r for c, r in seen.items() if c not in told and r > UNDERESTIMATE}
         return self.fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
 
@@ -186,7 +186,7 @@ class Procedure:
             owned = len(last.model.effects) - len(steps)
             # The last one has just shown its worth beside all others.
             self.progress(self._done, "leaving out one at a time")
-            tried = list(run_all(without, [(last, owned + k) for k in range(len(steps) - 1)], self.cfg.jobs))
+            tried = list(_run_all(without, [(last, owned + k) for k in range(len(steps) - 1)], self.cfg.jobs))
             shares = [1 - last.errors.sum() / max(n.errors.sum(), 1e-12) for n in tried]
             least = int(np.argmin(shares))
             if shares[least] >= self.cfg.least_gain:
@@ -216,7 +216,7 @@ class Procedure:
         if not found:
             return found
         hoped = np.array([max(c.share(base), s.promise) for c, s in zip(found, promising, strict=False)])
-        best = leader(base, found)
+        best = _leader(base, found)
         if best.ratio < EXPLAINED:
             # A fit that is stuck gains too little: where another is done, it can lead rivals far behind out of that.
             most = best.share(base)
@@ -234,7 +234,7 @@ class Procedure:
             found[k] = c
         hoped = np.maximum(hoped, [c.share(base) for c in found])
         self.level(base, found, hoped)
-        return self.pieced(base, found) if leader(base, found).ratio > self.cfg.adequate else found
+        return self.pieced(base, found) if _leader(base, found).ratio > self.cfg.adequate else found
 
     def level(self, base: Node, found: list[Candidate], hoped: np.ndarray) -> None:
         """Take up the best fit, and those of candidates that may be its equals, as long as that betters one; in place.
@@ -244,7 +244,7 @@ class Procedure:
         there may be in each.
         """
         for _ in range(ROUNDS if len(base.windows) <= MANY else 1):  # over many windows luck evens out
-            before, best = list(found), leader(base, found)
+            before, best = list(found), _leader(base, found)
             close = [k for k, c in enumerate(found) if c is not best and hoped[k] > CLOSE * best.share(base)]
             tasks = [(base, found[k], best.fit) for k in close]
             again = self.parallel(restarted_candidate, tasks, "fitting rivals anew", 0.0)
@@ -329,14 +329,14 @@ class Procedure:
 
     def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
         """Yield the results of independent pieces of work in the tasks' order."""
-        return run_all(work, tasks, self.cfg.jobs)
+        return _run_all(work, tasks, self.cfg.jobs)
 
     def conclude(self, nodes: Sequence[Node], detectable: tuple[Detectable, ...], issues: Sequence[str]) -> Diagnosis:
         """Return the verdict."""
         first, last = nodes[0].ratio, nodes[-1].ratio
         beyond = max(first**2 - 1.0, 1e-9)
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > self.cfg.adequate else 0.0
-        unknown = unknown_force(nodes, self.cfg, lambda work, tasks: run_all(work, tasks, self.cfg.jobs))
+        unknown = unknown_force(nodes, self.cfg, lambda work, tasks: _run_all(work, tasks, self.cfg.jobs))
         verdict: Verdict = "none_needed"
         if last > self.cfg.adequate or unknown is not None:
             verdict = "none_of_these"
@@ -416,7 +416,7 @@ MOST = 0.8
 """Share of the folds in which an effect must gain."""
 
 
-def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
+def _run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
     """Yield the results of independent pieces of work in order, by joblib where several may run at a time.
 
     Where there are fewer pieces than processes, each piece runs several simulations at a time.
@@ -426,22 +426,22 @@ def run_all(work: Callable[..., T], tasks: Sequence[tuple[Any, ...]], jobs: int)
     from joblib import Parallel, delayed, effective_n_jobs
 
     threads = effective_n_jobs(jobs) // len(tasks)
-    calls = (delayed(limited)(threads, work, *task) for task in tasks)
+    calls = (delayed(_limited)(threads, work, *task) for task in tasks)
     return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(calls))
 
 
-def limited(threads: int, work: Callable[..., T], *task: Any) -> T:
+def _limited(threads: int, work: Callable[..., T], *task: Any) -> T:
     """Do a piece of work with so many simulations at a time, one at least."""
     with at_most(threads):
         return work(*task)
 
 
-def leader(base: Node, found: Sequence[Candidate]) -> Candidate:
+def _leader(base: Node, found: Sequence[Candidate]) -> Candidate:
     """Return the fit that takes away most of a node's error."""
     return max(found, key=lambda c: c.share(base))
 
 
-def quiet_ratios(base: Node) -> dict[str, float]:
+def _quiet_ratios(base: Node) -> dict[str, float]:
     """Return the root mean square of the residuals over the noise of each channel, in the quietest blocks it has."""
     blocks: dict[str, list[float]] = {}
     for window, piece, rows in zip(base.windows, base.pieces, base.blocks.of_row, strict=True):

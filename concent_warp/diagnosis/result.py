@@ -65,10 +65,10 @@ class Finding:
             "parameters": [
                 {
                     "name": p.name,
-                    "value": number(p.value),
-                    "interval": [number(p.low), number(p.high)],
+                    "value": _number(p.value),
+                    "interval": [_number(p.low), _number(p.high)],
                     "unit": p.unit,
-                    "null": number(p.null),
+                    "null": _number(p.null),
                 }
                 for p in self.parameters
             ],
@@ -186,7 +186,7 @@ class Diagnosis:
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
             "ratio": list(self.ratio),
             "detectable": [
-                {"name": d.name, "parameter": d.parameter, "size": number(d.size), "unit": d.unit}
+                {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
                 for d in self.detectable
             ],
             "next_experiment": self.next_experiment,
@@ -214,7 +214,7 @@ class Diagnosis:
                 f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], p {finding.p:.2g}."
             )
             if len(group) > 1:
-                said.append(f"The data cannot tell it from {joined(group[1:])}.")
+                said.append(f"The data cannot tell it from {_joined(group[1:])}.")
         if self.verdict == "none_of_these":
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
@@ -226,11 +226,11 @@ class Diagnosis:
         return [*self.issues, *said]
 
 
-def number(value: float) -> float | None:
+def _number(value: float) -> float | None:
     """Return a number that JSON can hold; None for one that is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
-def joined(names: Sequence[str]) -> str:
+def _joined(names: Sequence[str]) -> str:
     """Return names as a list in words."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"

@@ -20,7 +20,7 @@ TITLES = {
 ACTS_ON = {"none": "the world", "joint": "joints", "actuator": "actuators", "body": "bodies", "sensor": "sensors"}
 
 
-def catalogue(m: mujoco.MjModel) -> str:
+def _catalogue(m: mujoco.MjModel) -> str:
     """Return a Markdown table for each family of this library's effects.
 
     Args:
@@ -28,20 +28,20 @@ def catalogue(m: mujoco.MjModel) -> str:
     """
     parts = []
     for family in get_args(Family):
-        rows = [row(effect, m) for effect in OURS if effect.family == family]
+        rows = [_row(effect, m) for effect in OURS if effect.family == family]
         head = "| effect | what it does | parameters | signature | taken for | source |\n|---|---|---|---|---|---|"
         parts.append(f"### {TITLES[family]}\n" + "\n".join([head, *rows]))
     return "\n\n".join(parts) + "\n"
 
 
-def row(effect: type[Effect], m: mujoco.MjModel) -> str:
+def _row(effect: type[Effect], m: mujoco.MjModel) -> str:
     """Return a row of the table."""
     known = [f"`{name}`" for name in effect.confusions if name in effect_classes()]
     others = [name.replace("_", " ") for name in effect.confusions if name not in effect_classes()]
     cells = [
         f"`{effect.name}` on {ACTS_ON[effect.kind]}",
         effect.summary,
-        parameters(effect, m),
+        _parameters(effect, m),
         effect.signature,
         ", ".join([*known, *others]),
         effect.source,
@@ -51,7 +51,7 @@ def row(effect: type[Effect], m: mujoco.MjModel) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
-def parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
+def _parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
     """Return names and units; several parameters of one kind as one, with what they belong to in brackets."""
     units: dict[str, list[str]] = {}
     for target in effect.targets(m):
@@ -59,10 +59,10 @@ def parameters(effect: type[Effect], m: mujoco.MjModel) -> str:
             found = units.setdefault(re.sub(r"\[.*\]", f"[{effect.kind}]", parameter.name), [])
             if parameter.unit not in found:
                 found.append(parameter.unit)
-    return ", ".join(f"`{name}`" + unit(found) for name, found in units.items())
+    return ", ".join(f"`{name}`" + _unit(found) for name, found in units.items())
 
 
-def unit(found: list[str]) -> str:
+def _unit(found: list[str]) -> str:
     """Return units in words, with what separates them from the name."""
     words = " or ".join(found)
     return "" if words == "-" else f" {words}"
@@ -71,4 +71,4 @@ def unit(found: list[str]) -> str:
 if __name__ == "__main__":
     from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
-    print(catalogue(ShapeSorterCfg().build().model), end="")
+    print(_catalogue(ShapeSorterCfg().build().model), end="")

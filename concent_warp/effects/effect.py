@@ -182,7 +182,7 @@ class Effect:
             if self.target:
                 raise ModelError(f"{self.name} acts on the whole world", expected="no target", found=list(self.target))
             return
-        known = names(m, self.kind)
+        known = _names(m, self.kind)
         if unknown := [name for name in self.target if name not in known]:
             raise ModelError(
                 f"{self.name} on what the model lacks", expected=f"{self.kind}s among {known}", found=unknown
@@ -223,7 +223,7 @@ class AddedEffect:
         return np.asarray(self.values, dtype=float)
 
 
-def names(m: mujoco.MjModel, kind: str) -> list[str]:
+def _names(m: mujoco.MjModel, kind: str) -> list[str]:
     """Return the names of a model's joints, actuators, bodies, geoms or sensors."""
     count = {"joint": m.njnt, "actuator": m.nu, "body": m.nbody, "geom": m.ngeom, "sensor": m.nsensor}[kind]
     found = [mujoco.mj_id2name(m, OBJECTS[kind], i) for i in range(count)]
@@ -261,16 +261,16 @@ def written(
     import copy
 
     chosen = sorted({name for effect in effects for name in effect.fields(m)})
-    found = {name: np.empty((len(values), *np.shape(field(m, name)))) for name in chosen}
+    found = {name: np.empty((len(values), *np.shape(_field(m, name)))) for name in chosen}
     for n, row in enumerate(values):
         variant = copy.copy(m)
         for effect, part in zip(effects, split, strict=True):
             effect.write(variant, row[part])
         for name in chosen:
-            found[name][n] = field(variant, name)
+            found[name][n] = _field(variant, name)
     return found
 
 
-def field(m: mujoco.MjModel, name: str) -> np.ndarray | float:
+def _field(m: mujoco.MjModel, name: str) -> np.ndarray | float:
     """Return a field of a compiled model, ``opt.<name>`` for an option."""
     return getattr(m.opt, name[4:]) if name.startswith("opt.") else getattr(m, name)

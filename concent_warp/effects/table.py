@@ -79,9 +79,9 @@ def read_effects(rows: Any, path: Path) -> list[AddedEffect]:
             raise ModelError("target is not right", where=where, expected="a list of names", found=target)
         intervals = row.get("intervals", [])
         if (
-            not numbers(values)
+            not _numbers(values)
             or not isinstance(intervals, list)
-            or not all(numbers(p) and len(p) == 2 for p in intervals)
+            or not all(_numbers(p) and len(p) == 2 for p in intervals)
         ):
             raise ModelError("values and intervals are not right", where=where, expected="lists of numbers")
         pairs = tuple((float(low), float(high)) for low, high in intervals)
@@ -89,7 +89,7 @@ def read_effects(rows: Any, path: Path) -> list[AddedEffect]:
     return found
 
 
-def numbers(values: Any) -> bool:
+def _numbers(values: Any) -> bool:
     """Return whether something is a list of numbers, none of them NaN."""
     return isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) and not np.isnan(v) for v in values

@@ -63,11 +63,11 @@ def joint_motion(model: mujoco.MjModel, demonstration: Demonstration) -> JointMo
             (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL),
             (mujoco.mjtSensor.mjSENS_TENDONPOS, mujoco.mjtSensor.mjSENS_TENDONVEL),
         )
-        for target, signal in sensors(model, demonstration, kind).items()
-        if (coefficients := combination(model, kind, target, place)) is not None
-        for rate in [more_precise(sensors(model, demonstration, speed).get(target), signal)]
+        for target, signal in _sensors(model, demonstration, kind).items()
+        if (coefficients := _combination(model, kind, target, place)) is not None
+        for rate in [more_precise(_sensors(model, demonstration, speed).get(target), signal)]
     )
-    motion = JointMotion(joints, readings, tuple(couplings(model, place)))
+    motion = JointMotion(joints, readings, tuple(_couplings(model, place)))
     rows = motion.rows()
     if len(joints) and (len(rows) < len(joints) or np.linalg.svd(rows, compute_uv=False)[-1] < SINGULAR):
         loose = np.abs(np.eye(len(joints)) - np.linalg.pinv(rows) @ rows).max(axis=1) > SINGULAR
@@ -80,7 +80,7 @@ def joint_motion(model: mujoco.MjModel, demonstration: Demonstration) -> JointMo
     return motion
 
 
-def sensors(model: mujoco.MjModel, demonstration: Demonstration, kind: mujoco.mjtSensor) -> dict[int, Samples]:
+def _sensors(model: mujoco.MjModel, demonstration: Demonstration, kind: mujoco.mjtSensor) -> dict[int, Samples]:
     """Return what the sensors of a kind measured, by the id of the joint or tendon."""
     result = {}
     for name, channel in demonstration.measured.items():
@@ -91,7 +91,9 @@ def sensors(model: mujoco.MjModel, demonstration: Demonstration, kind: mujoco.mj
     return result
 
 
-def combination(model: mujoco.MjModel, kind: mujoco.mjtSensor, target: int, place: dict[int, int]) -> np.ndarray | None:
+def _combination(
+    model: mujoco.MjModel, kind: mujoco.mjtSensor, target: int, place: dict[int, int]
+) -> np.ndarray | None:
     """Return the coefficients (J,) of the joints in what a sensor reads; None for a tendon that goes by sites."""
     result = np.zeros(len(place))
     if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
@@ -107,7 +109,7 @@ def combination(model: mujoco.MjModel, kind: mujoco.mjtSensor, target: int, plac
     return result
 
 
-def couplings(model: mujoco.MjModel, place: dict[int, int]) -> list[tuple[np.ndarray, float]]:
+def _couplings(model: mujoco.MjModel, place: dict[int, int]) -> list[tuple[np.ndarray, float]]:
     """Return the sums of joint positions that active linear joint equalities keep constant."""
     result = []
     for row in range(model.neq):

@@ -74,15 +74,15 @@ class Samples:
     def at(self, time: float) -> Estimate:
         """Return the estimate at a time [s]."""
         fits = [
-            local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
-            for rows in neighbourhoods(self.time, time, self.degree)
+            _local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
+            for rows in _neighbourhoods(self.time, time, self.degree)
         ]
-        return smoothest(fits)
+        return _smoothest(fits)
 
     def through(self, time: float) -> Estimate:
         """Return the estimate from samples on both sides of a time, even where an impact lies among them."""
-        rows = neighbourhoods(self.time, time, self.degree)[0]
-        return local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
+        rows = _neighbourhoods(self.time, time, self.degree)[0]
+        return _local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,10 @@ class Turns:
         """Return the estimate at a time [s]; the rate is the angular velocity in the body frame [rad/s]."""
         middle = self.nearest(time).inv()
         fits = [
-            local_fit(self.time[rows] - time, (middle * self.value[rows.start : rows.stop]).as_rotvec(), 2)
-            for rows in neighbourhoods(self.time, time, 2)
+            _local_fit(self.time[rows] - time, (middle * self.value[rows.start : rows.stop]).as_rotvec(), 2)
+            for rows in _neighbourhoods(self.time, time, 2)
         ]
-        return smoothest(fits)
+        return _smoothest(fits)
 
     def nearest(self, time: float) -> Rotation:
         """Return the sample nearest to a time."""
@@ -133,7 +133,7 @@ class BodyMotion:
         return np.concatenate([place.value, quaternion]), np.concatenate([linear, angular])
 
 
-def neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
+def _neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
     """Return the samples about a time, and as many of those after it and before it alone, where there are enough."""
     nearest = int(np.abs(time - now).argmin())
     low = min(int(np.searchsorted(time, now - SPAN)), nearest - FEWEST)
@@ -145,21 +145,21 @@ def neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
     return [centred, *sides] if centred.stop - centred.start >= min(degree + 2, len(time)) else sides or [centred]
 
 
-def smoothest(fits: list[Estimate]) -> Estimate:
+def _smoothest(fits: list[Estimate]) -> Estimate:
     """Return the first fit, or one of the others whose rate has less than half its standard error.
 
     The samples on both sides of a time say the most, unless an impact lies among them.
     """
-    best = min(fits, key=rate_error)
+    best = min(fits, key=_rate_error)
     return best if best.rate_error < ONE_SIDED * fits[0].rate_error else fits[0]
 
 
-def rate_error(estimate: Estimate) -> float:
+def _rate_error(estimate: Estimate) -> float:
     """Return the standard error of the rate."""
     return estimate.rate_error
 
 
-def local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
+def _local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
     """Fit a polynomial by least squares to values (k, n) at times `offset` (k,) from the time of interest [s]."""
     degree = min(degree, len(offset) - 1)
     scale = max(float(np.abs(offset).max()), 1e-9)
@@ -186,7 +186,7 @@ def local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
     )
 
 
-def precision(signal: Signal, order: int) -> float:
+def _precision(signal: Signal, order: int) -> float:
     """Return the median standard error of a signal's value (`order` 0) or rate (1)."""
     times = signal.time[np.unique(np.linspace(0, len(signal.time) - 1, PROBES).astype(int))]
     estimates = [signal.at(float(t)) for t in times]
@@ -211,22 +211,22 @@ def body_motion(scene: Scene, demonstration: Demonstration, body: str, qpos: np.
         target = body_target(scene, demonstration, body, qpos)
         if target is None:
             return None
-        time, position, turn = tracked_pose(target)
+        time, position, turn = _tracked_pose(target)
     if len(time) < 2 * FEWEST:
         return None
     place, turning = Samples(time, position), Turns(time, turn)
-    velocity, angular = velocity_sensors(scene.model, demonstration, body)
+    velocity, angular = _velocity_sensors(scene.model, demonstration, body)
     return BodyMotion(place, turning, more_precise(velocity, place), more_precise(angular, turning))
 
 
-def tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, Rotation]:
+def _tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, Rotation]:
     """Return times [s], positions [m] and rotations of a body's frame from its observed points (Kabsch)."""
     pose = observed_poses(target, np.arange(len(target.time)))
     seen = np.isfinite(pose).all(axis=1)
     return target.time[seen], pose[seen, :3], Rotation.from_quat(pose[seen, 3:], scalar_first=True)
 
 
-def velocity_sensors(
+def _velocity_sensors(
     model: mujoco.MjModel, demonstration: Demonstration, body: str
 ) -> tuple[Samples | None, Samples | None]:
     """Return the velocity [m/s, world] and angular velocity [rad/s, body frame] of a body's frame, as sensors say."""
@@ -251,6 +251,6 @@ def finite(channel: Channel | None) -> Samples | None:
 
 def more_precise(sensor: Samples | None, signal: Signal) -> Samples | None:
     """Return the sensor if it says the rate of a signal more precisely than the signal itself does, else None."""
-    if sensor is None or precision(sensor, 0) >= precision(signal, 1):
+    if sensor is None or _precision(sensor, 0) >= _precision(signal, 1):
         return None
     return sensor

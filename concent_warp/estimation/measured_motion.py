@@ -122,14 +122,14 @@ class Motion:
         qvel = interpolate(self.base_time, self.base_qvel, time)
         qpos, qvel = np.tile(qpos, (1 + count, 1, 1)), np.tile(qvel, (1 + count, 1, 1))
         for joint in self.joints:
-            position, velocity = drawn(joint.position.smooth, time, count, rng)
+            position, velocity = _drawn(joint.position.smooth, time, count, rng)
             qpos[:, :, joint.qpos], qvel[:, :, joint.dof] = position[..., 0], velocity[..., 0]
         for body in self.bodies:
-            position, velocity = drawn(body.position.smooth, time, count, rng)
+            position, velocity = _drawn(body.position.smooth, time, count, rng)
             qpos[:, :, body.qpos : body.qpos + 3], qvel[:, :, body.dof : body.dof + 3] = position, velocity
             if body.orientation is not None:
-                quaternion, rate = drawn(body.orientation.smooth, time, count, rng)
-                qvel[:, :, body.dof + 3 : body.dof + 6] = turning(quaternion, rate)
+                quaternion, rate = _drawn(body.orientation.smooth, time, count, rng)
+                qvel[:, :, body.dof + 3 : body.dof + 6] = _turning(quaternion, rate)
                 quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
                 qpos[:, :, body.qpos + 3 : body.qpos + 7] = quaternion
         return qpos, qvel
@@ -144,7 +144,7 @@ class Motion:
         return qacc
 
 
-def drawn(
+def _drawn(
     signal: Smooth, time: np.ndarray, count: int, rng: np.random.Generator | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a signal and its velocity at `time` (T,), and `count` drawn from their joint error after them.
@@ -161,7 +161,7 @@ def drawn(
     return both[:, :, 0], both[:, :, 1]
 
 
-def turning(quaternion: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _turning(quaternion: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return angular velocities in the body frame [rad/s], (..., 3), of quaternions (..., 4) and their rates (..., 4).
 
     omega = 2 conj(q) dq / |q|^2, vector part.
@@ -178,7 +178,7 @@ def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) 
         RecordingError: No joint position and no position of a free body was measured, or too few samples.
     """
     m = engine.compiled
-    joints, bodies = joint_motions(m, demonstration), body_motions(m, demonstration)
+    joints, bodies = _joint_motions(m, demonstration), _body_motions(m, demonstration)
     if not joints and not bodies:
         raise RecordingError(
             "no motion to locate forces in",
@@ -200,19 +200,19 @@ def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) 
     return Motion(m, joints, bodies, *base, ctrl)
 
 
-def joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[JointMotion, ...]:
+def _joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[JointMotion, ...]:
     """Return the measured hinges and slides."""
     found = []
-    channels = sensed(m, demonstration)
+    channels = _sensed(m, demonstration)
     for j in range(m.njnt):
         channel = channels.get((int(SENSOR.mjSENS_JOINTPOS), j))
         if int(m.jnt_type[j]) not in SCALAR or channel is None:
             continue
-        std = noise_of(channel, "joint")
+        std = _noise_of(channel, "joint")
         velocity = None
         if (rate := channels.get((int(SENSOR.mjSENS_JOINTVEL), j))) is not None:
-            velocity = signal(rate.time, rate.value, rate_std := noise_of(rate, "joint"), rate_std)
-        position = signal(channel.time, channel.value, std, std, velocity)
+            velocity = _signal(rate.time, rate.value, rate_std := _noise_of(rate, "joint"), rate_std)
+        position = _signal(channel.time, channel.value, std, std, velocity)
         if position is not None:
             unit = "rad" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else "m"
             name = m.joint(j).name or f"joint{j}"
@@ -220,7 +220,7 @@ def joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[Join
     return tuple(found)
 
 
-def body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyMotion, ...]:
+def _body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyMotion, ...]:
     """Return the measured free bodies; a frame sensor may sit on the body, its inertial frame, a site or a geom."""
     found: dict[int, BodyMotion] = {}
     posed: dict[int, dict[int, tuple[Channel, np.ndarray, Rotation]]] = {}
@@ -228,7 +228,7 @@ def body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyM
         row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
         kind = int(m.sensor_type[row]) if row >= 0 else -1
         if kind in (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT)) and m.sensor_refid[row] < 0:
-            place = frame_in_body(m, row)
+            place = _frame_in_body(m, row)
             if place is not None:
                 posed.setdefault(place[0], {}).setdefault(kind, (channel, place[1], place[2]))
     for body, channels in posed.items():
@@ -238,7 +238,7 @@ def body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyM
         orientation = None
         if int(SENSOR.mjSENS_FRAMEQUAT) in channels:
             channel, _, turn = channels[int(SENSOR.mjSENS_FRAMEQUAT)]
-            orientation = orientation_signal(channel, turn)
+            orientation = _orientation_signal(channel, turn)
         channel, offset, _ = channels[int(SENSOR.mjSENS_FRAMEPOS)]
         value = np.array(channel.value, dtype=float)
         if np.any(offset):
@@ -246,7 +246,7 @@ def body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyM
                 continue
             quaternion = orientation.smooth.at(channel.time)
             value = value - Rotation.from_quat(quaternion, scalar_first=True).apply(offset)
-        position = signal(channel.time, value, std := noise_of(channel, "position"), std)
+        position = _signal(channel.time, value, std := _noise_of(channel, "position"), std)
         if position is not None:
             name = m.body(body).name or f"body{body}"
             addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
@@ -254,7 +254,7 @@ def body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyM
     return tuple(found[body] for body in sorted(found))
 
 
-def frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotation] | None:
+def _frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotation] | None:
     """Return the body that a frame sensor sits on, where on it [m], and how the frame is turned against the body's."""
     target, kind = int(m.sensor_objid[row]), int(m.sensor_objtype[row])
     if kind == mujoco.mjtObj.mjOBJ_XBODY:
@@ -270,18 +270,18 @@ def frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotatio
     return body, np.array(offset), Rotation.from_quat(turn, scalar_first=True)
 
 
-def orientation_signal(channel: Channel, turn: Rotation) -> Signal | None:
+def _orientation_signal(channel: Channel, turn: Rotation) -> Signal | None:
     """Return readings of a frame that is turned by `turn` against its body, as orientations of the body."""
-    std = noise_of(channel, "orientation")
+    std = _noise_of(channel, "orientation")
     valid = np.isfinite(channel.value).all(axis=1)
     if not valid.any():
         return None
     body = Rotation.from_quat(channel.value[valid], scalar_first=True) * turn.inv()
     quaternion = same_sign(body.as_quat(scalar_first=True))
-    return signal(channel.time[valid], quaternion, std, std / 2)
+    return _signal(channel.time[valid], quaternion, std, std / 2)
 
 
-def signal(
+def _signal(
     time: np.ndarray,
     value: np.ndarray,
     std: float,
@@ -295,14 +295,14 @@ def signal(
     return None if smoothed is None else Signal(np.asarray(time[valid], float), value[valid], std, smoothed)
 
 
-def noise_of(channel: Channel, kind: Kind) -> float:
+def _noise_of(channel: Channel, kind: Kind) -> float:
     """Return the noise of a channel, never 0."""
     valid = channel.value[np.isfinite(channel.value).all(axis=1)]
     least = LEAST_NOISE * max(float(np.ptp(valid, axis=0).max(initial=0)) if len(valid) else 0.0, 1e-3)
     return float(np.fmax(channel_noise(channel, kind).std, least))
 
 
-def sensed(m: mujoco.MjModel, demonstration: Demonstration) -> dict[tuple[int, int], Channel]:
+def _sensed(m: mujoco.MjModel, demonstration: Demonstration) -> dict[tuple[int, int], Channel]:
     """Return the measured channels by type and target of their sensors; the first of several alike."""
     found: dict[tuple[int, int], Channel] = {}
     for name, channel in demonstration.measured.items():

@@ -77,13 +77,13 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind) -> Noise:
     stated = [c.noise_std for c in channels if c.noise_std]
     if stated:
         return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
-    pieces = [piece for c in channels for piece in finite_pieces(c.value)]
+    pieces = [piece for c in channels for piece in _finite_pieces(c.value)]
     if sum(len(piece) for piece in pieces) < FEWEST:
         return Noise(np.nan, "unknown")
-    fast = difference_std(pieces, kind)
-    floor = 0.0 if kind == "orientation" else resolution(pieces) / np.sqrt(12)
+    fast = _difference_std(pieces, kind)
+    floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
     found = Noise(fast, "differences")
-    if (rest := rest_std(pieces, kind, max(fast, floor))) is not None:
+    if (rest := _rest_std(pieces, kind, max(fast, floor))) is not None:
         found = Noise(max(rest, fast), "rest")
     if found.std < floor:
         return Noise(floor, "resolution")
@@ -91,7 +91,7 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind) -> Noise:
     return found if found.std > ROUNDING * size else Noise(np.nan, "unknown")
 
 
-def finite_pieces(value: np.ndarray) -> list[np.ndarray]:
+def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:
     """Return the stretches of `value` (T, dim) without missing readings, each (n, dim)."""
     value = np.asarray(value, dtype=float).reshape(len(value), -1)
     valid = np.asarray(np.isfinite(value).all(axis=1))
@@ -100,7 +100,7 @@ def finite_pieces(value: np.ndarray) -> list[np.ndarray]:
     return [value[rows] for rows in parts if len(rows) and bool(valid[rows].all())]
 
 
-def difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
+def _difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     """Return the noise per component seen in third differences, by their median size, so that impacts count little.
 
     Third differences of independent noise have the variance 1 + 9 + 9 + 1 = 20. Of orientations the first difference
@@ -117,7 +117,7 @@ def difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     return float(np.sqrt(np.mean(spread**2) / 20))
 
 
-def rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float) -> float | None:
+def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float) -> float | None:
     """Return the scatter about the mean of stretches of rest, None where there is none.
 
     A window is at rest if it scatters, and its two halves differ, by no more than `REST_SCATTER` times `fast`.
@@ -126,17 +126,17 @@ def rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float) -> float | N
     for piece in pieces:
         count = len(piece) // REST_LENGTH
         windows = [piece[i * REST_LENGTH : (i + 1) * REST_LENGTH] for i in range(count)]
-        still = np.array([is_still(centred(window, kind), fast) for window in windows], dtype=bool)
+        still = np.array([_is_still(_centred(window, kind), fast) for window in windows], dtype=bool)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
         for start, end in edges.reshape(-1, 2):
-            stretch = centred(piece[start * REST_LENGTH : end * REST_LENGTH], kind)
-            if end - start >= REST_WINDOWS and is_still(stretch, fast):
+            stretch = _centred(piece[start * REST_LENGTH : end * REST_LENGTH], kind)
+            if end - start >= REST_WINDOWS and _is_still(stretch, fast):
                 square += float((stretch**2).sum())
                 freedom += stretch.size - stretch.shape[1]
     return float(np.sqrt(square / freedom)) if freedom else None
 
 
-def is_still(window: np.ndarray, fast: float) -> bool:
+def _is_still(window: np.ndarray, fast: float) -> bool:
     """Return whether readings about their mean, shape (n, dim), scatter and drift by no more than noise does."""
     limit = REST_SCATTER * fast
     half = len(window) // 2
@@ -144,13 +144,13 @@ def is_still(window: np.ndarray, fast: float) -> bool:
     return bool(np.sqrt((window**2).mean(axis=0)).max() <= limit and drift <= limit)
 
 
-def centred(window: np.ndarray, kind: Kind) -> np.ndarray:
+def _centred(window: np.ndarray, kind: Kind) -> np.ndarray:
     """Return readings (n, dim) less their mean; of orientations rotation vectors [rad], shape (n, 3)."""
     value = turns(np.broadcast_to(window[0], window.shape), window) if kind == "orientation" else window
     return value - value.mean(axis=0)
 
 
-def resolution(pieces: Sequence[np.ndarray]) -> float:
+def _resolution(pieces: Sequence[np.ndarray]) -> float:
     """Return the step in which readings come, in their unit; 0 where they do not come in steps."""
     steps = []
     for column in np.concatenate(pieces).T:

@@ -78,7 +78,7 @@ def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -
             expected=f"points, or position and orientation sensors, of one of {movable}",
             fix="record /points/<body> or the body's pose",
         )
-    joints = joint_channels(model, demonstration)
+    joints = _joint_channels(model, demonstration)
     return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets), joints)
 
 
@@ -91,18 +91,18 @@ def body_target(scene: Scene, demonstration: Demonstration, body: str, qpos: np.
     if body in demonstration.points:
         track = demonstration.points[body]
         points = np.where(track.visible[:, :, None], track.value, np.nan)
-        anchor = (resting_mean(points) - origin) @ rotation
+        anchor = (_resting_mean(points) - origin) @ rotation
         known = np.isfinite(anchor).all(axis=1)
         return BodyTarget(body, anchor[known], track.time, points[:, known])
     pose = measured_pose(scene.model, demonstration, body)
     if pose is None:
         return None
     time, position, turn = pose
-    anchor = carried_points(scene, body)
+    anchor = _carried_points(scene, body)
     return BodyTarget(body, anchor, time, position[:, None] + np.einsum("tij,mj->tmi", turn.as_matrix(), anchor))
 
 
-def resting_mean(points: np.ndarray) -> np.ndarray:
+def _resting_mean(points: np.ndarray) -> np.ndarray:
     """Return each point's mean over the frames before the body moves [m], shape (M, 3); NaN for points unseen then."""
     centre = np.nanmean(points - points[:1], axis=1)
     moved = np.flatnonzero(np.linalg.norm(centre, axis=1) > REST)
@@ -186,7 +186,7 @@ def observed_poses(target: BodyTarget, frames: np.ndarray) -> np.ndarray:
     return result
 
 
-def joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict[int, Channel]:
+def _joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict[int, Channel]:
     """Return the measured joint positions of a demonstration by their address in qpos."""
     result = {}
     for name, channel in demonstration.measured.items():
@@ -196,7 +196,7 @@ def joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict[
     return result
 
 
-def carried_points(scene: Scene, body: str) -> np.ndarray:
+def _carried_points(scene: Scene, body: str) -> np.ndarray:
     """Return points spread over a body's surface, body frame [m], shape (CARRIED_POINTS, 3)."""
     from concent_warp.scene.shapes.surface import Surface
     from concent_warp.scene.spheres.sampling import farthest_point_sampling

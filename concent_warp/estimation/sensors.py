@@ -59,12 +59,12 @@ def kind_and_unit(compiled: mujoco.MjModel, row: int) -> tuple[Kind, str]:
     if sensor in UNIT_QUATERNION_SENSORS:
         return "orientation", "rad"
     if sensor in JOINT_UNITS:
-        unit = JOINT_UNITS[sensor][slides(compiled, sensor, int(compiled.sensor_objid[row]))]
+        unit = JOINT_UNITS[sensor][_slides(compiled, sensor, int(compiled.sensor_objid[row]))]
         return "joint" if unit in ("rad", "m") else "other", unit
     return "position" if sensor in POSITIONS else "other", UNITS.get(sensor, "")
 
 
-def slides(compiled: mujoco.MjModel, sensor: mujoco.mjtSensor, target: int) -> bool:
+def _slides(compiled: mujoco.MjModel, sensor: mujoco.mjtSensor, target: int) -> bool:
     """Return whether a joint, tendon or actuator sensor is about lengths rather than angles."""
     if sensor in (SENSOR.mjSENS_ACTUATORPOS, SENSOR.mjSENS_ACTUATORVEL, SENSOR.mjSENS_ACTUATORFRC):
         tendon = compiled.actuator_trntype[target] == mujoco.mjtTrn.mjTRN_TENDON

@@ -44,11 +44,11 @@ class Smooth:
 
     def at(self, time: np.ndarray, order: int = 0) -> np.ndarray:
         """Return the signal (0), its velocity (1) or its acceleration (2) at `time` (T,) [s], shape (T, dim)."""
-        return rows(self.knots, time, order) @ self.coefficient
+        return _rows(self.knots, time, order) @ self.coefficient
 
     def covariance(self, time: np.ndarray) -> np.ndarray:
         """Return the covariance of signal, velocity and acceleration of a component at `time` (T,), (T, 3, 3)."""
-        basis = np.stack([rows(self.knots, time, order).toarray() for order in range(3)], axis=1)
+        basis = np.stack([_rows(self.knots, time, order).toarray() for order in range(3)], axis=1)
         flat = basis.reshape(-1, basis.shape[2])
         solved = cho_solve_banded((self.factor, False), flat.T).T.reshape(basis.shape)
         return np.einsum("tin,tjn->tij", basis, solved)
@@ -75,24 +75,24 @@ def smooth(
     time, value = np.asarray(time, float)[valid], np.asarray(value, float)[valid]
     if len(time) < FEWEST_SAMPLES:
         return None
-    knots = even_knots(time)
+    knots = _even_knots(time)
     count = len(knots) - DEGREE - 1
-    design = rows(knots, time, 0)
+    design = _rows(knots, time, 0)
     normal = (design.T @ design) / noise**2
     right = design.T @ value / noise**2
     square = float((value**2).sum()) / noise**2
     if velocity is not None:
         clock, speed, std = velocity
         kept = np.isfinite(speed).all(axis=1) & (clock >= time[0]) & (clock <= time[-1])
-        rate = rows(knots, clock[kept], 1)
+        rate = _rows(knots, clock[kept], 1)
         normal = normal + (rate.T @ rate) / std**2
         right = right + rate.T @ speed[kept] / std**2
         square += float((speed[kept] ** 2).sum()) / std**2
-    data = upper_bands(normal)
-    penalty = penalty_bands(count)
+    data = _upper_bands(normal)
+    penalty = _penalty_bands(count)
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     for scale in SMOOTHNESS * noise:
-        factor = cholesky_banded(data + penalty / scale**2 + ridge(data, scale), lower=False)
+        factor = cholesky_banded(data + penalty / scale**2 + _ridge(data, scale), lower=False)
         coefficient = cho_solve_banded((factor, False), right)
         evidence = float((right * coefficient).sum() - square)
         evidence -= value.shape[1] * (2 * np.log(factor[-1]).sum() + 2 * (count - PENALISED) * np.log(scale))
@@ -102,7 +102,7 @@ def smooth(
     return Smooth(knots, best[1], best[2], noise, (float(time[0]), float(time[-1])))
 
 
-def even_knots(time: np.ndarray) -> np.ndarray:
+def _even_knots(time: np.ndarray) -> np.ndarray:
     """Return even knots about as far apart as the readings, reaching over both ends, shape (n + 6,)."""
     length = time[-1] - time[0]
     pieces = int(np.clip(round(length / float(np.median(np.diff(time)))), 1, MOST_KNOTS))
@@ -110,7 +110,7 @@ def even_knots(time: np.ndarray) -> np.ndarray:
     return time[0] + step * np.arange(-DEGREE, pieces + DEGREE + 1)
 
 
-def rows(knots: np.ndarray, time: np.ndarray, order: int) -> csr_array:
+def _rows(knots: np.ndarray, time: np.ndarray, order: int) -> csr_array:
     """Return the matrix that takes coefficients to the derivative of some order at `time` (T,), sparse, (T, n)."""
     from scipy.sparse import csr_array, diags_array
 
@@ -125,7 +125,7 @@ def rows(knots: np.ndarray, time: np.ndarray, order: int) -> csr_array:
     return matrix
 
 
-def upper_bands(matrix: csr_array) -> np.ndarray:
+def _upper_bands(matrix: csr_array) -> np.ndarray:
     """Return the upper bands of a symmetric banded matrix as `scipy.linalg` wants them, shape (6, n)."""
     count = int(matrix.diagonal().size)
     bands = np.zeros((DEGREE + 1, count))
@@ -134,15 +134,15 @@ def upper_bands(matrix: csr_array) -> np.ndarray:
     return bands
 
 
-def penalty_bands(count: int) -> np.ndarray:
+def _penalty_bands(count: int) -> np.ndarray:
     """Return the upper bands of D'D, D the third differences of `count` coefficients, shape (6, count)."""
     from scipy.sparse import csr_array, diags_array
 
     third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - PENALISED, count))  # pyright: ignore
-    return upper_bands(csr_array(third.T @ third))
+    return _upper_bands(csr_array(third.T @ third))
 
 
-def ridge(data: np.ndarray, scale: float) -> np.ndarray:
+def _ridge(data: np.ndarray, scale: float) -> np.ndarray:
     """Return bands that keep coefficients definite where a gap leaves them to the penalty alone."""
     bands = np.zeros_like(data)
     bands[-1] = 1e-10 * max(float(data[-1].max()), 1 / scale**2)

@@ -136,7 +136,7 @@ def windows(
         within = (clock >= start) & (clock <= start + EARLY * length)
         if only_contact and not touching[within].any():
             continue
-        if (segment := cut(measured, full, float(start), length)) is not None:
+        if (segment := _cut(measured, full, float(start), length)) is not None:
             result.append(segment)
     return result
 
@@ -152,7 +152,7 @@ def calm_starts(clock: np.ndarray, rough: np.ndarray, length: float, stride: flo
     return np.unique(result)
 
 
-def cut(measured: Measured, full: Segment, start: float, length: float) -> Segment | None:
+def _cut(measured: Measured, full: Segment, start: float, length: float) -> Segment | None:
     """Return one window of a demonstration; None where too little was observed in it."""
     model = measured.scene.model
     targets = []

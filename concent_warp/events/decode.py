@@ -20,19 +20,19 @@ def decode(kind: type[T], value: Any, where: str) -> T:
     Raises:
         EventsError: `value` does not fit; the message says at which field.
     """
-    return decode_value(kind, value, where)
+    return _decode_value(kind, value, where)
 
 
-def decode_value(kind: Any, value: Any, where: str) -> Any:
+def _decode_value(kind: Any, value: Any, where: str) -> Any:
     """Return `value` as a `kind`, see `decode`."""
     if is_dataclass(kind):
-        return decode_fields(kind, value, where)
+        return _decode_fields(kind, value, where)
     origin, options = get_origin(kind), get_args(kind)
     if origin is tuple:
-        return decode_tuple(options, value, where)
+        return _decode_tuple(options, value, where)
     if origin in (Union, types.UnionType):
         inner = next(option for option in options if option is not type(None))
-        return None if value is None else decode_value(inner, value, where)
+        return None if value is None else _decode_value(inner, value, where)
     if origin is Literal:
         if value not in options:
             raise EventsError("unknown value", where=where, expected=f"one of {list(options)}", found=repr(value))
@@ -45,7 +45,7 @@ def decode_value(kind: Any, value: Any, where: str) -> Any:
     raise EventsError("wrong type of value", where=where, expected=words[kind], found=repr(value)[:60])
 
 
-def decode_fields(kind: Any, value: Any, where: str) -> Any:
+def _decode_fields(kind: Any, value: Any, where: str) -> Any:
     """Return a dataclass from a JSON object."""
     if not isinstance(value, dict):
         raise EventsError("wrong type of value", where=where, expected="an object", found=repr(value)[:60])
@@ -56,16 +56,16 @@ def decode_fields(kind: Any, value: Any, where: str) -> Any:
     if missing := [name for name in needed if name not in value]:
         raise EventsError("missing entries", where=where, expected=f"all of {needed}", found=f"no {missing}")
     hints = get_type_hints(kind)
-    return kind(**{name: decode_value(hints[name], item, f"{where}, {name}") for name, item in value.items()})
+    return kind(**{name: _decode_value(hints[name], item, f"{where}, {name}") for name, item in value.items()})
 
 
-def decode_tuple(options: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+def _decode_tuple(options: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     """Return a tuple from a JSON list; `options` are its element types, or one type and an ellipsis."""
     if not isinstance(value, list):
         raise EventsError("wrong type of value", where=where, expected="a list", found=repr(value)[:60])
     if len(options) == 2 and options[1] is Ellipsis:
-        return tuple(decode_value(options[0], item, f"{where}[{i}]") for i, item in enumerate(value))
+        return tuple(_decode_value(options[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     if len(value) != len(options):
         raise EventsError("wrong length of list", where=where, expected=len(options), found=len(value))
     pairs = zip(options, value, strict=True)
-    return tuple(decode_value(option, item, f"{where}[{i}]") for i, (option, item) in enumerate(pairs))
+    return tuple(_decode_value(option, item, f"{where}[{i}]") for i, (option, item) in enumerate(pairs))

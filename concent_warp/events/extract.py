@@ -47,10 +47,10 @@ def extract(
     roles = Roles.of(engine.compiled, model)
     steps = step_count(demonstration, engine.timestep)
     motion = Motion.of(rollout, roles.bodies, engine.timestep, steps)
-    return from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg)
+    return _from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg)
 
 
-def from_log(
+def _from_log(
     log: ContactLog,
     roles: Roles,
     motion: Motion,
@@ -82,24 +82,24 @@ def from_log(
         steps=motion.steps,
         settings=cfg,
         entities=tuple(roles.entities[i] for i in used),
-        body_contacts=body_intervals(touches, settled, motion, roles),
-        contacts=entity_intervals(touches, settled, motion, roles, steps_of(cfg.gap, motion.timestep)),
+        body_contacts=_body_intervals(touches, settled, motion, roles),
+        contacts=_entity_intervals(touches, settled, motion, roles, steps_of(cfg.gap, motion.timestep)),
         stages=find_stages(touches, settled, motion, roles, geometry, cfg),
     )
 
 
-def body_intervals(
+def _body_intervals(
     touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of bodies."""
     found = []
     for (a, b), touching in settled.items():
         names = roles.bodies[a], roles.bodies[b]
-        found += intervals(touches.between(a, b), touching, motion, names)
-    return in_order(found)
+        found += _intervals(touches.between(a, b), touching, motion, names)
+    return _in_order(found)
 
 
-def entity_intervals(
+def _entity_intervals(
     touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles, gap: int
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of entities: breaks closed, within the contacts of their bodies."""
@@ -112,11 +112,11 @@ def entity_intervals(
         a, b = group.body[0].tolist()
         touching = close_gaps(group.frames(motion.steps), gap) & settled[a, b]
         first, second = (roles.entities[i].name for i in group.entity[0])
-        found += intervals(group, touching, motion, (first, second))
-    return in_order(found)
+        found += _intervals(group, touching, motion, (first, second))
+    return _in_order(found)
 
 
-def intervals(rows: Touches, touching: np.ndarray, motion: Motion, names: tuple[str, str]) -> list[ContactInterval]:
+def _intervals(rows: Touches, touching: np.ndarray, motion: Motion, names: tuple[str, str]) -> list[ContactInterval]:
     """Return an interval for each run of `touching` (K,) with the means of the contacts `rows` within it."""
     found = []
     for start, end in runs(touching):
@@ -140,6 +140,6 @@ def intervals(rows: Touches, touching: np.ndarray, motion: Motion, names: tuple[
     return found
 
 
-def in_order(found: list[ContactInterval]) -> tuple[ContactInterval, ...]:
+def _in_order(found: list[ContactInterval]) -> tuple[ContactInterval, ...]:
     """Return intervals in the order of their start, then of their names."""
     return tuple(sorted(found, key=lambda item: (item.start, item.a, item.b)))

@@ -88,11 +88,11 @@ class PairContact:
             normal=motion.turn_into(b, rows.step, rows.normal),
             force=rows.force,
             point=point,
-            feelers=thinned(motion.into(a, rows.step, rows.point)),
+            feelers=_thinned(motion.into(a, rows.step, rows.point)),
             origin=origin,
             rotation=rotation,
             spheres=spheres,
-            layout=spheres if len(spheres) else thinned(point),
+            layout=spheres if len(spheres) else _thinned(point),
         )
 
     def mean(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +107,7 @@ class PairContact:
         return (self.origin - plane.point) @ plane.normal + reach.min(axis=1)
 
 
-def thinned(points: np.ndarray) -> np.ndarray:
+def _thinned(points: np.ndarray) -> np.ndarray:
     """Return points [m], shape (C, 3), one for each cell of a grid that holds any, shape (n, 3)."""
     return np.unique(np.round(points / GRAIN), axis=0) * GRAIN
 
@@ -141,48 +141,48 @@ def object_onsets(
         return []
     contact = PairContact.of(rows, motion, pair, spheres)
     first = int(rows.step[0])
-    plane = first_plane(contact, touching, steps_of(cfg.window, motion.timestep), cfg)
-    beyond, inside = passage(contact, touching, plane, motion.timestep, cfg)
+    plane = _first_plane(contact, touching, steps_of(cfg.window, motion.timestep), cfg)
+    beyond, inside = _passage(contact, touching, plane, motion.timestep, cfg)
     entered = int(np.flatnonzero(inside)[0]) if inside.any() else motion.steps
     onsets = []
     if entered - first >= steps_of(cfg.blip, motion.timestep):
         onsets.append(Onset("align" if held[first] else "touch", first, pair, touching & ~beyond))
     if inside.any():
         deepest = entered + int(np.argmin(contact.height(plane)[entered : contact.step[-1] + 1]))
-        kind = "insert" if surrounded(contact, plane, deepest, cfg.depth) else "enter"
+        kind = "insert" if _surrounded(contact, plane, deepest, cfg.depth) else "enter"
         onsets.append(Onset(kind, entered, pair, touching & beyond))
     return onsets
 
 
-def first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: StagingCfg) -> Plane:
+def _first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: StagingCfg) -> Plane:
     """Return the plane of the first contact, judged by the first `width` steps from it on."""
     first, last = int(contact.step[0]), int(np.flatnonzero(touching)[-1])
     point, normal = contact.mean(contact.step < first + width)
-    approach = approach_direction(contact.origin, first, cfg.approach)
-    ways = [-approach, unit(contact.origin[first] - contact.origin[last], cfg.depth)]
+    approach = _approach_direction(contact.origin, first, cfg.approach)
+    ways = [-approach, _unit(contact.origin[first] - contact.origin[last], cfg.depth)]
     opposed = [way for way in ways if way @ normal > OPPOSING]
     if not opposed:
         return Plane(point, -approach if approach.any() else normal, barred=not approach.any())
     if len(contact.spheres):
-        normal = fit_normal(contact.spheres, point, opposed[0])
+        normal = _fit_normal(contact.spheres, point, opposed[0])
     plane = Plane(point, normal, barred=True)
-    return replace(plane, barred=not surrounded(contact, plane, first, cfg.depth))
+    return replace(plane, barred=not _surrounded(contact, plane, first, cfg.depth))
 
 
-def approach_direction(origin: np.ndarray, first: int, length: float) -> np.ndarray:
+def _approach_direction(origin: np.ndarray, first: int, length: float) -> np.ndarray:
     """Return the unit direction of the last `length` [m] of path before step `first`; zero if it has not moved."""
     travelled = np.cumsum(np.linalg.norm(np.diff(origin[: first + 1], axis=0), axis=1)[::-1])
     back = int(np.searchsorted(travelled, length)) + 1
-    return unit(origin[first] - origin[max(first - back, 0)], 0.1 * length)
+    return _unit(origin[first] - origin[max(first - back, 0)], 0.1 * length)
 
 
-def unit(vector: np.ndarray, least: float) -> np.ndarray:
+def _unit(vector: np.ndarray, least: float) -> np.ndarray:
     """Return a vector (3,) at length 1, or zero if it is not longer than `least`."""
     length = np.linalg.norm(vector)
     return vector / length if length > least else np.zeros(3)
 
 
-def fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Turn a direction (3,) into the normal of the layer of spheres (n, 3) that a contact at `point` (3,) is on.
 
     Of the directions around `normal`, the one is taken that has most spheres level with the touched one, the more of
@@ -193,7 +193,7 @@ def fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np
     if len(near) < PLANE_LEAST:
         return normal
     from_touched = near - near[np.argmin(np.linalg.norm(near - point, axis=1))]
-    candidates = cone(normal)
+    candidates = _cone(normal)
     level = np.abs(from_touched @ candidates.T) < PLANE_BAND
     nearness = 2 * (candidates @ normal) ** 2 - 1  # cosine of twice the tilt
     layer = from_touched[level[:, np.argmax(level.sum(axis=0) * nearness)]]
@@ -204,7 +204,7 @@ def fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np
     return turned if spread[1] > 3 * spread[2] and turned @ normal > np.cos(PLANE_TILTS[-1]) else normal
 
 
-def cone(axis: np.ndarray) -> np.ndarray:
+def _cone(axis: np.ndarray) -> np.ndarray:
     """Return unit vectors around an axis (3,), the axis first, shape (n, 3)."""
     across = np.linalg.svd(axis[None])[2][1:]
     tilt, turn = np.meshgrid(PLANE_TILTS, np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij")
@@ -213,7 +213,7 @@ def cone(axis: np.ndarray) -> np.ndarray:
     return np.concatenate([axis[None], vectors.reshape(-1, 3)])
 
 
-def passage(
+def _passage(
     contact: PairContact, touching: np.ndarray, plane: Plane, timestep: float, cfg: StagingCfg
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return when a is in contact beyond the plane, and when on inner surfaces for `persist`, shape (K,) bool each."""
@@ -229,7 +229,7 @@ def passage(
     return beyond, settle(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
 
 
-def surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> bool:
+def _surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> bool:
     """Return whether b is all around a at a step.
 
     Seen along the plane's normal from the middle of a's feelers, what b has above the foremost feeler, by more than

@@ -63,7 +63,7 @@ def contact_frames(contacts: Iterable[tuple[float, str, str]], grid: np.ndarray)
     """
     frames: dict[Pair, np.ndarray] = {}
     for time, a, b in contacts:
-        row = frame_of(np.array([time]), grid)[0]
+        row = _frame_of(np.array([time]), grid)[0]
         if 0 <= row < len(grid):
             frames.setdefault(pair(a, b), np.zeros(len(grid), dtype=bool))[row] = True
     return frames
@@ -71,7 +71,7 @@ def contact_frames(contacts: Iterable[tuple[float, str, str]], grid: np.ndarray)
 
 def resample(frames: Frames, time: np.ndarray, grid: np.ndarray) -> dict[Pair, np.ndarray]:
     """Return frames, given at `time` (S,) [s], on another grid (T,) of equal frames no shorter than their steps."""
-    row = frame_of(time, grid)
+    row = _frame_of(time, grid)
     inside = (row >= 0) & (row < len(grid))
     result = {}
     for (a, b), touching in frames.items():
@@ -83,7 +83,7 @@ def resample(frames: Frames, time: np.ndarray, grid: np.ndarray) -> dict[Pair, n
     return result
 
 
-def frame_of(time: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _frame_of(time: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the index of the frame that each time [s] falls in, shape (S,) int; outside the grid if there is none."""
     if len(grid) < 2:
         raise EventsError("the time grid is too short", expected="at least 2 frames", found=len(grid))
@@ -145,13 +145,13 @@ def overlap(a: ContactEventSequence, b: ContactEventSequence, period: float | No
     return SequenceOverlap(
         frames=iou(sequence_frames(a, grid), sequence_frames(b, grid)),
         primitives=dict.fromkeys(names, 0.0)
-        | {name: set_iou(events[0][name].primitives, events[1][name].primitives) for name in both},
+        | {name: _set_iou(events[0][name].primitives, events[1][name].primitives) for name in both},
         links=dict.fromkeys(names, 0.0)
-        | {name: set_iou(events[0][name].links, events[1][name].links) for name in both},
+        | {name: _set_iou(events[0][name].links, events[1][name].links) for name in both},
     )
 
 
-def set_iou(a: Iterable[str], b: Iterable[str]) -> float:
+def _set_iou(a: Iterable[str], b: Iterable[str]) -> float:
     """Return the intersection over union of two sets of names; 1 where both are empty."""
     one, other = set(a), set(b)
     return len(one & other) / len(one | other) if one | other else 1.0

@@ -46,7 +46,7 @@ class Roles:
         objects = model.scene.objects() if model.geometry is None else model.geometry.bodies
         spheres = {} if model.geometry is None else {name: i for i, name in enumerate(model.geometry.names())}
         bodies = tuple(compiled.body(i).name or f"body{i}" for i in range(compiled.nbody))
-        driven = driven_trees(compiled)
+        driven = _driven_trees(compiled)
         tree = compiled.body_treeid
         role: tuple[Role, ...] = tuple(
             "object" if name in objects else "robot" if int(tree[i]) in driven else "world"
@@ -74,7 +74,7 @@ class Roles:
         return [i for i, found in enumerate(self.body_role) if found == role]
 
 
-def driven_trees(m: mujoco.MjModel) -> set[int]:
+def _driven_trees(m: mujoco.MjModel) -> set[int]:
     """Return the ids of the kinematic trees with a joint that an actuator moves."""
     joints: set[int] = set()
     tendons: set[int] = set()
@@ -89,12 +89,12 @@ def driven_trees(m: mujoco.MjModel) -> set[int]:
             trees.add(int(m.body_treeid[m.site_bodyid[target]]))
         elif kind == mujoco.mjtTrn.mjTRN_BODY:
             trees.add(int(m.body_treeid[target]))
-    spread_couplings(m, joints, tendons)
+    _spread_couplings(m, joints, tendons)
     trees |= {int(m.body_treeid[m.jnt_bodyid[j]]) for j in joints}
     return trees - {-1}
 
 
-def spread_couplings(m: mujoco.MjModel, joints: set[int], tendons: set[int]) -> None:
+def _spread_couplings(m: mujoco.MjModel, joints: set[int], tendons: set[int]) -> None:
     """Add to the driven joints and tendons those that move with them through tendons and equalities."""
     before = -1
     while before != len(joints) + len(tendons):

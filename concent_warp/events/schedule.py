@@ -44,12 +44,12 @@ def plot_schedule(sequence: ContactEventSequence, path: Path | None = None, titl
     figure = Figure(figsize=(10, 1.7 + 0.44 * max(len(rows), 1)), layout="constrained")
     axes = figure.add_subplot()
     for row, key in enumerate(rows):
-        draw_row(axes, sequence, row, *key)
-    levels = label_levels([stage.start for stage in sequence.stages], 0.1 * sequence.duration)
+        _draw_row(axes, sequence, row, *key)
+    levels = _label_levels([stage.start for stage in sequence.stages], 0.1 * sequence.duration)
     for k, (stage, level) in enumerate(zip(sequence.stages, levels, strict=True)):
-        draw_stage(axes, stage, BAND[k % len(BAND)], level)
-        mark_event(axes, sequence, stage, rows)
-    axes.set_yticks(range(len(rows)), [row_label(sequence, *key) for key in rows], color=INK)
+        _draw_stage(axes, stage, BAND[k % len(BAND)], level)
+        _mark_event(axes, sequence, stage, rows)
+    axes.set_yticks(range(len(rows)), [_row_label(sequence, *key) for key in rows], color=INK)
     axes.set_ylim(max(len(rows), 1) - 0.4, -0.6)
     axes.set_xlim(0, max(sequence.duration, sequence.timestep))
     axes.set_xlabel("time [s]", color=INK)
@@ -89,7 +89,7 @@ def schedule_rows(sequence: ContactEventSequence) -> list[tuple[str, str]]:
     return sorted(first, key=lambda key: (*(order.index(role[name]) for name in key), first[key], key))
 
 
-def row_label(sequence: ContactEventSequence, a: str, b: str) -> str:
+def _row_label(sequence: ContactEventSequence, a: str, b: str) -> str:
     """Return the names of two bodies; of the surroundings, the names of the geoms that are touched."""
     entity = sequence.entity
     touched = {c.b for c in sequence.contacts if (entity[c.a].body, entity[c.b].body) == (a, b)}
@@ -97,7 +97,7 @@ def row_label(sequence: ContactEventSequence, a: str, b: str) -> str:
     return f"{a} · {', '.join(fixed) if 0 < len(fixed) <= 2 else b}"
 
 
-def label_levels(starts: list[float], room: float) -> list[int]:
+def _label_levels(starts: list[float], room: float) -> list[int]:
     """Return how high to set each label, in rows of text, so that those closer than `room` [s] do not overlap."""
     levels: list[int] = []
     for k, start in enumerate(starts):
@@ -106,7 +106,7 @@ def label_levels(starts: list[float], room: float) -> list[int]:
     return levels
 
 
-def draw_row(axes: Axes, sequence: ContactEventSequence, row: int, a: str, b: str) -> None:
+def _draw_row(axes: Axes, sequence: ContactEventSequence, row: int, a: str, b: str) -> None:
     """Draw the contacts of one pair of bodies."""
     role = {entity.body: entity.role for entity in sequence.entities}
     kind = "world" if role[b] == "world" else role[a]
@@ -128,7 +128,7 @@ def contact_count(contacts: list[ContactInterval]) -> tuple[np.ndarray, np.ndarr
     return time, np.searchsorted(start, time, side="right") - np.searchsorted(end, time, side="right")
 
 
-def draw_stage(axes: Axes, stage: Stage, colour: str, level: int) -> None:
+def _draw_stage(axes: Axes, stage: Stage, colour: str, level: int) -> None:
     """Draw the band of one stage, with its name and start above."""
     axes.axvspan(stage.start, stage.end, color=colour, linewidth=0, zorder=0)
     axes.axvline(stage.start, color=GREY, linewidth=0.9, zorder=1)
@@ -146,7 +146,7 @@ def draw_stage(axes: Axes, stage: Stage, colour: str, level: int) -> None:
         )
 
 
-def mark_event(axes: Axes, sequence: ContactEventSequence, stage: Stage, rows: list[tuple[str, str]]) -> None:
+def _mark_event(axes: Axes, sequence: ContactEventSequence, stage: Stage, rows: list[tuple[str, str]]) -> None:
     """Mark the pairs of bodies in a target event with diamonds."""
     entity = sequence.entity
     touched = {(entity[p.a].body, entity[p.b].body) for p in stage.event.pairs}

@@ -60,22 +60,22 @@ def find_stages(
             if geometry is not None and roles.bodies[b] in geometry.bodies:
                 spheres = geometry.position[geometry.of(roles.bodies[b])]
             onsets += object_onsets(touches.between(a, b), touching, (a, b), motion, carried, spheres, cfg)
-    onsets.sort(key=lambda onset: (onset.step, KINDS.index(onset.kind), body_names(onset, roles)))
+    onsets.sort(key=lambda onset: (onset.step, KINDS.index(onset.kind), _body_names(onset, roles)))
     ends = [onset.step for onset in onsets[1:]] + [motion.steps] * bool(onsets)
-    names = stage_names(onsets, roles)
+    names = _stage_names(onsets, roles)
     return tuple(
         Stage(
             name=name,
             start=round(onset.step * motion.timestep, 6),
             end=round(end * motion.timestep, 6),
-            bodies=body_names(onset, roles),
-            event=target_event(touches, motion, roles, onset.step, end, steady(onset, held), cfg),
+            bodies=_body_names(onset, roles),
+            event=target_event(touches, motion, roles, onset.step, end, _steady(onset, held), cfg),
         )
         for onset, end, name in zip(onsets, ends, names, strict=True)
     )
 
 
-def steady(onset: Onset, held: dict[int, np.ndarray]) -> np.ndarray:
+def _steady(onset: Onset, held: dict[int, np.ndarray]) -> np.ndarray:
     """Return when the contact of a stage holds, and the robot still holds what it held at first, shape (K,) bool."""
     holds = onset.holds.copy()
     for body in onset.body:
@@ -84,18 +84,18 @@ def steady(onset: Onset, held: dict[int, np.ndarray]) -> np.ndarray:
     return holds
 
 
-def body_names(onset: Onset, roles: Roles) -> tuple[str, str]:
+def _body_names(onset: Onset, roles: Roles) -> tuple[str, str]:
     """Return the names of the two sides of an onset."""
     a, b = onset.body
     return ROBOT if a is None else roles.bodies[a], roles.bodies[b]
 
 
-def stage_names(onsets: list[Onset], roles: Roles) -> list[str]:
+def _stage_names(onsets: list[Onset], roles: Roles) -> list[str]:
     """Return a name for each onset, numbered from the second of a name on."""
     count: Counter[str] = Counter()
     names = []
     for onset in onsets:
-        name = onset.kind if onset.kind in NAMED else "contact " + "-".join(body_names(onset, roles))
+        name = onset.kind if onset.kind in NAMED else "contact " + "-".join(_body_names(onset, roles))
         count[name] += 1
         names.append(name if count[name] == 1 else f"{name} {count[name]}")
     return names

@@ -20,7 +20,7 @@ def target_event(
     """Return the target event of a stage.
 
     It holds the pairs of entities, robot or object on object, that touch in a window of `cfg.window`, see
-    `event_window`: of each pair of bodies those that touch for at least `cfg.share` as long as the one that touches
+    `_event_window`: of each pair of bodies those that touch for at least `cfg.share` as long as the one that touches
     longest. Points, normals and forces are means over the window.
 
     Args:
@@ -32,7 +32,7 @@ def target_event(
         steady: When the contact of the stage holds and so does what carries it, shape (K,) bool.
         cfg: Settings.
     """
-    low, high = event_window(start, end, steady, steps_of(cfg.window, motion.timestep), cfg.target)
+    low, high = _event_window(start, end, steady, steps_of(cfg.window, motion.timestep), cfg.target)
     world = roles.ids("world")
     rows = touches[(touches.step >= low) & (touches.step < high) & ~np.isin(touches.body, world).any(axis=1)]
     groups = [rows[(rows.entity == pair).all(axis=1)] for pair in np.unique(rows.entity, axis=0)]
@@ -42,7 +42,7 @@ def target_event(
         bodies = tuple(group.body[0].tolist())
         longest[bodies] = max(longest.get(bodies, 0), count)
     pairs = [
-        contact_pair(group, motion, roles, high - low)
+        _contact_pair(group, motion, roles, high - low)
         for group, count in zip(groups, lasting, strict=True)
         if count >= cfg.share * longest[tuple(group.body[0].tolist())]
     ]
@@ -57,7 +57,7 @@ def target_event(
     )
 
 
-def event_window(start: int, end: int, steady: np.ndarray, width: int, target: str) -> tuple[int, int]:
+def _event_window(start: int, end: int, steady: np.ndarray, width: int, target: str) -> tuple[int, int]:
     """Return the steps that a target event is read from, first and one past the last.
 
     "transition" takes the first `width` steps of the stage; "settled" takes as many of the last steady run of the stage
@@ -72,7 +72,7 @@ def event_window(start: int, end: int, steady: np.ndarray, width: int, target: s
     return int(max(low, high - width)), int(high)
 
 
-def contact_pair(rows: Touches, motion: Motion, roles: Roles, steps: int) -> ContactPair:
+def _contact_pair(rows: Touches, motion: Motion, roles: Roles, steps: int) -> ContactPair:
     """Return the pair of entities that `rows` are contacts of, with means over a window of `steps`."""
     a, b = rows.body[0]
     weight = rows.force + 1e-9

@@ -37,7 +37,7 @@ class Motion:
         rows = [rollout.bodies.index(name) for name in bodies]
         position = np.asarray(rollout.body_position[variant][:steps, rows], dtype=float)
         quaternion = np.asarray(rollout.body_quaternion[variant][:steps, rows], dtype=float)
-        return Motion(timestep, position, rotation_matrix(quaternion))
+        return Motion(timestep, position, _rotation_matrix(quaternion))
 
     @property
     def steps(self) -> int:
@@ -93,7 +93,7 @@ class Touches:
         role = np.array([ORDER[r] for r in roles.body_role])[body]
         force = np.abs(np.einsum("ci,ci->c", np.asarray(log.force[kept], dtype=float), normal))
         step = np.asarray(log.step[kept], dtype=int)
-        rank = body_rank(roles, step, body, role)
+        rank = _body_rank(roles, step, body, role)
         swap = rank[body[:, 0]] > rank[body[:, 1]]
         columns = np.where(swap[:, None], [[1, 0]], [[0, 1]])
         touches = Touches(
@@ -129,7 +129,7 @@ class Touches:
         return self[kept]
 
 
-def body_rank(roles: Roles, step: np.ndarray, body: np.ndarray, role: np.ndarray) -> np.ndarray:
+def _body_rank(roles: Roles, step: np.ndarray, body: np.ndarray, role: np.ndarray) -> np.ndarray:
     """Return the rank of each body, shape (nbody,): robot, objects by time in the robot's hands, world; then name."""
     held = dict.fromkeys(roles.ids("object"), 0)
     for b in held:
@@ -143,7 +143,7 @@ def body_rank(roles: Roles, step: np.ndarray, body: np.ndarray, role: np.ndarray
     return rank
 
 
-def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
+def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     """Return rotation matrices, shape (..., 3, 3), of unit quaternions wxyz, shape (..., 4)."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     rows = [

@@ -110,11 +110,11 @@ def fit_geometry(
             progress(search.progress())
     found = search.result()
     if folder is not None:
-        save_fit(found, folder)
+        _save_fit(found, folder)
     return found
 
 
-def save_fit(fit: FitResult, folder: Path) -> None:
+def _save_fit(fit: FitResult, folder: Path) -> None:
     """Write ``model.toml`` and ``history.json``: why the fit ended, each generation, what gradients did."""
     fit.model.save(folder / "model.toml")
     document = {"stopped": fit.stopped, "generations": fit.history}

@@ -175,7 +175,7 @@ def track_points(
     """
     cfg = cfg or TrackingCfg()
     where = f"{recording.source}, {demonstration.name}"
-    stream = chosen_stream(demonstration, camera, where)
+    stream = _chosen_stream(demonstration, camera, where)
     scene = Scene(recording.scene, recording.source)
     state = demonstration.qpos if qpos is None else qpos
     if state is None or len(state) != scene.model.nq:
@@ -211,7 +211,7 @@ def track_points(
     return replace(demonstration, points={**demonstration.points, **points})
 
 
-def chosen_stream(demonstration: Demonstration, camera: str | None, where: str) -> ImageStream:
+def _chosen_stream(demonstration: Demonstration, camera: str | None, where: str) -> ImageStream:
     """Return the stream of a name, or the only one."""
     names = list(demonstration.image)
     if camera is None and len(names) != 1:

@@ -76,15 +76,15 @@ def consensus(
     winner = np.minimum(distances, tolerance).sum(axis=1).argmin()
     distance, transform = distances[winner], candidates[winner]
     for _ in range(REFITS):
-        agrees = narrowed(distance, tolerance)
+        agrees = _narrowed(distance, tolerance)
         if agrees.sum() < min(count, 4):
             return None
         transform = kabsch(source[agrees], target[agrees])
         distance = np.linalg.norm(moved(transform, source) - target, axis=1)
-    return transform, narrowed(distance, tolerance)
+    return transform, _narrowed(distance, tolerance)
 
 
-def narrowed(distance: np.ndarray, tolerance: float) -> np.ndarray:
+def _narrowed(distance: np.ndarray, tolerance: float) -> np.ndarray:
     """Return which points agree, shape (n,) bool: within `tolerance` and not unlike the others that are, [m]."""
     agrees = distance < tolerance
     if not agrees.any():

@@ -70,7 +70,7 @@ def record(
     scene = cfg.task.build()
     demonstrations, truths = [], []
     for k, seed in enumerate(seeds):
-        demonstration, truth = perform(
+        demonstration, truth = _perform(
             cfg,
             scene,
             f"demo_{k}",
@@ -83,7 +83,7 @@ def record(
     return Recording(scene.xml, tuple(demonstrations), source="reality"), truths
 
 
-def perform(
+def _perform(
     cfg: RealityCfg,
     scene: Scene,
     name: str,
@@ -127,7 +127,7 @@ def perform(
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     log = simulate(cfg.sensing, scene, model, data, path.time, action, effects, rng, progress)
 
-    truth = judge(model, log, task)
+    truth = _judge(model, log, task)
     actions = {model.actuator(i).name: Channel(path.time, action[:, i]) for i in range(model.nu)}
     measured = measure(cfg.sensing, model, np.array(log.time), np.array(log.sensordata), rng)
     points = {
@@ -153,7 +153,7 @@ def perform(
     return demonstration, truth
 
 
-def judge(model: mujoco.MjModel, log: Log, task: ShapeSorterCfg) -> Truth:
+def _judge(model: mujoco.MjModel, log: Log, task: ShapeSorterCfg) -> Truth:
     """Return what truly happened."""
     address = model.sensor_adr[model.sensor("block_position").id]
     position = np.array(log.sensordata)[:, address : address + 3]

@@ -32,12 +32,12 @@ def settle(
     """Let objects and arm come to rest before the recording starts, under the forces of the effects."""
     data.ctrl[:] = ctrl
     for _ in range(round(0.3 / model.opt.timestep)):
-        act(model, data, effects)
+        _act(model, data, effects)
         mujoco.mj_step(model, data)
     data.time = 0.0
 
 
-def act(model: mujoco.MjModel, data: mujoco.MjData, effects: tuple[HiddenEffect, ...]) -> None:
+def _act(model: mujoco.MjModel, data: mujoco.MjData, effects: tuple[HiddenEffect, ...]) -> None:
     """Apply the forces of the effects, and none else, in the next step."""
     data.qfrc_applied[:] = 0
     data.xfrc_applied[:] = 0
@@ -74,13 +74,13 @@ def simulate(
                 ctrl = effect.command(now, ctrl)
         wander = keep * wander + kick * rng.normal(size=model.nu)
         data.ctrl[:] = ctrl + wander
-        act(model, data, effects)
+        _act(model, data, effects)
         qpos = data.qpos.copy()
         mujoco.mj_step(model, data)  # sensors, poses and contacts are those of the state before the step
         log.time.append(now)
         log.qpos.append(qpos)
         log.sensordata.append(data.sensordata.copy())
-        log.pairs.append(touching(model, data))
+        log.pairs.append(_touching(model, data))
         if now >= next_frame - 1e-9:
             next_frame += 1 / sensing.point_rate
             log.frames.append(now)
@@ -95,7 +95,7 @@ def simulate(
     return log
 
 
-def touching(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, str], np.ndarray]:
+def _touching(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[str, str], np.ndarray]:
     """Return the body pairs in contact, in alphabetical order, with the force on the second [N], world frame."""
     pairs: dict[tuple[str, str], np.ndarray] = {}
     force = np.zeros(6)

@@ -37,95 +37,95 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
         return ""
     effects = [e for e in diagnosis.get("effects") or [] if isinstance(e, Mapping)]
     found = ['<section id="diagnosis">', "<h2>What is missing</h2>"]
-    found.append(f'<p class="answer {answer_class(diagnosis)}">{escape(headline(diagnosis))}</p>')
+    found.append(f'<p class="answer {_answer_class(diagnosis)}">{escape(_headline(diagnosis))}</p>')
     if groups := [group for group in diagnosis.get("groups") or [] if len(group) > 1]:
-        found += [f"<p>{escape(group_sentence(group))}</p>" for group in groups]
+        found += [f"<p>{escape(_group_sentence(group))}</p>" for group in groups]
     if effects:
-        found += ["<h3>Held-out error that each effect takes away</h3>", bars(effects)]
-    if parameters := parameter_rows(effects):
+        found += ["<h3>Held-out error that each effect takes away</h3>", _bars(effects)]
+    if parameters := _parameter_rows(effects):
         found += [
             "<h3>Parameters</h3>",
             table(["effect", "parameter", "value", "95 % interval", "unit"], parameters, 2),
         ]
-    if where := places(diagnosis.get("where")):
+    if where := _places(diagnosis.get("where")):
         found += ["<h3>Where it shows</h3>", bullet_list(where)]
-    if limits := detectable_rows(diagnosis.get("detectable")):
+    if limits := _detectable_rows(diagnosis.get("detectable")):
         about = "<summary>Smallest effects that would have been seen</summary>"
         opened = " open" if diagnosis.get("verdict") == "none_needed" else ""
         found.append(f"<details{opened}>{about}{table(['effect', 'size', 'unit'], limits, 1)}</details>")
-    if experiment := sentences(diagnosis.get("next_experiment")):
+    if experiment := _sentences(diagnosis.get("next_experiment")):
         found.append(f'<p class="next"><b>Next experiment</b> {escape(" ".join(experiment))}</p>')
     return "\n".join([*found, "</section>"])
 
 
-def answer_class(diagnosis: Mapping[str, Any]) -> str:
+def _answer_class(diagnosis: Mapping[str, Any]) -> str:
     """Return the style of the headline."""
     kinds = {"effect": "named", "group": "open", "none_needed": "fine", "none_of_these": "lost"}
     return kinds.get(str(diagnosis.get("verdict")), "open")
 
 
-def headline(diagnosis: Mapping[str, Any]) -> str:
+def _headline(diagnosis: Mapping[str, Any]) -> str:
     """Return the answer in one or two sentences."""
     effects = [e for e in diagnosis.get("effects") or [] if isinstance(e, Mapping)]
-    best = [e for e in effects if accepted(e)] or effects[:1]
+    best = [e for e in effects if _accepted(e)] or effects[:1]
     unexplained = diagnosis.get("unexplained")
-    left = "" if not isinstance(unexplained, int | float) else f" {share(unexplained)} of the error stays unexplained."
+    left = "" if not isinstance(unexplained, int | float) else f" {_share(unexplained)} of the error stays unexplained."
     match diagnosis.get("verdict"):
         case "effect" if best:
-            names = listed([words(str(e["name"])) + family_text(e) for e in best])
-            return f"The model lacks {names}. {gain_sentence(best)}{left}"
+            names = _listed([words(str(e["name"])) + _family_text(e) for e in best])
+            return f"The model lacks {names}. {_gain_sentence(best)}{left}"
         case "group":
             group = next((g for g in diagnosis.get("groups") or [] if len(g) > 1), [e["name"] for e in effects])
-            names = listed([words(name) for name in group], "or")
+            names = _listed([words(name) for name in group], "or")
             return f"The model lacks something, and the data cannot tell whether it is {names}.{left}"
         case "none_needed":
             return "No discrepancy was detected: the model explains the measurements down to their noise."
-        case "none_of_these" if any(accepted(e) for e in effects):
+        case "none_of_these" if any(_accepted(e) for e in effects):
             groups = diagnosis.get("groups") or []
             alike = [next((g for g in groups if e["name"] in g), [str(e["name"])]) for e in best]
-            names = listed([listed([words(name) for name in group], "or") for group in alike])
+            names = _listed([_listed([words(name) for name in group], "or") for group in alike])
             lacks = "The model lacks something that none of the effects in the library explains"
-            return f"{lacks}, beside what {names} can account for. {gain_sentence(best)}{left}"
+            return f"{lacks}, beside what {names} can account for. {_gain_sentence(best)}{left}"
         case "none_of_these":
             return f"The model lacks something that none of the effects in the library explains.{left}"
     return f"The diagnosis ended with “{diagnosis.get('verdict')}”.{left}"
 
 
-def gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
+def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
     """Return what the first effects gain on data that their fits have not seen."""
     parts = []
     for e in effects:
-        value, interval = estimate(e.get("gain"), e)
+        value, interval = _estimate(e.get("gain"), e)
         if value is not None:
             what = f"{words(str(e['name']))} " if len(effects) > 1 else "it "
-            p = p_text(e.get("p"))
+            p = _p_text(e.get("p"))
             parts.append(
-                f"{what}takes away {share(value)}{interval_text(interval)} of the error{f' ({p})' if p else ''}"
+                f"{what}takes away {_share(value)}{_interval_text(interval)} of the error{f' ({p})' if p else ''}"
             )
     return f"On data that the fit has not seen, {', '.join(parts)}." if parts else ""
 
 
-def family_text(effect: Mapping[str, Any]) -> str:
+def _family_text(effect: Mapping[str, Any]) -> str:
     """Return the family of an effect in brackets, empty where it is not given."""
     family = str(effect.get("family") or "")
     return f" ({FAMILIES.get(family, family)})" if family else ""
 
 
-def group_sentence(group: Sequence[str]) -> str:
+def _group_sentence(group: Sequence[str]) -> str:
     """Return a sentence on effects that cannot be told apart."""
-    return f"These data cannot tell {listed([words(name) for name in group], 'from')} apart."
+    return f"These data cannot tell {_listed([words(name) for name in group], 'from')} apart."
 
 
-def accepted(effect: Mapping[str, Any]) -> bool:
+def _accepted(effect: Mapping[str, Any]) -> bool:
     """Return whether the diagnosis accepted an effect."""
     if "accepted" in effect:
         return bool(effect["accepted"])
-    value, interval = estimate(effect.get("gain"), effect)
+    value, interval = _estimate(effect.get("gain"), effect)
     low = value if interval is None else interval[0]
     return low is not None and low > 0 and isinstance(effect.get("p"), int | float) and effect["p"] < SIGNIFICANT
 
 
-def estimate(value: Any, owner: Mapping[str, Any]) -> tuple[float | None, tuple[float, float] | None]:
+def _estimate(value: Any, owner: Mapping[str, Any]) -> tuple[float | None, tuple[float, float] | None]:
     """Return a number and its interval, given as an object with `value` and `interval`, or beside each other."""
     interval = owner.get("gain_interval", owner.get("interval"))
     if isinstance(value, Mapping):
@@ -137,9 +137,9 @@ def estimate(value: Any, owner: Mapping[str, Any]) -> tuple[float | None, tuple[
     return number, (float(ends[0]), float(ends[1]))
 
 
-def bars(effects: Sequence[Mapping[str, Any]]) -> str:
+def _bars(effects: Sequence[Mapping[str, Any]]) -> str:
     """Return a bar for each effect with its interval; what lies beyond `MOST_EFFECTS` is folded away."""
-    gains = [estimate(e.get("gain"), e) for e in effects]
+    gains = [_estimate(e.get("gain"), e) for e in effects]
     ends = [end for value, interval in gains if value is not None for end in (value, *(interval or ()))]
     low, high = min([0.0, *ends]), max([0.01, *ends])
     span = high - low
@@ -154,15 +154,15 @@ def bars(effects: Sequence[Mapping[str, Any]]) -> str:
         if value is not None:
             start, end = sorted((0.0, value))
             marks += f'<i class="gain" style="left:{at(start)};width:{100 * (end - start) / span:.2f}%"></i>'
-            text = share(value) + interval_text(interval)
+            text = _share(value) + _interval_text(interval)
         if interval is not None:
             width = f"{100 * (interval[1] - interval[0]) / span:.2f}%"
             marks += f'<i class="whisker" style="left:{at(interval[0])};width:{width}"></i>'
-        style = "accepted" if accepted(e) else "rejected"
+        style = "accepted" if _accepted(e) else "rejected"
         name = escape(words(str(e.get("name", "?"))))
         rows.append(
             f'<div class="effect {style}"><span class="name">{name}</span><span class="track">{marks}</span>'
-            f'<span class="figure">{text} <span class="quiet">{p_text(e.get("p"))}</span></span></div>'
+            f'<span class="figure">{text} <span class="quiet">{_p_text(e.get("p"))}</span></span></div>'
         )
     shown = f'<div class="bars">{"".join(rows[:MOST_EFFECTS])}</div>'
     if rest := rows[MOST_EFFECTS:]:
@@ -170,15 +170,15 @@ def bars(effects: Sequence[Mapping[str, Any]]) -> str:
     return shown
 
 
-def parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
+def _parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Return the rows of the table of parameters of accepted effects, of the best where none was accepted."""
     rows: list[Row] = []
-    for e in [e for e in effects if accepted(e)] or effects[:1]:
+    for e in [e for e in effects if _accepted(e)] or effects[:1]:
         given = e.get("parameters") or []
         if isinstance(given, Mapping):
             given = [{"name": name, **(p if isinstance(p, Mapping) else {"value": p})} for name, p in given.items()]
         for k, p in enumerate(given):
-            value, interval = estimate(p.get("value"), p)
+            value, interval = _estimate(p.get("value"), p)
             ends = "-" if interval is None else f"{interval[0]:.4g} to {interval[1]:.4g}"
             name = escape(words(str(e.get("name", "?")))) if k == 0 else ""
             number = "-" if value is None else f"<b>{value:.4g}</b>"
@@ -186,37 +186,37 @@ def parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
     return rows
 
 
-def detectable_rows(given: Any) -> list[Row]:
+def _detectable_rows(given: Any) -> list[Row]:
     """Return the rows of the table of the smallest effects that would have been seen."""
     if isinstance(given, Mapping):
         given = [{"name": name, **(v if isinstance(v, Mapping) else {"value": v})} for name, v in given.items()]
     rows: list[Row] = []
     for item in given or []:
-        value, _ = estimate(item.get("value", item.get("size")), {})
+        value, _ = _estimate(item.get("value", item.get("size")), {})
         name = escape(words(str(item.get("name", item.get("effect", "?")))))
         rows.append(("", [name, "-" if value is None else f"{value:.3g}", escape(str(item.get("unit", "")))]))
     return rows
 
 
-def places(given: Any) -> list[str]:
+def _places(given: Any) -> list[str]:
     """Return where a diagnosis sees the effect as sentences: objects with a channel, a phase, a time span and so on."""
     items = [given] if isinstance(given, Mapping | str) else list(given or [])
     found = []
     for item in items:
         if not isinstance(item, Mapping) or "sentence" in item:
-            found += sentences(item)
+            found += _sentences(item)
             continue
         span = item.get("span") or item.get("time") or [item.get("start"), item.get("end")]
         ends = [end for end in span if isinstance(end, int | float)] if isinstance(span, Sequence) else []
         parts = [words(str(item[key])) for key in ("channel", "body") if item.get(key)]
         parts += [f"{item['phase']} phase"] if item.get("phase") else []
         parts += [f"{ends[0]:.2f}-{ends[1]:.2f} s"] if len(ends) == 2 else []
-        parts += [plain(item["direction"])] if item.get("direction") else []
+        parts += [_plain(item["direction"])] if item.get("direction") else []
         found += [", ".join(parts)] if parts else []
     return found
 
 
-def sentences(given: Any) -> list[str]:
+def _sentences(given: Any) -> list[str]:
     """Return text, an object or a list of either as sentences."""
     if not given:
         return []
@@ -225,16 +225,16 @@ def sentences(given: Any) -> list[str]:
     if isinstance(given, Mapping):
         if text := given.get("sentence") or given.get("words"):
             return [str(text)]
-        return [", ".join(f"{words(str(k))}: {plain(v)}" for k, v in given.items() if v not in (None, "", []))]
-    return [text for item in given for text in sentences(item)]
+        return [", ".join(f"{words(str(k))}: {_plain(v)}" for k, v in given.items() if v not in (None, "", []))]
+    return [text for item in given for text in _sentences(item)]
 
 
-def plain(value: Any) -> str:
+def _plain(value: Any) -> str:
     """Return a value of a JSON object as text."""
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(map(plain, value))
+        return ", ".join(map(_plain, value))
     return words(str(value))
 
 
@@ -243,22 +243,22 @@ def bullet_list(lines: Sequence[str]) -> str:
     return f'<ul class="plain">{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>'
 
 
-def listed(names: Sequence[str], last: str = "and") -> str:
+def _listed(names: Sequence[str], last: str = "and") -> str:
     """Return names as "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}" if names else "something"
 
 
-def share(value: float) -> str:
+def _share(value: float) -> str:
     """Return a share in whole percent."""
     return f"{100 * value:.0f} %"
 
 
-def interval_text(interval: tuple[float, float] | None) -> str:
+def _interval_text(interval: tuple[float, float] | None) -> str:
     """Return an interval of shares in percent, in brackets and with a space before it."""
     return "" if interval is None else f" [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
 
 
-def p_text(p: Any) -> str:
+def _p_text(p: Any) -> str:
     """Return a p value as text."""
     if not isinstance(p, int | float):
         return ""

@@ -51,13 +51,13 @@ def cards(
     found = []
     if seen:
         suffix = " (demonstrations that were fitted)" if unseen else ""
-        found.append(error_card(comparison, where + suffix, channel, phases, seen))
+        found.append(_error_card(comparison, where + suffix, channel, phases, seen))
     if unseen:
-        found.append(error_card(comparison, where + " (demonstrations not seen by the fit)", channel, phases, unseen))
+        found.append(_error_card(comparison, where + " (demonstrations not seen by the fit)", channel, phases, unseen))
     if overlap:
         ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
         if ends:
-            figure = arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
+            figure = _arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
             found.append(Card("Overlap (IoU) of object contact with the truth; 1 is perfect", figure))
     if comparison.staged and any(sequence.stages for sequence in events.values()):
         counts = sorted({len(sequence.stages) for sequence in events.values()})
@@ -78,7 +78,7 @@ def cards(
     return found
 
 
-def above_noise(summary: Summary) -> str:
+def _above_noise(summary: Summary) -> str:
     """Return how far a mean error stands above the noise, as the end of a sentence; empty where it cannot be told."""
     if summary.ratio is None or not np.isfinite(summary.ratio):
         return ""
@@ -87,7 +87,7 @@ def above_noise(summary: Summary) -> str:
     return f", {times(summary.ratio)} what the measurement noise alone would leave"
 
 
-def error_card(
+def _error_card(
     comparison: Comparison, what: str, channel: str, phases: tuple[str, ...], demonstrations: tuple[str, ...]
 ) -> Card:
     """Return the card of an error before and after."""
@@ -105,10 +105,10 @@ def error_card(
         if np.isfinite(found.low):
             low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
             note += f", difference {low} to {high} {unit} (95 %)"
-    return Card(what, arrow([shown(before.mean, before.unit), shown(after.mean, after.unit)], unit), note)
+    return Card(what, _arrow([shown(before.mean, before.unit), shown(after.mean, after.unit)], unit), note)
 
 
-def arrow(ends: Sequence[str], unit: str) -> str:
+def _arrow(ends: Sequence[str], unit: str) -> str:
     """Return two figures with an arrow between them as HTML."""
     tail = f" <small>{unit}</small>" if unit else ""
     return f'<span class="from">{ends[0]}</span><span class="arrow">→</span><span class="to">{ends[1]}</span>{tail}'
@@ -124,7 +124,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
         return f"The simulation of “{comparison.after}” does not stay finite: see the table for when it diverges."
     if len(comparison.models) < 2:
         text = f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}"
-        return f"{text}{above_noise(after)}."
+        return f"{text}{_above_noise(after)}."
     before = comparison.summarise(comparison.before, channel, phases)
     found = comparison.difference(channel, phases)
     change = {
@@ -134,7 +134,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
     }[found.verdict]
     text = (
         f"The error of {words(channel)}{during} {change}: {shown(before.mean, before.unit)} {unit} "
-        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{above_noise(after)}."
+        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{_above_noise(after)}."
     )
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)

@@ -156,8 +156,8 @@ class LiveView:
                 continue
             self._frames[body] = self._server.scene.add_frame(f"/body{body}", show_axes=False)
             for g in visible:
-                vertices, faces = surface(m, g)
-                rgba = colour_of(m, g)
+                vertices, faces = _surface(m, g)
+                rgba = _colour_of(m, g)
                 opacity = GLASS if name in glass else float(rgba[3])
                 handle = self._server.scene.add_mesh_simple(
                     f"/body{body}/geom{g}",
@@ -286,13 +286,13 @@ class LiveView:
                 handle.visible = self._shows_targets.value
 
 
-def colour_of(m: mujoco.MjModel, g: int) -> np.ndarray:
+def _colour_of(m: mujoco.MjModel, g: int) -> np.ndarray:
     """Return the colour of a geom, red, green, blue and opacity in 0..1, shape (4,)."""
     material = m.geom_matid[g]
     return np.array(m.mat_rgba[material] if material >= 0 else m.geom_rgba[g])
 
 
-def surface(m: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray]:
+def _surface(m: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [m], shape (V, 3), in the geom's frame, and triangles, shape (F, 3), of a geom."""
     import trimesh
 

@@ -43,12 +43,12 @@ def motion_data(
         pose = np.concatenate([rollout.body_position[0], rollout.body_quaternion[0]], axis=2)
         poses[name], qpos = packed(pose[rows]), rollout.qpos[0][rows]
     compiled = list(models.values())[-1].scene.model
-    measured = measured_poses(compiled, demonstration, time)
-    measured = {**measured_links(compiled, demonstration, time, qpos, measured), **measured}
+    measured = _measured_poses(compiled, demonstration, time)
+    measured = {**_measured_links(compiled, demonstration, time, qpos, measured), **measured}
     points = {
-        body: point_data(track)
+        body: _point_data(track)
         for body, track in demonstration.points.items()
-        if body not in measured and moves(compiled, body)
+        if body not in measured and _moves(compiled, body)
     }
     return {
         "time": packed(time),
@@ -58,7 +58,7 @@ def motion_data(
     }
 
 
-def measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time: np.ndarray) -> dict[str, np.ndarray]:
+def _measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time: np.ndarray) -> dict[str, np.ndarray]:
     """Return the measured poses (T, 7) at `time` (T,) of the bodies that move and were measured in full."""
     found: dict[str, dict[int, Channel]] = {}
     for name, channel in demonstration.measured.items():
@@ -70,14 +70,14 @@ def measured_poses(compiled: mujoco.MjModel, demonstration: Demonstration, time:
     for body, channels in found.items():
         position = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEPOS))
         rotation = channels.get(int(mujoco.mjtSensor.mjSENS_FRAMEQUAT))
-        if position is not None and rotation is not None and moves(compiled, body):
-            quaternion = resampled(rotation, time, align=True)
+        if position is not None and rotation is not None and _moves(compiled, body):
+            quaternion = _resampled(rotation, time, align=True)
             quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-            poses[body] = np.concatenate([resampled(position, time), quaternion], axis=1)
+            poses[body] = np.concatenate([_resampled(position, time), quaternion], axis=1)
     return poses
 
 
-def measured_links(
+def _measured_links(
     compiled: mujoco.MjModel,
     demonstration: Demonstration,
     time: np.ndarray,
@@ -99,7 +99,7 @@ def measured_links(
         row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
         if row >= 0 and compiled.sensor_type[row] == mujoco.mjtSensor.mjSENS_JOINTPOS:
             joint = int(compiled.sensor_objid[row])
-            state[:, compiled.jnt_qposadr[joint]] = resampled(channel, time)[:, 0]
+            state[:, compiled.jnt_qposadr[joint]] = _resampled(channel, time)[:, 0]
             known[compiled.jnt_bodyid[joint]] = True
     for body, pose in free.items():
         joint = int(compiled.body_jntadr[compiled.body(body).id])
@@ -119,7 +119,7 @@ def measured_links(
     return {compiled.body(b).name or f"body{b}": poses[:, b] for b in np.flatnonzero(known)}
 
 
-def resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.ndarray:
+def _resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.ndarray:
     """Return a channel at other times, shape (T, dim); NaN before its first and after its last reading.
 
     Gaps are bridged. `align` flips quaternions to one side.
@@ -138,7 +138,7 @@ def resampled(channel: Channel, time: np.ndarray, *, align: bool = False) -> np.
     return found
 
 
-def point_data(track: PointTrack) -> dict[str, Any]:
+def _point_data(track: PointTrack) -> dict[str, Any]:
     """Return the tracked points of a body, thinned in number and time."""
     frames = np.unique(np.linspace(0, len(track.time) - 1, min(len(track.time), MOST_FRAMES // 2)).astype(int))
     chosen = np.unique(np.linspace(0, track.value.shape[1] - 1, min(track.value.shape[1], MOST_POINTS)).astype(int))
@@ -146,7 +146,7 @@ def point_data(track: PointTrack) -> dict[str, Any]:
     return {"time": packed(track.time[frames]), "xyz": packed(value), "count": len(chosen)}
 
 
-def moves(compiled: mujoco.MjModel, body: str) -> bool:
+def _moves(compiled: mujoco.MjModel, body: str) -> bool:
     """Return whether a body can move."""
     row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_BODY, body)
     return row >= 0 and compiled.body_weldid[row] != 0

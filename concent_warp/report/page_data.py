@@ -47,9 +47,9 @@ def page_data(
             "name": d.name,
             "duration": d.duration,
             "measured_until": max((float(c.time[-1]) for c in [*d.measured.values(), *d.points.values()]), default=0.0),
-            "phases": phase_bands(comparison, d),
-            "channels": channel_lines(comparison, d.name),
-            "schedule": schedule_data(events[d.name]) if d.name in events else None,
+            "phases": _phase_bands(comparison, d),
+            "channels": _channel_lines(comparison, d.name),
+            "schedule": _schedule_data(events[d.name]) if d.name in events else None,
             "motion": motion_data(models, engines, d, names),
         }
         for d in demonstrations
@@ -62,12 +62,12 @@ def page_data(
         "geometry": geometry_data(models, events),
         "demonstrations": found,
         "history": [] if fit is None else fit.history,
-        "view": camera_views(last, demonstrations[0]),
-        "places": [place_data(comparison, number, place) for number, place in numbered(comparison)],
+        "view": _camera_views(last, demonstrations[0]),
+        "places": [_place_data(comparison, number, place) for number, place in numbered(comparison)],
     }
 
 
-def place_data(comparison: Comparison, number: int, place: Place) -> dict[str, Any]:
+def _place_data(comparison: Comparison, number: int, place: Place) -> dict[str, Any]:
     """Return what the page shows of a place: where it is in time and on which body, and which way it points."""
     found = [comparison.residual(comparison.after, place.demonstration, channel) for channel in place.channels]
     shift = next((r for r in found if r is not None and r.kind in ("position", "points")), None)
@@ -88,7 +88,7 @@ def place_data(comparison: Comparison, number: int, place: Place) -> dict[str, A
     }
 
 
-def phase_bands(comparison: Comparison, demonstration: Demonstration) -> list[dict[str, Any]]:
+def _phase_bands(comparison: Comparison, demonstration: Demonstration) -> list[dict[str, Any]]:
     """Return the phases of a demonstration with the number of their colour."""
     found = []
     for phase in comparison.phases.get(demonstration.name, ()):
@@ -100,7 +100,7 @@ def phase_bands(comparison: Comparison, demonstration: Demonstration) -> list[di
     return found
 
 
-def channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str, Any]]:
+def _channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str, Any]]:
     """Return the errors of every channel of a demonstration over time."""
     found = []
     for channel in ordered_channels(comparison):
@@ -124,7 +124,7 @@ def channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str, 
     return found
 
 
-def schedule_data(sequence: ContactEventSequence) -> dict[str, Any]:
+def _schedule_data(sequence: ContactEventSequence) -> dict[str, Any]:
     """Return rows, bars, stages and target events of a contact schedule."""
     entity = sequence.entity
     role = {e.body: e.role for e in sequence.entities}
@@ -159,7 +159,7 @@ def schedule_data(sequence: ContactEventSequence) -> dict[str, Any]:
     return {"rows": rows, "targets": targets, "stages": stages}
 
 
-def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
+def _camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
     """Return where the camera of the replay may stand: before the whole scene, or with an object.
 
     Distances follow from the sizes of the objects and from how far apart they are at the start.
@@ -171,7 +171,7 @@ def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
     objects = {name: compiled.body(name).id for name in model.scene.objects() if name}
     moving = [i for i in range(1, compiled.nbody) if compiled.body_weldid[i] != 0] or list(range(1, compiled.nbody))
     objects = objects or {compiled.body(i).name or f"body{i}": i for i in moving}
-    size = {name: extent(compiled, i) for name, i in objects.items()}
+    size = {name: _extent(compiled, i) for name, i in objects.items()}
     places = np.array([data.xpos[i] for i in objects.values()])
     spread = float(np.linalg.norm(np.ptp(places, axis=0))) + max(size.values())
     return {
@@ -182,7 +182,7 @@ def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
     }
 
 
-def extent(compiled: mujoco.MjModel, body: int) -> float:
+def _extent(compiled: mujoco.MjModel, body: int) -> float:
     """Return the radius of a ball about a body's frame that holds its geoms [m]; 0.05 where it has none."""
     mine = (compiled.geom_bodyid == body) & (compiled.geom_rbound > 0)
     if not mine.any():

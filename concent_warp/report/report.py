@@ -72,99 +72,99 @@ def write_report(
     shown_models = {name: comparison.models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
     chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
     data = page_data(shown_models, chosen, comparison, events, fit)
-    data["forces"] = forces(data, location)
+    data["forces"] = _forces(data, location)
     parts = {
-        "title": escape(title(recording, fit)),
-        "subtitle": escape(subtitle(recording, comparison, fitted)),
+        "title": escape(_title(recording, fit)),
+        "subtitle": escape(_subtitle(recording, comparison, fitted)),
         "verdict": escape(verdict(comparison, fitted, overlap)),
         "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap)),
-        "demonstration_options": options([d.name for d in chosen]),
-        "channel_options": options(ordered_channels(comparison)),
+        "demonstration_options": _options([d.name for d in chosen]),
+        "channel_options": _options(ordered_channels(comparison)),
         "model_keys": "".join(
             f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
         )
         + '<span class="key noise"></span>noise floor',
         "diagnosis": diagnosis_section(diagnosis),
-        "where": where_section(comparison, [d.name for d in chosen]),
+        "where": _where_section(comparison, [d.name for d in chosen]),
         "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (
             "How far the simulation is from the measurement at each instant of the replay. The bands are "
-            f"{bands(comparison)}, found in the replay of the last model; numbers mark the worst places. "
+            f"{_bands(comparison)}, found in the replay of the last model; numbers mark the worst places. "
             "Click to move the replay to that instant."
         ),
-        "schedule": page_file("schedule.html") if events else "",
+        "schedule": _page_file("schedule.html") if events else "",
         "replay_about": (
             "The recorded commands, replayed open loop from the recorded initial state. "
             "Green: the measured pose of the objects, or the tracked points where no pose was measured."
         ),
-        "follow_options": options(follow_order(data, comparison)) + '<option value="">the scene</option>',
-        "replay_views": views("replay", comparison, shown_models),
+        "follow_options": _options(_follow_order(data, comparison)) + '<option value="">the scene</option>',
+        "replay_views": _views("replay", comparison, shown_models),
         "sphere_switch": SPHERE_SWITCH if data["geometry"] else "",
-        "forces": forces_section(data["forces"], location),
-        "geometry": geometry_section(data, comparison, shown_models),
-        "fit": fit_section(fit),
+        "forces": _forces_section(data["forces"], location),
+        "geometry": _geometry_section(data, comparison, shown_models),
+        "fit": _fit_section(fit),
         "tables_about": escape(
             f"Mean error over time with its 95 % interval ({RULE}); RMS, 95th percentile, largest error and noise "
             f"floor of “{comparison.after}”. Green and red changes are those whose interval excludes none."
         ),
-        "tables": tables(comparison, fitted, overlap),
+        "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),
-        "footer": escape(f"Written by concent {concent_warp.__version__}. {left_out(comparison)}"),
-        "data": script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
-        "style": page_file("style.css"),
-        "script": "\n".join(page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
+        "footer": escape(f"Written by concent {concent_warp.__version__}. {_left_out(comparison)}"),
+        "data": _script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
+        "style": _page_file("style.css"),
+        "script": "\n".join(_page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
     }
-    write_text(path, filled(page_file("page.html"), parts))
+    write_text(path, _filled(_page_file("page.html"), parts))
 
 
-def follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
+def _follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
     """Return the objects that the camera can go with, first the one that the main channel is about."""
     main = comparison.main_channel()
     about = {r.body for d in comparison.demonstrations if (r := comparison.residual(comparison.before, d, main))}
     return sorted(data["view"]["bodies"], key=lambda name: name not in about)
 
 
-def where_section(comparison: Comparison, shown: Sequence[str]) -> str:
+def _where_section(comparison: Comparison, shown: Sequence[str]) -> str:
     """Return the section that says where the last model fails."""
     strips = ""
     if len(comparison.models) > 1:
         strips = f" The upper strip is “{comparison.before}”, the lower one “{comparison.after}”."
     about = (
         f"Every channel over time, coloured by how far its error stands above the measurement noise.{strips} Bands are "
-        f"{bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
+        f"{_bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
     )
-    return filled(page_file("where.html"), {"about": escape(about), "places": place_list(comparison, shown)})
+    return _filled(_page_file("where.html"), {"about": escape(about), "places": place_list(comparison, shown)})
 
 
-def bands(comparison: Comparison) -> str:
+def _bands(comparison: Comparison) -> str:
     """Return what the phases of a comparison are."""
     return "the contact stages" if comparison.staged else "the ways of moving"
 
 
-def forces(data: Mapping[str, Any], location: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+def _forces(data: Mapping[str, Any], location: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """Return the unexplained forces that can be drawn: those on bodies of the scene."""
     known = {body["name"] for body in data["bodies"]}
     return [dict(arrow) for arrow in (location or {}).get("arrows", ()) if arrow["body"] in known]
 
 
-def forces_section(arrows: Sequence[Mapping[str, Any]], location: Mapping[str, Any] | None) -> str:
+def _forces_section(arrows: Sequence[Mapping[str, Any]], location: Mapping[str, Any] | None) -> str:
     """Return the section of unexplained forces, empty where they were not looked for."""
     if not location:
         return ""
     bodies = list(dict.fromkeys(arrow["body"] for arrow in arrows))
-    view = filled(page_file("forces_view.html"), {"bodies": options(bodies)}) if bodies else ""
-    return filled(page_file("forces.html"), {"views": view, "sentences": bullet_list(location.get("sentences", ()))})
+    view = _filled(_page_file("forces_view.html"), {"bodies": _options(bodies)}) if bodies else ""
+    return _filled(_page_file("forces.html"), {"views": view, "sentences": bullet_list(location.get("sentences", ()))})
 
 
-def geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:
+def _geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:
     """Return the section of the contact geometry, empty where there is none to show."""
     if not data["geometry"]:
         return ""
-    bodies = options(data["geometry"]["bodies"])
-    return filled(page_file("geometry.html"), {"bodies": bodies, "views": views("geometry", comparison, models)})
+    bodies = _options(data["geometry"]["bodies"])
+    return _filled(_page_file("geometry.html"), {"bodies": bodies, "views": _views("geometry", comparison, models)})
 
 
-def fit_section(fit: FitResult | None) -> str:
+def _fit_section(fit: FitResult | None) -> str:
     """Return the section of the fit, empty where there was none."""
     if fit is None or not fit.history:
         return ""
@@ -173,10 +173,10 @@ def fit_section(fit: FitResult | None) -> str:
         f"{len(fit.history)} generations, {last['simulations']:,} simulations in {last['seconds']:.0f} s; "
         f"ended because: {fit.stopped}. {int(fit.mask.sum())} of {len(fit.mask)} spheres have moved."
     )
-    return filled(page_file("fit.html"), {"text": escape(text)})
+    return _filled(_page_file("fit.html"), {"text": escape(text)})
 
 
-def tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
+def _tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
     """Return all tables: objects by phase, demonstrations, and everything else folded away."""
     objects = comparison.object_channels
     others = [c for c in comparison.channels if c not in objects]
@@ -192,7 +192,7 @@ def tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, 
     return "\n".join(parts)
 
 
-def views(name: str, comparison: Comparison, models: Mapping[str, Model]) -> str:
+def _views(name: str, comparison: Comparison, models: Mapping[str, Model]) -> str:
     """Return a canvas for each model shown."""
     return "".join(
         f'<figure><figcaption><span class="{kind_of(comparison, model)}">{escape(model)}</span></figcaption>'
@@ -201,13 +201,13 @@ def views(name: str, comparison: Comparison, models: Mapping[str, Model]) -> str
     )
 
 
-def title(recording: Recording, fit: FitResult | None) -> str:
+def _title(recording: Recording, fit: FitResult | None) -> str:
     """Return the title of the page."""
     task = next((d.task for d in recording.demonstrations if d.task), "")
     return ("Grounded simulation" if fit is not None else "Model against measurement") + (f": {task}" if task else "")
 
 
-def subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]) -> str:
+def _subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]) -> str:
     """Return what the report is about."""
     number = len(comparison.demonstrations)
     length = sum(recording[name].duration for name in comparison.demonstrations)
@@ -215,7 +215,7 @@ def subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str]
     return text + (f"; the fit has seen {', '.join(fitted)}" if fitted else "")
 
 
-def left_out(comparison: Comparison) -> str:
+def _left_out(comparison: Comparison) -> str:
     """Return which demonstrations have no charts."""
     more = len(comparison.demonstrations) - MOST_DEMONSTRATIONS
     return (
@@ -225,22 +225,22 @@ def left_out(comparison: Comparison) -> str:
     )
 
 
-def options(names: Sequence[str]) -> str:
+def _options(names: Sequence[str]) -> str:
     """Return the options of a list to choose from."""
     return "".join(f'<option value="{escape(name)}">{escape(name)}</option>' for name in names)
 
 
-def page_file(name: str) -> str:
+def _page_file(name: str) -> str:
     """Return a file of the page that comes with this package."""
     return files("concent_warp.report").joinpath("page", name).read_text(encoding="utf-8")
 
 
-def filled(template: str, parts: Mapping[str, str]) -> str:
+def _filled(template: str, parts: Mapping[str, str]) -> str:
     """Return a template with every ``[[name]]`` replaced, in one pass: what is put in is not looked at again."""
     return re.sub(r"\[\[(\w+)\]\]", lambda found: parts[found[1]], template)
 
 
-def script_safe(text: str) -> str:
+def _script_safe(text: str) -> str:
     """Return JSON that cannot end the script element that it stands in."""
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 

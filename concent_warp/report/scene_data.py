@@ -47,16 +47,16 @@ def scene_bodies(compiled: mujoco.MjModel) -> tuple[list[dict[str, Any]], dict[s
         start = compiled.body_geomadr[b]
         rows = range(start, start + compiled.body_geomnum[b]) if start >= 0 else range(0)
         visible = [g for g in rows if compiled.geom_group[g] < VISIBLE_GROUPS] or list(rows)
-        geoms = [geom_data(compiled, g) for g in visible if int(compiled.geom_type[g]) in SHAPES]
+        geoms = [_geom_data(compiled, g) for g in visible if int(compiled.geom_type[g]) in SHAPES]
         if geoms:
             bodies.append({"name": compiled.body(b).name or f"body{b}", "id": b, "geoms": geoms})
         for geom in geoms:
             if (name := geom.get("mesh")) is not None and name not in meshes:
-                meshes[name] = mesh_data(compiled, int(name))
+                meshes[name] = _mesh_data(compiled, int(name))
     return bodies, meshes
 
 
-def geom_data(compiled: mujoco.MjModel, g: int) -> dict[str, Any]:
+def _geom_data(compiled: mujoco.MjModel, g: int) -> dict[str, Any]:
     """Return one geom: shape, half sizes [m], pose in the body frame, colour."""
     kind = int(compiled.geom_type[g])
     size = np.array(compiled.geom_size[g])
@@ -67,19 +67,19 @@ def geom_data(compiled: mujoco.MjModel, g: int) -> dict[str, Any]:
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
         half = np.where(size[:2] > 0, np.minimum(size[:2], PLANE_HALF_SIZE), PLANE_HALF_SIZE)
         size = np.array([*half, 1e-3])
-        position = position - 1e-3 * rotation(compiled.geom_quat[g])[:, 2]
+        position = position - 1e-3 * _rotation(compiled.geom_quat[g])[:, 2]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         data["mesh"] = str(int(compiled.geom_dataid[g]))
     data |= {
-        "size": rounded(size),
-        "position": rounded(position),
-        "quaternion": rounded(compiled.geom_quat[g]),
-        "colour": [*rounded(colour[:3]), 1.0 if colour[3] > 0.95 else round(float(max(colour[3], 0.25)), 3)],
+        "size": _rounded(size),
+        "position": _rounded(position),
+        "quaternion": _rounded(compiled.geom_quat[g]),
+        "colour": [*_rounded(colour[:3]), 1.0 if colour[3] > 0.95 else round(float(max(colour[3], 0.25)), 3)],
     }
     return data
 
 
-def mesh_data(compiled: mujoco.MjModel, mesh: int) -> dict[str, Any]:
+def _mesh_data(compiled: mujoco.MjModel, mesh: int) -> dict[str, Any]:
     """Return a mesh as the page has it."""
     vertices, faces = mesh_arrays(compiled, mesh)
     return {"vertices": packed(vertices), "faces": packed(faces.ravel())}
@@ -108,12 +108,12 @@ def geometry_data(
     if first is None or last is None or first.bodies != last.bodies or len(first) != len(last):
         return None
     moved = np.linalg.norm(last.position - first.position, axis=1)
-    touched, gripped = touched_spheres(events or {}, len(last))
+    touched, gripped = _touched_spheres(events or {}, len(last))
     state = np.select([moved > MOVED, gripped, touched], ["moved", "gripped", "touched"], "other")
     data: dict[str, Any] = {
         "bodies": sorted(last.bodies, key=lambda name: -int((state[last.of(name)] == "moved").sum())),
         "state": state.tolist(),
-        "facts": {body: facts(last, body, moved, touched, gripped) for body in last.bodies},
+        "facts": {body: _facts(last, body, moved, touched, gripped) for body in last.bodies},
     }
     for name, geometry in ((names[0], first), (names[-1], last)):
         data[name] = {
@@ -124,7 +124,7 @@ def geometry_data(
     return data
 
 
-def touched_spheres(events: Mapping[str, ContactEventSequence], count: int) -> tuple[np.ndarray, np.ndarray]:
+def _touched_spheres(events: Mapping[str, ContactEventSequence], count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return which spheres touched anything, and which the robot touched, in any demonstration, (S,) bool each."""
     touched, gripped = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     for sequence in events.values():
@@ -137,7 +137,7 @@ def touched_spheres(events: Mapping[str, ContactEventSequence], count: int) -> t
     return touched, gripped
 
 
-def facts(geometry: ContactGeometry, body: str, moved: np.ndarray, touched: np.ndarray, gripped: np.ndarray) -> str:
+def _facts(geometry: ContactGeometry, body: str, moved: np.ndarray, touched: np.ndarray, gripped: np.ndarray) -> str:
     """Return a line on the spheres of a body."""
     rows = geometry.of(body)
     far = moved[rows][moved[rows] > MOVED] * 1e3
@@ -148,13 +148,13 @@ def facts(geometry: ContactGeometry, body: str, moved: np.ndarray, touched: np.n
     return f"{text}; {by_robot} touched by the robot, {(touched & ~gripped)[rows].sum()} by other things alone."
 
 
-def rotation(quaternion: np.ndarray) -> np.ndarray:
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a quaternion wxyz."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)
 
 
-def rounded(values: np.ndarray) -> list[float]:
+def _rounded(values: np.ndarray) -> list[float]:
     """Return numbers with six digits after the point."""
     return [round(float(v), 6) for v in values]

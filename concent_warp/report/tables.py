@@ -27,7 +27,7 @@ def table(header: Sequence[str], rows: Sequence[Row], numbers_from: int) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def mean_cell(summary: Summary) -> str:
+def _mean_cell(summary: Summary) -> str:
     """Return a mean with its interval."""
     mean = shown(summary.mean, summary.unit)
     if not np.isfinite(summary.low):
@@ -36,7 +36,7 @@ def mean_cell(summary: Summary) -> str:
     return f'{mean} <span class="interval">[{low}, {high}]</span>'
 
 
-def change_cell(
+def _change_cell(
     comparison: Comparison, channel: str, phase: tuple[str, ...], demonstrations: tuple[str, ...] = ()
 ) -> str:
     """Return the relative change of the mean error, coloured where it is more than chance."""
@@ -62,8 +62,8 @@ def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool
         if not last.count:
             continue
         name = escape(phase[0]) if phase else f"<b>{escape(channel)}</b>"
-        cells = [name, unit_shown(last.unit), str(last.count), *map(mean_cell, summaries)]
-        cells += [change_cell(comparison, channel, phase)] if several else []
+        cells = [name, unit_shown(last.unit), str(last.count), *map(_mean_cell, summaries)]
+        cells += [_change_cell(comparison, channel, phase)] if several else []
         cells += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
         rows.append(("phase-row" if phase else "", cells))
     return table(header, rows, 2)
@@ -83,8 +83,8 @@ def demonstration_table(
     for d in comparison.demonstrations:
         role = "" if not fitted else "fitted" if d in fitted else "not seen"
         cells = [escape(d), role]
-        cells += [mean_cell(comparison.summarise(model, channel, phases, (d,))) for model in comparison.models]
-        cells += [change_cell(comparison, channel, phases, (d,))] if several else []
+        cells += [_mean_cell(comparison.summarise(model, channel, phases, (d,))) for model in comparison.models]
+        cells += [_change_cell(comparison, channel, phases, (d,))] if several else []
         cells += [f"{values[d]:.2f}" if d in values else "-" for values in overlap.values()]
         rows.append(("", cells))
     return table(header, rows, 2)

@@ -145,7 +145,7 @@ def panda() -> mujoco.MjSpec:
     body = spec.worldbody.add_body(name="link0")
     base = body.add_geom(name="link0", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[-0.06, 0, 0.06, 0, 0, 0.06])
     base.size[0] = 0.06
-    paint(base, white=True)
+    _paint(base, white=True)
     for i, (a, d, alpha) in enumerate(DH):
         body = body.add_body(
             name=f"link{i + 1}",
@@ -167,7 +167,7 @@ def panda() -> mujoco.MjSpec:
         for k, (*ends, radius) in enumerate(SHAPES[i]):
             geom = body.add_geom(name=f"link{i + 1}_{k}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends)
             geom.size[0] = radius
-            paint(geom, white=i % 2 == 0)
+            _paint(geom, white=i % 2 == 0)
         actuator = spec.add_actuator(name=f"joint{i + 1}", target=f"joint{i + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=STIFFNESS[i], kv=DAMPING[i])
         actuator.ctrlrange, actuator.ctrllimited = list(RANGE[i]), True
@@ -178,14 +178,14 @@ def panda() -> mujoco.MjSpec:
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=f"joint{i + 1}",
         )
-    add_hand(spec, body)
+    _add_hand(spec, body)
     for i in range(7):
         for j in range(i, 7):
             spec.add_exclude(bodyname1=f"link{i}", bodyname2=f"link{j + 1}")
     return spec
 
 
-def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
+def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
     """Add the parallel gripper to the last link: two fingers coupled by an equality, closed by one actuator."""
     turn = -np.pi / 4
     hand = flange.add_body(
@@ -193,7 +193,7 @@ def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
     )
     hand.explicitinertial = True
     hand.mass, hand.ipos, hand.inertia = 0.73, [-0.01, 0, 0.03], [0.001, 0.0025, 0.0017]
-    paint(hand.add_geom(name="hand", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, 0, 0.033], size=[0.02, 0.1, 0.033]))
+    _paint(hand.add_geom(name="hand", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, 0, 0.033], size=[0.02, 0.1, 0.033]))
     hand.add_site(name="tcp", pos=[0, 0, TCP], size=[0.004, 0.004, 0.004], group=4)
     for name, side in (("left_finger", 1.0), ("right_finger", -1.0)):
         finger = hand.add_body(name=name, pos=[0, 0, 0.0584], gravcomp=1.0)
@@ -208,7 +208,7 @@ def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
             armature=0.1,
             damping=[20, 0, 0],
         )
-        paint(
+        _paint(
             finger.add_geom(
                 name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, side * 0.016, 0.018], size=[0.0105, 0.0075, 0.018]
             ),
@@ -222,7 +222,7 @@ def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
             friction=[1.0, 0.01, 0.0001],
             condim=4,
         )
-        paint(pad)
+        _paint(pad)
     equality = spec.add_equality(
         type=mujoco.mjtEq.mjEQ_JOINT,
         objtype=mujoco.mjtObj.mjOBJ_JOINT,
@@ -257,6 +257,6 @@ def add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
         spec.add_exclude(bodyname1=a, bodyname2=b)
 
 
-def paint(geom: mujoco.MjsGeom, *, white: bool = False) -> None:
+def _paint(geom: mujoco.MjsGeom, *, white: bool = False) -> None:
     """Give a robot geom its colour."""
     geom.rgba = [0.92, 0.93, 0.94, 1] if white else [0.30, 0.33, 0.37, 1]

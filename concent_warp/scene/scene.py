@@ -39,14 +39,14 @@ class Scene:
             raise SceneError("no such MJCF file", where=path, fix="check the path given with --scene or --robot")
         try:
             spec = mujoco.MjSpec.from_file(str(path))
-            return standalone(spec, str(path))
+            return _standalone(spec, str(path))
         except (ValueError, mujoco.FatalError) as error:
             raise SceneError("MuJoCo cannot read this MJCF", where=path, found=" ".join(str(error).split())) from None
 
     @staticmethod
     def from_spec(spec: mujoco.MjSpec, source: str = "<memory>") -> Scene:
         """Hold a spec as text; meshes are written as inline vertices and faces."""
-        return standalone(spec.copy(), source)
+        return _standalone(spec.copy(), source)
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh spec that the caller may edit."""
@@ -88,19 +88,19 @@ class Scene:
         return tuple(m.body(m.jnt_bodyid[j]).name for j in free)
 
 
-def standalone(spec: mujoco.MjSpec, source: str) -> Scene:
+def _standalone(spec: mujoco.MjSpec, source: str) -> Scene:
     """Hold a spec as text and change it in doing so.
 
     A spec that was read from a file is not copied before: the copy would lack, without a word, the actuators and
     sensors that refer to names which do not exist, where compiling the spec itself says so.
     """
     for mesh in spec.meshes:
-        inline_mesh(spec, mesh)
+        _inline_mesh(spec, mesh)
     spec.compile()
     return Scene(spec.to_xml(), source)
 
 
-def inline_mesh(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> None:
+def _inline_mesh(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> None:
     """Replace a mesh file by its vertices and faces, so that the scene's text stands alone."""
     if not mesh.file:
         return

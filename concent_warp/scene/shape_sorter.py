@@ -54,7 +54,7 @@ class ShapeSorterCfg:
         spec.option.iterations = 50
         spec.option.ls_iterations = 50
         spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-        add_table(spec)
+        _add_table(spec)
         self.add_block(spec)
         self.add_box(spec)
         spec.add_text(name=OBJECTS_TEXT, data="block box")
@@ -105,7 +105,7 @@ class ShapeSorterCfg:
             )
 
 
-def add_table(spec: mujoco.MjSpec) -> None:
+def _add_table(spec: mujoco.MjSpec) -> None:
     """Add a table whose top is the plane z = 0, a light and a camera that looks at the workspace."""
     spec.worldbody.add_geom(
         name="table",

@@ -95,7 +95,7 @@ def check_run(
     """
     if contacts not in get_args(Contacts):
         raise EngineError("unknown `contacts`", expected=f"one of {list(get_args(Contacts))}", found=repr(contacts))
-    check_variants(compiled, sphere_count, variants)
+    _check_variants(compiled, sphere_count, variants)
     values = np.asarray(host(ctrl), dtype=float)
     found = values.shape
     values = values[None] if values.ndim == 2 else values
@@ -108,10 +108,10 @@ def check_run(
     if not np.isfinite(values).all():
         raise EngineError("the commands hold values that are not finite", fix="fill or cut the gaps first")
     steps = values.shape[1]
-    return Run(variants, values, steps, check_record(record, steps), *check_bodies(compiled, bodies), contacts)
+    return Run(variants, values, steps, _check_record(record, steps), *_check_bodies(compiled, bodies), contacts)
 
 
-def check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Variants) -> None:
+def _check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Variants) -> None:
     """Check counts, shapes and values of all that varies."""
     n = variants.count
     if n < 1:
@@ -125,7 +125,7 @@ def check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Varian
     }
     for name, shape in shapes.items():
         if (value := getattr(variants, name)) is not None:
-            check_array(f"variants.{name}", value, shape)
+            _check_array(f"variants.{name}", value, shape)
     if variants.sphere_radius is not None and not bool((variants.sphere_radius > 0).all()):
         raise EngineError("variants.sphere_radius holds radii that are not positive", expected="> 0 m")
     if variants.sphere_friction is not None:
@@ -136,12 +136,12 @@ def check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Varian
                 "friction is given twice", found="variants.sphere_friction and fields['geom_friction']", fix="give one"
             )
     for law, values in variants.laws or ():
-        check_array(f"parameters of {type(law).__name__}", values, (n, *np.shape(values)[1:]))
+        _check_array(f"parameters of {type(law).__name__}", values, (n, *np.shape(values)[1:]))
     for name, value in variants.fields.items():
-        check_array(f"variants.fields[{name!r}]", value, (n, *np.shape(model_field(compiled, name))))
+        _check_array(f"variants.fields[{name!r}]", value, (n, *np.shape(_model_field(compiled, name))))
 
 
-def model_field(compiled: mujoco.MjModel, name: str) -> np.ndarray | float:
+def _model_field(compiled: mujoco.MjModel, name: str) -> np.ndarray | float:
     """Return the value of a model field that may vary, ``opt.<name>`` for an option.
 
     Raises:
@@ -161,7 +161,7 @@ def model_field(compiled: mujoco.MjModel, name: str) -> np.ndarray | float:
     )
 
 
-def check_array(name: str, value: Any, shape: tuple[int, ...]) -> None:
+def _check_array(name: str, value: Any, shape: tuple[int, ...]) -> None:
     """Check the shape of an array or a tensor, and that all its values are finite."""
     found = tuple(value.shape) if hasattr(value, "shape") else np.shape(value)
     if found != shape:
@@ -171,7 +171,7 @@ def check_array(name: str, value: Any, shape: tuple[int, ...]) -> None:
         raise EngineError(f"{name} holds values that are not finite", expected="finite numbers")
 
 
-def check_record(record: Sequence[int] | np.ndarray | None, steps: int) -> np.ndarray:
+def _check_record(record: Sequence[int] | np.ndarray | None, steps: int) -> np.ndarray:
     """Return the steps to record, shape (R,) int; all of 0..steps by default."""
     if record is None:
         return np.arange(steps + 1)
@@ -184,7 +184,7 @@ def check_record(record: Sequence[int] | np.ndarray | None, steps: int) -> np.nd
     return rows
 
 
-def check_bodies(compiled: mujoco.MjModel, bodies: Sequence[str] | None) -> tuple[tuple[str, ...], np.ndarray]:
+def _check_bodies(compiled: mujoco.MjModel, bodies: Sequence[str] | None) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and ids, shape (B,), of the bodies to record; all by default. ``body<id>`` names a nameless one."""
     known = tuple(compiled.body(i).name or f"body{i}" for i in range(compiled.nbody))
     if bodies is None:

@@ -160,7 +160,7 @@ class MujocoEngine:
         if run.variants.qvel is not None:
             d.qvel[:] = run.variants.qvel[n]
         result = VariantResult.empty(m, run)
-        step = simulate if not unwatched(m, run) else in_one_loop if laws else in_one_call
+        step = _simulate if not _unwatched(m, run) else _in_one_loop if laws else _in_one_call
         try:
             result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, laws)
         except mujoco.FatalError as error:
@@ -289,7 +289,7 @@ class VariantResult:
         self.body_position[row], self.body_quaternion[row] = d.xpos[body_ids], d.xquat[body_ids]
 
 
-def simulate(
+def _simulate(
     m: mujoco.MjModel,
     d: mujoco.MjData,
     run: Run,
@@ -308,11 +308,11 @@ def simulate(
     number = d.warning.number
     base = {name: getattr(m, name).copy() for law, _ in laws for name in law.edits}
     k = 0
-    for stop in range(1, run.steps + 1) if laws else stops(ctrl, run):
+    for stop in range(1, run.steps + 1) if laws else _stops(ctrl, run):
         if m.nu:
             d.ctrl[:] = ctrl[k]
         if laws:
-            apply_laws(m, d, laws, base)
+            _apply_laws(m, d, laws, base)
         row = row_of.get(k)
         if row is None and not watch:
             mujoco.mj_step(m, d, nstep=stop - k)
@@ -320,10 +320,10 @@ def simulate(
             qpos, qvel = d.qpos.copy(), d.qvel.copy()
             if overwritten:
                 mujoco.mj_forward(m, d)
-                read(m, d, k, row, run, result, qpos, qvel)
+                _read(m, d, k, row, run, result, qpos, qvel)
             mujoco.mj_step(m, d)
             if not overwritten and not number[DIVERGED].any():
-                read(m, d, k, row, run, result, qpos, qvel)
+                _read(m, d, k, row, run, result, qpos, qvel)
         if number[OVERFLOW].any():
             return True
         if number[DIVERGED].any():
@@ -332,20 +332,20 @@ def simulate(
     mujoco.mj_checkPos(m, d)
     mujoco.mj_checkVel(m, d)
     if laws:
-        apply_laws(m, d, laws, base)
+        _apply_laws(m, d, laws, base)
     if run.steps in row_of and not number[DIVERGED].any():
         mujoco.mj_forward(m, d)
         result.put(row_of[run.steps], d, run.body_ids, d.qpos, d.qvel)
     return not number[DIVERGED].any()
 
 
-def unwatched(m: mujoco.MjModel, run: Run) -> bool:
+def _unwatched(m: mujoco.MjModel, run: Run) -> bool:
     """Return whether states and sensors are all that is asked for, so that MuJoCo may step on its own."""
     plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and not m.na and not m.nmocap
     return run.contacts == "none" and not len(run.body_ids) and run.steps > 0 and plain
 
 
-def in_one_call(
+def _in_one_call(
     m: mujoco.MjModel,
     d: mujoco.MjData,
     run: Run,
@@ -353,7 +353,7 @@ def in_one_call(
     result: VariantResult,
     laws: Sequence[tuple[Law, np.ndarray]],
 ) -> bool:
-    """Do what `simulate` does where nothing is watched, in MuJoCo's own loop, which lets other threads run."""
+    """Do what `_simulate` does where nothing is watched, in MuJoCo's own loop, which lets other threads run."""
     from mujoco import rollout
 
     del laws
@@ -378,7 +378,7 @@ def in_one_call(
     return sane > run.steps
 
 
-def in_one_loop(
+def _in_one_loop(
     m: mujoco.MjModel,
     d: mujoco.MjData,
     run: Run,
@@ -386,7 +386,7 @@ def in_one_loop(
     result: VariantResult,
     laws: Sequence[tuple[Law, np.ndarray]],
 ) -> bool:
-    """Do what `simulate` does where nothing but laws asks for a pause; what goes wrong is left to `simulate`."""
+    """Do what `_simulate` does where nothing but laws asks for a pause; what goes wrong is left to `_simulate`."""
     number = d.warning.number
     start = d.qpos.copy(), d.qvel.copy(), d.userdata.copy()
     base = [(getattr(m, name), getattr(m, name).copy()) for law, _ in laws for name in law.edits]
@@ -415,11 +415,11 @@ def in_one_loop(
         for field, value in base:
             field[:] = value
         d.qpos[:], d.qvel[:], d.userdata[:] = start
-        return simulate(m, d, run, ctrl, result, laws)
+        return _simulate(m, d, run, ctrl, result, laws)
     return True
 
 
-def apply_laws(
+def _apply_laws(
     m: mujoco.MjModel, d: mujoco.MjData, laws: Sequence[tuple[Law, np.ndarray]], base: Mapping[str, np.ndarray]
 ) -> None:
     """Let force laws act on the coming step, from fields as they are in `base` and no applied force."""
@@ -431,7 +431,7 @@ def apply_laws(
         law.apply(m, d, values)
 
 
-def stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:
+def _stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:
     """Return the steps at which the simulation pauses, increasing, the last one K.
 
     Every step when contacts are watched; else around each record and where the commands change.
@@ -443,7 +443,7 @@ def stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:
     return iter(np.unique(every[(every > 0) & (every <= run.steps)]).tolist())
 
 
-def read(
+def _read(
     m: mujoco.MjModel,
     d: mujoco.MjData,
     step: int,
@@ -465,10 +465,10 @@ def read(
         result.touched[geom[:, 0], body[:, 1]] = True
         result.touched[geom[:, 1], body[:, 0]] = True
     elif len(active):
-        result.contacts.append((step, contact_rows(m, d, active)))
+        result.contacts.append((step, _contact_rows(m, d, active)))
 
 
-def contact_rows(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.ndarray:
+def _contact_rows(m: mujoco.MjModel, d: mujoco.MjData, active: np.ndarray) -> np.ndarray:
     """Return geom ids, position [m], normal, distance [m] and force [N] of the `active` contacts, shape (C, 12)."""
     contact = d.contact
     frame = contact.frame[active].reshape(-1, 3, 3)

@@ -27,16 +27,16 @@ def in_processes(work: Callable[[Run], list[T]], run: Run, rows: Sequence[int], 
     from joblib import Parallel, delayed
 
     parts = np.array_split(np.asarray(rows), min(count, len(rows)))
-    found = Parallel(n_jobs=count, backend="loky")(delayed(work)(part_of(run, part)) for part in parts)
+    found = Parallel(n_jobs=count, backend="loky")(delayed(work)(_part_of(run, part)) for part in parts)
     return [result for part in cast("list[list[T]]", found) for result in part]
 
 
-def part_of(run: Run, rows: np.ndarray) -> Run:
+def _part_of(run: Run, rows: np.ndarray) -> Run:
     """Return a run of some of its variants."""
-    return replace(run, variants=some(run.variants, rows), ctrl=run.ctrl[rows % len(run.ctrl)])
+    return replace(run, variants=_some(run.variants, rows), ctrl=run.ctrl[rows % len(run.ctrl)])
 
 
-def some(variants: Variants, rows: np.ndarray) -> Variants:
+def _some(variants: Variants, rows: np.ndarray) -> Variants:
     """Return some of the variants."""
     arrays = {f.name: getattr(variants, f.name) for f in fields(variants) if f.name not in ("count", "fields", "laws")}
     return replace(

@@ -86,7 +86,7 @@ class WarpEngine:
         self.model = model
         self.device = str(wp.get_device(device if device is not None else preferred_device()))
         self._compiled, self._sphere_geom = compile_model(model, collidable)
-        self._max_memory = free_memory(self.device) if max_memory is None else int(max_memory)
+        self._max_memory = _free_memory(self.device) if max_memory is None else int(max_memory)
         self._max_worlds = max_worlds
         self._nconmax, self._njmax = nconmax, njmax
         self._buffers: Buffers | None = None
@@ -132,7 +132,7 @@ class WarpEngine:
         velocity or acceleration is not finite or beyond 1e10 is `diverged`, and its records are NaN from then on.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
-        variants = with_edited_fields(self._compiled, with_laws(self.model, self._compiled, variants))
+        variants = _with_edited_fields(self._compiled, with_laws(self.model, self._compiled, variants))
         run = replace(run, variants=variants)
         for name in variants.fields:
             if not batchable(name):
@@ -158,11 +158,11 @@ class WarpEngine:
         kept = int((rows < count).sum())
         rows = np.minimum(rows, count - 1)
         program = self._program(run, len(rows))
-        spheres = {name: pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
-        fields = {name: pick(value, rows) for name, value in run.variants.fields.items()}
-        laws = [pick(values, rows) for _, values in run.variants.laws or ()]
+        spheres = {name: _pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
+        fields = {name: _pick(value, rows) for name, value in run.variants.fields.items()}
+        laws = [_pick(values, rows) for _, values in run.variants.laws or ()]
         ctrl = run.ctrl[rows[: program.plan.commands] % len(run.ctrl)]
-        qpos, qvel = pick(run.variants.qpos, rows), pick(run.variants.qvel, rows)
+        qpos, qvel = _pick(run.variants.qpos, rows), _pick(run.variants.qvel, rows)
         program.load(spheres, fields, laws, qpos, qvel, ctrl, run.record)
         demand = program.run()
         if (grown := self._grown(self._buffers, demand, program)) is not None:
@@ -187,7 +187,7 @@ class WarpEngine:
         """Return a program for a run, a kept one if there is one."""
         assert self._buffers is not None
         fields, laws = run.variants.fields, run.variants.laws or ()
-        edited = edited_fields(run.variants)
+        edited = _edited_fields(run.variants)
         plan = Plan(
             worlds=worlds,
             steps=run.steps,
@@ -221,10 +221,10 @@ class WarpEngine:
 
     def _first_buffers(self, run: Run) -> Buffers:
         """Return sizes for the first run: what was given, else twice what the first variant needs in C MuJoCo."""
-        contacts, constraints, total = probe(self._compiled, run)
+        contacts, constraints, total = _probe(self._compiled, run)
         return Buffers(
-            contacts=rung(2 * contacts + 8) if self._nconmax is None else self._nconmax,
-            constraints=rung(1.5 * constraints + 16) if self._njmax is None else self._njmax,
+            contacts=_rung(2 * contacts + 8) if self._nconmax is None else self._nconmax,
+            constraints=_rung(1.5 * constraints + 16) if self._njmax is None else self._njmax,
             log_rows=int(min(2 * total * run.variants.count + 64, self._max_memory / 8 / LOG_ROW_BYTES)),
         )
 
@@ -238,9 +238,9 @@ class WarpEngine:
         capacity = buffers.contacts * program.plan.worlds
         if demand.contacts > capacity or bits & (BITS.BROADPHASE | BITS.NARROWPHASE | BITS.CCD):
             need = 1.25 * demand.contacts / program.plan.worlds
-            changes["contacts"] = rung(max(need, buffers.contacts + 1))
+            changes["contacts"] = _rung(max(need, buffers.contacts + 1))
         if demand.constraints > buffers.constraints or bits & BITS.NEFC:
-            changes["constraints"] = rung(max(1.25 * demand.constraints, buffers.constraints + 1))
+            changes["constraints"] = _rung(max(1.25 * demand.constraints, buffers.constraints + 1))
         if bits & BITS.NJMAX_NNZ:
             changes["nonzeros"] = 2 * program.data.njmax_nnz
         elif "constraints" in changes:
@@ -289,19 +289,21 @@ class WarpEngine:
             body_position=position,
             body_quaternion=quaternion,
             touched=torch.cat(touched) if touched else None,
-            contacts=join_logs([part.log for part in parts if part.log is not None]) if run.contacts == "all" else None,
+            contacts=_join_logs([part.log for part in parts if part.log is not None])
+            if run.contacts == "all"
+            else None,
             diverged=torch.as_tensor(unstable <= run.steps, device=qpos.device),
         )
 
 
-def join_logs(logs: Sequence[tuple[np.ndarray, np.ndarray]]) -> ContactLog:
+def _join_logs(logs: Sequence[tuple[np.ndarray, np.ndarray]]) -> ContactLog:
     """Return the ordered log of keys (variant, step, geoms), shape (C, 4), and values, shape (C, 10)."""
     key = np.concatenate([key for key, _ in logs])
     value = np.concatenate([value for _, value in logs])
     return sorted_log(key[:, 0].astype(int), key[:, 1].astype(int), np.concatenate([key[:, 2:], value], axis=1))
 
 
-def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
+def _probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
     """Simulate the first variant's commands on the unchanged model in C MuJoCo.
 
     Returns:
@@ -309,7 +311,7 @@ def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
     """
     d = mujoco.MjData(compiled)
     for name in ("qpos", "qvel"):
-        if (value := pick(getattr(run.variants, name), np.zeros(1, dtype=int))) is not None:
+        if (value := _pick(getattr(run.variants, name), np.zeros(1, dtype=int))) is not None:
             getattr(d, name)[:] = value[0].detach().cpu().numpy() if hasattr(value, "detach") else value[0]
     ctrl = run.ctrl[0]
     contacts = constraints = total = 0
@@ -323,19 +325,19 @@ def probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
     return contacts, constraints, total
 
 
-def edited_fields(variants: Variants) -> set[str]:
+def _edited_fields(variants: Variants) -> set[str]:
     """Return the names of the model fields that force laws edit."""
     return {name for law, _ in variants.laws or () for name in law.edits}
 
 
-def with_edited_fields(compiled: mujoco.MjModel, variants: Variants) -> Variants:
+def _with_edited_fields(compiled: mujoco.MjModel, variants: Variants) -> Variants:
     """Return the variants with a row a world of each field that force laws edit."""
-    shared = {name: getattr(compiled, name) for name in edited_fields(variants) - set(variants.fields)}
+    shared = {name: getattr(compiled, name) for name in _edited_fields(variants) - set(variants.fields)}
     rows = {name: np.tile(value, (variants.count, *[1] * value.ndim)) for name, value in shared.items()}
     return replace(variants, fields={**variants.fields, **rows})
 
 
-def rung(size: float) -> int:
+def _rung(size: float) -> int:
     """Return the next of 16, 24, 32, 48, 64, 96, ...: few sizes, since each one is compiled for and cached."""
     step = 16
     while step < size:
@@ -351,7 +353,7 @@ def largest(value: Any) -> np.ndarray:
     return np.take_along_axis(array, np.abs(array).argmax(axis=0)[None], axis=0)[0]
 
 
-def pick(value: Any, rows: np.ndarray) -> Any:
+def _pick(value: Any, rows: np.ndarray) -> Any:
     """Return the rows of an array or a tensor, or None of None."""
     if value is None:
         return None
@@ -363,6 +365,6 @@ def preferred_device() -> str:
     return "cuda:0" if wp.is_cuda_available() else "cpu"
 
 
-def free_memory(device: str) -> int:
+def _free_memory(device: str) -> int:
     """Return what the data of worlds may take by default [bytes]."""
     return int(0.4 * wp.get_device(device).free_memory) if device.startswith("cuda") else 2 * 2**30

@@ -68,7 +68,7 @@ class WorldModel:
             spheres: Properties of the spheres that vary, keys of `SPHERE_ARRAYS`.
             fields: Fields that vary, each with a typical value: not zero where any world's value is not.
         """
-        self.typical = typical_model(compiled, fields)
+        self.typical = _typical_model(compiled, fields)
         self.device = wp.device_to_torch(wp.get_device())
         self._compiled, self._worlds = compiled, worlds
         self._spheres = torch.as_tensor(np.flatnonzero(sphere_geom >= 0), device=self.device)
@@ -81,7 +81,7 @@ class WorldModel:
         self.mjw.opt.warn_overflow = 0
         for name in fields:
             if name.startswith("opt."):
-                self._widen(option_name(name))
+                self._widen(_option_name(name))
         self._folded = {name: self._target(name)[:1].clone() - self._typical(name) for name in names & set(FOLDED)}
         moved = np.arange(compiled.ngeom)
         if not names & {"body_pos", "body_quat"}:
@@ -148,7 +148,7 @@ class WorldModel:
     def _target(self, name: str) -> torch.Tensor:
         """Return the device array of a field, shape (N, ...)."""
         if name.startswith("opt."):
-            return wp.to_torch(getattr(self.mjw.opt, option_name(name)))
+            return wp.to_torch(getattr(self.mjw.opt, _option_name(name)))
         return wp.to_torch(getattr(self.mjw, name))
 
     def _typical(self, name: str) -> torch.Tensor:
@@ -156,12 +156,12 @@ class WorldModel:
         return self.tensor(getattr(self.typical, name)).reshape(1, *self._target(name).shape[1:])
 
 
-def option_name(name: str) -> str:
+def _option_name(name: str) -> str:
     """Return MuJoCo-Warp's name of the option ``opt.<name>``."""
     return "impratio_invsqrt" if name == "opt.impratio" else name[4:]
 
 
-def typical_model(compiled: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> mujoco.MjModel:
+def _typical_model(compiled: mujoco.MjModel, fields: Mapping[str, np.ndarray]) -> mujoco.MjModel:
     """Return a model in which no physics is switched off that any world needs."""
     switches = {name: value for name, value in fields.items() if is_switch(name)}
     if not switches:

@@ -140,7 +140,7 @@ class Program:
                 raise EngineError(
                     "MuJoCo-Warp cannot simulate this model", found=error, fix="use MujocoEngine"
                 ) from error
-            self._graphs = [capture(part) for part in (self._begin, self._step, self._end)]
+            self._graphs = [_capture(part) for part in (self._begin, self._step, self._end)]
 
     def _make_records(self) -> None:
         """Create the buffers of commands, records and contacts."""
@@ -345,7 +345,7 @@ class Program:
             )
 
 
-def capture(part: Any) -> Any:
+def _capture(part: Any) -> Any:
     """Return the launches of a function as a graph."""
     with wp.ScopedCapture() as captured:
         part()

@@ -153,7 +153,7 @@ class Staging:
         """Take over the folder that `begin` returned."""
         partial = self.folder / f"{key:06d}{PARTIAL}"
         for path in partial.iterdir():
-            sync(path)
+            _sync(path)
         partial.rename(self.path(key))
 
     def drop(self, key: int) -> None:
@@ -167,7 +167,7 @@ class Staging:
             shutil.rmtree(self.path(key), ignore_errors=True)
 
 
-def sync(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Have the system put a file on the disk."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
@@ -182,7 +182,7 @@ def partial_of(path: Path) -> Path:
 def settle(path: Path) -> None:
     """Give a file that was written under `partial_of` its name."""
     partial = partial_of(path)
-    sync(partial)
+    _sync(partial)
     partial.replace(path)
 
 

@@ -100,7 +100,7 @@ class LeRobotWriter:
         where = {"chunk_index": number // CHUNK, "file_index": number % CHUNK}
         lengths = [note["length"] for note in notes]
         for camera in self.layout.cameras:
-            out = self.folder / video_path(camera, where)
+            out = self.folder / _video_path(camera, where)
             join_videos(
                 [self._staging.path(k) / f"{camera}.mp4" for k in keys], lengths, self.layout.rate, partial_of(out)
             )
@@ -117,7 +117,7 @@ class LeRobotWriter:
             row |= {"dataset_from_index": index, "dataset_to_index": index + length}
             until = seconds + length / self.layout.rate
             for camera in self.layout.cameras:
-                prefix = f"videos/{image_key(camera)}"
+                prefix = f"videos/{_image_key(camera)}"
                 row |= {f"{prefix}/{name}": value for name, value in where.items()}
                 row |= {f"{prefix}/from_timestamp": seconds, f"{prefix}/to_timestamp": until}
             row |= {f"stats/{feature}/{name}": value for feature, named in note["stats"].items()
@@ -125,12 +125,12 @@ class LeRobotWriter:
             row |= {f"meta/episodes/{name}": value for name, value in where.items()}
             rows.append(row)
             index, seconds = index + length, until
-        out = self.folder / file_path("data", where)
+        out = self.folder / _file_path("data", where)
         pq.write_table(pa.concat_tables(tables), partial_of(out))
         settle(out)
         self._write_tasks(tasks)
         # From here on the episodes belong to the data set.
-        out = self.folder / file_path("meta/episodes", where)
+        out = self.folder / _file_path("meta/episodes", where)
         pq.write_table(pa.Table.from_pylist(rows), partial_of(out))
         settle(out)
         self._episodes += rows
@@ -152,7 +152,7 @@ class LeRobotWriter:
         height, width = self.layout.size
         found: dict[str, Any] = {}
         for camera in self.layout.cameras:
-            found[image_key(camera)] = {
+            found[_image_key(camera)] = {
                 "dtype": "video",
                 "shape": [height, width, 3],
                 "names": ["height", "width", "channels"],
@@ -226,7 +226,7 @@ class LeRobotWriter:
             "video_files_size_in_mb": VIDEO_MB,
             "fps": self.layout.rate,
             "splits": {"train": f"0:{len(rows)}"},
-            "data_path": file_path("data"),
+            "data_path": _file_path("data"),
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             "features": self.features(),
         }
@@ -271,9 +271,9 @@ class LeRobotEpisode:
         self._close()
         state, action = np.stack(self._state), np.stack(self._action)
         time = np.arange(len(state), dtype=np.float32) / np.float32(self._writer.layout.rate)
-        columns = {"observation.state": fixed(state), "action": fixed(action), "timestamp": pa.array(time)}
+        columns = {"observation.state": _fixed(state), "action": _fixed(action), "timestamp": pa.array(time)}
         pq.write_table(pa.table(columns), self._folder / "data.parquet")
-        stats: dict[str, Statistics] = {image_key(c): seen.statistics() for c, seen in self._seen.items()}
+        stats: dict[str, Statistics] = {_image_key(c): seen.statistics() for c, seen in self._seen.items()}
         stats |= {
             "observation.state": of_values(state),
             "action": of_values(action),
@@ -302,24 +302,24 @@ class LeRobotEpisode:
                 video.close()
 
 
-def fixed(values: np.ndarray) -> pa.Array:
+def _fixed(values: np.ndarray) -> pa.Array:
     """Return a column of lists of one length, shape (T, n) float32."""
     import pyarrow as pa
 
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
 
 
-def image_key(camera: str) -> str:
+def _image_key(camera: str) -> str:
     """Return the name of a camera's feature."""
     return f"observation.images.{camera}"
 
 
-def file_path(part: str, where: Mapping[str, int] | None = None) -> str:
+def _file_path(part: str, where: Mapping[str, int] | None = None) -> str:
     """Return the path of a table, or its pattern."""
     pattern = part + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     return pattern if where is None else pattern.format(**where)
 
 
-def video_path(camera: str, where: Mapping[str, int]) -> str:
+def _video_path(camera: str, where: Mapping[str, int]) -> str:
     """Return the path of a video."""
-    return file_path(f"videos/{image_key(camera)}", where).replace(".parquet", ".mp4")
+    return _file_path(f"videos/{_image_key(camera)}", where).replace(".parquet", ".mp4")

@@ -55,7 +55,7 @@ class RobomimicWriter:
             data: Any = file.create_group("data")
             if packed:
                 with h5py.File(out, "r") as before:
-                    for name in entries(before, "data"):
+                    for name in _entries(before, "data"):
                         before.copy(f"data/{name}", data, name=name)
             for k, key in enumerate(staged, start=len(packed)):
                 with h5py.File(self._staging.path(key) / EPISODE, "r") as episode:
@@ -79,10 +79,10 @@ class RobomimicWriter:
         if not path.exists():
             return set()
         with h5py.File(path, "r") as file:
-            return {int(group.attrs[KEY]) for group in entries(file, "data").values()}
+            return {int(group.attrs[KEY]) for group in _entries(file, "data").values()}
 
 
-def entries(file: h5py.File, name: str) -> Any:
+def _entries(file: h5py.File, name: str) -> Any:
     """Return a group of a file; h5py cannot tell that it is one."""
     return file[name]
 

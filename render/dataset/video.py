@@ -94,7 +94,7 @@ def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: P
             before += length
 
 
-def read_frames(path: Path) -> np.ndarray:
+def _read_frames(path: Path) -> np.ndarray:
     """Return all frames of a video, shape (T, H, W, 3) uint8."""
     import av
 

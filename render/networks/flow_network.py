@@ -25,7 +25,7 @@ class Block(nn.Module):
 
     def __init__(self, into: int, out: int, embedding: int) -> None:
         super().__init__()
-        self.norm_in, self.norm_out = nn.GroupNorm(groups(into), into), nn.GroupNorm(groups(out), out)
+        self.norm_in, self.norm_out = nn.GroupNorm(_groups(into), into), nn.GroupNorm(_groups(out), out)
         self.first, self.second = nn.Conv2d(into, out, 3, padding=1), nn.Conv2d(out, out, 3, padding=1)
         self.film = nn.Linear(embedding, 2 * out)
         self.past = nn.Identity() if into == out else nn.Conv2d(into, out, 1)
@@ -75,7 +75,7 @@ class FlowNetwork(nn.Module):
             self.up.append(stage)
             if level:
                 self.larger.append(nn.Conv2d(now, now, 3, padding=1))
-        self.norm, self.exit = nn.GroupNorm(groups(now), now), nn.Conv2d(now, 3, 3, padding=1)
+        self.norm, self.exit = nn.GroupNorm(_groups(now), now), nn.Conv2d(now, 3, 3, padding=1)
         nn.init.zeros_(self.exit.weight)
 
     def forward(
@@ -95,7 +95,7 @@ class FlowNetwork(nn.Module):
             previous: The previous real image, shape (N, 3, S, S).
             pose: Position [m] and two columns of the rotation of the end-effector, shape (N, 9).
         """
-        embedding = self.time(waves(time, self.cfg.width))
+        embedding = self.time(_waves(time, self.cfg.width))
         if self.pose is not None:
             embedding = embedding + self.pose(pose)
         x = self.entry(torch.cat([noised, simulated, previous], dim=1)) + self.place
@@ -116,12 +116,12 @@ class FlowNetwork(nn.Module):
         return previous + self.exit(functional.silu(self.norm(x)))
 
 
-def groups(channels: int) -> int:
+def _groups(channels: int) -> int:
     """Return into how many groups channels are normalised: the most, up to 8, that divide them."""
     return next(count for count in range(min(8, channels), 0, -1) if channels % count == 0)
 
 
-def waves(time: torch.Tensor, count: int) -> torch.Tensor:
+def _waves(time: torch.Tensor, count: int) -> torch.Tensor:
     """Return sines and cosines of times 0..1 (N,) of `count` numbers each (Vaswani et al. 2017), shape (N, count)."""
     half = count // 2
     frequency = torch.exp(-math.log(1000.0) * torch.arange(half, device=time.device) / max(half - 1, 1))

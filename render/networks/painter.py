@@ -62,11 +62,11 @@ class Painter:
         for described, reference in zip(state["cameras"], state["references"], strict=True):
             camera = Camera(**described)
             network = FlowNetwork(network_of(base, camera))
-            network.load_state_dict(averaged(state["trainings"][camera.name]["mean"]))
+            network.load_state_dict(_averaged(state["trainings"][camera.name]["mean"]))
             networks[camera.name], references[camera.name] = network.to(device).eval(), reference.to(device)
             cameras[camera.name] = camera
         enlarge = SuperResolution(SuperResolutionCfg(**cfg["super_resolution"]))
-        enlarge.load_state_dict(averaged(state["trainings"][ENLARGE]["mean"]))
+        enlarge.load_state_dict(_averaged(state["trainings"][ENLARGE]["mean"]))
         return Painter(networks, references, cameras, enlarge.to(device).eval(), steps=steps, seed=seed, half=half)
 
     def begin(self, worlds: int, which: torch.Tensor | None = None) -> None:
@@ -118,6 +118,6 @@ class Painter:
         return self._previous[camera]
 
 
-def averaged(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def _averaged(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return the weights of the model that an `AveragedModel` keeps."""
     return {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}

@@ -96,14 +96,14 @@ def pairs_of(
         states = [m.states(np.clip(s.time, *m.span))[0] for m, s in zip(motions, streams, strict=True)]
         qpos = np.concatenate(states)
         shown = None if progress is None else lambda share, c=c: progress((c + share) / len(names))
-        simulated, pose = rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, shown)
+        simulated, pose = _rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, shown)
         real = torch.from_numpy(np.concatenate([s.rgb for s in streams])).permute(0, 3, 1, 2).contiguous()
-        before = frames_before([len(s.time) for s in streams])
+        before = _frames_before([len(s.time) for s in streams])
         found.append(Pairs(camera, real, simulated, pose, before))
     return found
 
 
-def frames_before(lengths: Sequence[int]) -> torch.Tensor:
+def _frames_before(lengths: Sequence[int]) -> torch.Tensor:
     """Return the number of the frame before each in demonstrations of these lengths, -1 for first ones, shape (N,)."""
     before = torch.arange(-1, sum(lengths) - 1)
     first = torch.tensor([sum(lengths[:k]) for k in range(len(lengths))])
@@ -111,7 +111,7 @@ def frames_before(lengths: Sequence[int]) -> torch.Tensor:
     return before
 
 
-def rendered(
+def _rendered(
     scene: Scene,
     camera: Camera,
     size: tuple[int, int],
@@ -145,10 +145,10 @@ def carrier_pose(stage: Stage, camera: Camera) -> torch.Tensor:
     if camera.body is None:
         return torch.zeros(stage.worlds, 9, device=stage.qpos.device)
     body = stage.model.body(camera.body).id
-    return torch.cat([stage.position[:, body], columns(stage.quaternion[:, body])], dim=1)
+    return torch.cat([stage.position[:, body], _columns(stage.quaternion[:, body])], dim=1)
 
 
-def columns(quaternion: torch.Tensor) -> torch.Tensor:
+def _columns(quaternion: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of the rotations of unit quaternions wxyz (N, 4), shape (N, 6)."""
     w, x, y, z = quaternion.unbind(-1)
     first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)

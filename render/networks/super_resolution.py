@@ -21,7 +21,7 @@ class Residual(nn.Module):
 
     def __init__(self, width: int, scale: float) -> None:
         super().__init__()
-        self.first, self.second = (convolution(width, width) for _ in range(2))
+        self.first, self.second = (_convolution(width, width) for _ in range(2))
         self.scale = scale
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -34,26 +34,26 @@ class SuperResolution(nn.Module):
 
     def __init__(self, cfg: SuperResolutionCfg) -> None:
         super().__init__()
-        self.entry = convolution(3, cfg.width)
+        self.entry = _convolution(3, cfg.width)
         self.body = nn.Sequential(
-            *(Residual(cfg.width, cfg.scale) for _ in range(cfg.blocks)), convolution(cfg.width, cfg.width)
+            *(Residual(cfg.width, cfg.scale) for _ in range(cfg.blocks)), _convolution(cfg.width, cfg.width)
         )
-        self.exit = nn.Sequential(convolution(cfg.width, 3 * FACTOR**2), nn.PixelShuffle(FACTOR))
+        self.exit = nn.Sequential(_convolution(cfg.width, 3 * FACTOR**2), nn.PixelShuffle(FACTOR))
         for parameter in self.exit.parameters():
             nn.init.zeros_(parameter)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Return images (N, 3, 4 H, 4 W) of images (N, 3, H, W), both in -1..1 or thereabouts."""
         x = self.entry(image)
-        return enlarged(image) + self.exit(x + self.body(x))
+        return _enlarged(image) + self.exit(x + self.body(x))
 
 
-def convolution(into: int, out: int) -> nn.Conv2d:
+def _convolution(into: int, out: int) -> nn.Conv2d:
     """Return a convolution that takes what is beyond the edge to be as the edge is, so that it leaves no frame."""
     return nn.Conv2d(into, out, 3, padding=1, padding_mode="replicate")
 
 
-def enlarged(image: torch.Tensor) -> torch.Tensor:
+def _enlarged(image: torch.Tensor) -> torch.Tensor:
     """Return images (N, 3, 4 H, 4 W) by bicubic interpolation."""
     return functional.interpolate(image, scale_factor=FACTOR, mode="bicubic", align_corners=False)
 

@@ -103,7 +103,7 @@ class RenderTraining:
         self.pairs = [one.to(self.device) for one in pairs]
         torch.manual_seed(cfg.seed)
         self.generator = torch.Generator(self.device).manual_seed(cfg.seed)
-        self.small = [small_pairs(one, size) for one in self.pairs]
+        self.small = [_small_pairs(one, size) for one in self.pairs]
         self.reference = [to_signed(one.real).mean(dim=0) if len(one) else None for one in self.small]
         self.trainings: dict[str, NetworkTraining] = {}
         for one in self.pairs:
@@ -216,7 +216,7 @@ class RenderTraining:
         """
         assert self.folder is not None
         state = load_checkpoint(self.folder / CHECKPOINT, str(self.device))
-        before, now = flat(state["cfg"]), flat(asdict(self.cfg))
+        before, now = _flat(state["cfg"]), _flat(asdict(self.cfg))
         differing = [n for n in sorted(before | now) if before.get(n) != now.get(n) and n not in FREE]
         names = [camera["name"] for camera in state["cameras"]]
         if differing or names != [one.camera.name for one in self.pairs]:
@@ -245,7 +245,7 @@ def network_of(cfg: FlowNetworkCfg, camera: Camera) -> FlowNetworkCfg:
     return replace(cfg, posed=camera.moves)
 
 
-def small_pairs(pairs: Pairs, size: int) -> Pairs:
+def _small_pairs(pairs: Pairs, size: int) -> Pairs:
     """Return the pairs at the size that the flow paints."""
 
     def less(images: torch.Tensor) -> torch.Tensor:
@@ -273,8 +273,8 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any]:
     return state
 
 
-def flat(value: Any, prefix: str = "") -> dict[str, Any]:
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     """Return nested settings by their dotted names."""
     if not isinstance(value, dict):
         return {prefix: list(value) if isinstance(value, tuple) else value}
-    return {k: v for name, part in value.items() for k, v in flat(part, f"{prefix}.{name}".lstrip(".")).items()}
+    return {k: v for name, part in value.items() for k, v in _flat(part, f"{prefix}.{name}".lstrip(".")).items()}

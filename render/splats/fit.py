@@ -198,7 +198,7 @@ class SplatFit:
         side[len(index) - halves :] = -1
         offset = torch.zeros(len(index), 3, device=self.device)
         offset.scatter_(1, axis[index, None], (0.6 * side * longest[index].exp())[:, None])
-        values["means"] += turned(values["quats"], offset)
+        values["means"] += _turned(values["quats"], offset)
         values["scales"] -= torch.log(torch.tensor(1.5)) * (offset != 0)
         whole = values["opacities"].sigmoid()
         # Two of these cover as much as the one did.
@@ -278,7 +278,7 @@ class SplatFit:
         self._pull = tensors["pull"].clone()
 
 
-def turned(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+def _turned(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """Return vectors (n, 3) turned by quaternions wxyz (n, 4) of any length."""
     unit = quats / quats.norm(dim=1, keepdim=True)
     scalar, axis = unit[:, :1], unit[:, 1:]

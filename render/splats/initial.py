@@ -36,15 +36,15 @@ def read_start(path: Path, count: int, scale: float, rng: np.random.Generator) -
         points = trimesh.sample.sample_surface(read_mesh(path), count, seed=int(rng.integers(2**31)))[0]
     else:
         points = read_points(path)
-    return scale * thinned(np.asarray(points), count, rng)
+    return scale * _thinned(np.asarray(points), count, rng)
 
 
-def thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+def _thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return at most `count` of the points, drawn at random."""
     return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
 
 
-def project(views: SplatViews, v: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _project(views: SplatViews, v: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (column, row), shape (n, 2), int, and the depths [m], shape (n,), of points in a view."""
     pose, matrix = views.poses[v], views.intrinsics[v]
     seen = (points - pose[:3, 3]) @ pose[:3, :3] @ FLIP
@@ -53,7 +53,7 @@ def project(views: SplatViews, v: int, points: np.ndarray) -> tuple[np.ndarray, 
     return np.round(np.clip(pixels, -9, 1e6)).astype(int), seen[:, 2]
 
 
-def within(views: SplatViews, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def _within(views: SplatViews, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return which pixels (n, 2) are in the image and before the camera, shape (n,)."""
     return (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < views.size).all(axis=1)
 
@@ -69,13 +69,13 @@ def visual_hull(views: SplatViews, count: int, rng: np.random.Generator) -> np.n
             "nothing tells where the object is", expected="images with an alpha channel, or points to start from",
             fix="pass --points with a mesh or a point cloud",
         )  # fmt: skip
-    middle, half = enclosing_cube(views)
+    middle, half = _enclosing_cube(views)
     axis = (np.arange(CELLS) + 0.5) / CELLS * 2 - 1
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + middle
     inside = np.ones(len(grid), dtype=bool)
     for v in range(len(views)):
-        pixels, depth = project(views, v, grid)
-        seen = within(views, pixels, depth)
+        pixels, depth = _project(views, v, grid)
+        seen = _within(views, pixels, depth)
         mask = views.rgba[v, ..., 3] >= SURE
         # What is beyond the image may belong to an object that the image's border cuts, and to no other.
         cut = mask[[0, -1]].any() or mask[:, [0, -1]].any()
@@ -95,10 +95,10 @@ def visual_hull(views: SplatViews, count: int, rng: np.random.Generator) -> np.n
         )  # fmt: skip
     cell = 2 * half / CELLS
     points = surface[rng.choice(len(surface), max(count, len(surface)))]
-    return thinned(points + rng.uniform(-cell / 2, cell / 2, points.shape), count, rng)
+    return _thinned(points + rng.uniform(-cell / 2, cell / 2, points.shape), count, rng)
 
 
-def enclosing_cube(views: SplatViews) -> tuple[np.ndarray, float]:
+def _enclosing_cube(views: SplatViews) -> tuple[np.ndarray, float]:
     """Return the middle [m], shape (3,), and half the edge [m] of a cube that holds the object, by its masks."""
     origins, rays, spans = [], [], []
     for v in range(len(views)):
@@ -131,8 +131,8 @@ def first_splats(views: SplatViews, points: np.ndarray, degree: int, device: tor
     scale = np.clip(gaps[:, 1:].mean(axis=1), 1e-6, None)
     total, weight = np.zeros((len(points), 3)), np.full((len(points), 1), 1e-6)
     for v in range(len(views)):
-        pixels, depth = project(views, v, points)
-        seen = within(views, pixels, depth)
+        pixels, depth = _project(views, v, points)
+        seen = _within(views, pixels, depth)
         rgba = views.rgba[v, pixels[seen, 1], pixels[seen, 0]].astype(float) / 255
         total[seen] += rgba[:, :3] * rgba[:, 3:]
         weight[seen] += rgba[:, 3:]

@@ -111,7 +111,7 @@ class Rasteriser:
         self.pinholes, self.hidden = new(worlds, cameras, 4), new(worlds, cameras, height, width)
         self.light = new(worlds, cameras, 3)
         self.light[..., 2] = -1
-        self.splats = Splats(*(t.detach() for t in together(objects, self.device).tensors()))
+        self.splats = Splats(*(t.detach() for t in _together(objects, self.device).tensors()))
         owner = [torch.full((len(o),), k, dtype=torch.int32) for k, o in enumerate(objects)]
         kinds = dict(zip(PARAMETERS, (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3), strict=True))
         self._arrays = SplatArrays(
@@ -208,7 +208,7 @@ class Rasteriser:
         Gradients are to be taken before the next images are rendered.
         """
         self._set(object_poses, camera_poses, intrinsics, depth)
-        given = together(objects, self.device)
+        given = _together(objects, self.device)
         if len(given) != len(self.splats) or given.degree != self.splats.degree:
             raise RenderError(
                 "other splats than the rasteriser was made for",
@@ -285,7 +285,7 @@ class _Rasterise(torch.autograd.Function):
         return (None, *(wp.to_torch(plan.gradients[name]).clone() for name in PARAMETERS))
 
 
-def together(objects: Sequence[Splats], device: torch.device) -> Splats:
+def _together(objects: Sequence[Splats], device: torch.device) -> Splats:
     """Return the splats of all objects in one, harmonics filled up to the highest degree."""
     most = max(o.harmonics.shape[1] for o in objects)
     columns = [[], [], [], [], []]

@@ -115,21 +115,21 @@ def read_views(path: Path) -> SplatViews:
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise RenderError("no list of frames", where=file, expected="frames, each with file_path and transform_matrix")
-    to_object = np.linalg.inv(object_frame(document.get("object_pose"), file))
+    to_object = np.linalg.inv(_object_frame(document.get("object_pose"), file))
     images, poses, intrinsics, masked = [], [], [], []
     for k, frame in enumerate(frames):
         where = f"{file}, frame {k}"
-        image, has_alpha = read_image(file.parent, frame, where)
+        image, has_alpha = _read_image(file.parent, frame, where)
         if images and image.shape != images[0].shape:
             raise RenderError("images differ in size", where=where, expected=images[0].shape[:2], found=image.shape[:2])
         images.append(image)
         masked.append(has_alpha)
-        poses.append(to_object @ camera_frame(frame.get("transform_matrix"), where))
-        intrinsics.append(pinhole({**document, **frame}, image.shape[1], image.shape[0], where))
+        poses.append(to_object @ _camera_frame(frame.get("transform_matrix"), where))
+        intrinsics.append(_pinhole({**document, **frame}, image.shape[1], image.shape[0], where))
     return SplatViews(np.stack(images), np.stack(poses), np.stack(intrinsics), all(masked))
 
 
-def read_image(folder: Path, frame: dict[str, Any], where: str) -> tuple[np.ndarray, bool]:
+def _read_image(folder: Path, frame: dict[str, Any], where: str) -> tuple[np.ndarray, bool]:
     """Return an image as RGBA (H, W, 4), uint8, and whether it has a mask."""
     import cv2
 
@@ -145,7 +145,7 @@ def read_image(folder: Path, frame: dict[str, Any], where: str) -> tuple[np.ndar
     return np.dstack([image[..., 2::-1], alpha]), image.shape[2] == 4
 
 
-def camera_frame(value: Any, where: str) -> np.ndarray:
+def _camera_frame(value: Any, where: str) -> np.ndarray:
     """Return a camera-to-world matrix, shape (4, 4), rotation of unit scale."""
     try:
         matrix = np.array(value, dtype=float)
@@ -163,7 +163,7 @@ def camera_frame(value: Any, where: str) -> np.ndarray:
     return np.vstack([matrix[:3], [0, 0, 0, 1]])
 
 
-def object_frame(value: Any, where: Path) -> np.ndarray:
+def _object_frame(value: Any, where: Path) -> np.ndarray:
     """Return the pose of the object as a matrix, shape (4, 4); the world's frame where none is given."""
     from scipy.spatial.transform import Rotation
 
@@ -181,7 +181,7 @@ def object_frame(value: Any, where: Path) -> np.ndarray:
     return matrix
 
 
-def pinhole(values: dict[str, Any], width: int, height: int, where: str) -> np.ndarray:
+def _pinhole(values: dict[str, Any], width: int, height: int, where: str) -> np.ndarray:
     """Return the pinhole matrix [px], shape (3, 3), of a frame, given for images of the size ``w`` x ``h``."""
     try:
         shrink_x = width / float(values.get("w", width))

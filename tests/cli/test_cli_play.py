@@ -13,7 +13,7 @@ from live_page import BROWSER, Page, opened
 
 from concent_warp.cli import main
 from concent_warp.deploy.cfg import PlayCfg
-from concent_warp.deploy.play import make_player
+from concent_warp.deploy.play import _make_player
 from concent_warp.train.policy.load import Policy
 
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
@@ -130,7 +130,7 @@ def test_commands_are_scaled_as_in_an_evaluation():
     robots = []
     for action_scale, lead_scale in ((1.0, 1.0), (0.4, 0.5)):
         cfg = PlayCfg(states=1, action_scale=action_scale, setpoint_lead_scale=lead_scale)
-        player, _ = make_player(Policy.load("shape_sorter"), cfg, world="simulation")
+        player, _ = _make_player(Policy.load("shape_sorter"), cfg, world="simulation")
         robots.append(player.environment.task.robot)
     np.testing.assert_allclose(robots[1].step, 0.4 * robots[0].step)
     np.testing.assert_allclose(robots[1].lead, 0.5 * robots[0].lead)

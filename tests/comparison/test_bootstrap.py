@@ -3,9 +3,9 @@ import pytest
 
 from concent_warp.comparison.bootstrap import (
     WHOLE,
-    autocorrelation_time,
-    block_length,
-    drawn_demonstrations,
+    _autocorrelation_time,
+    _block_length,
+    _drawn_demonstrations,
     effective_count,
     mean_interval,
 )
@@ -23,15 +23,15 @@ def autoregressive(rng, n, keep):
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.9])
 def test_autocorrelation_time_is_that_of_the_process(keep):
     rng = np.random.default_rng(1)
-    found = np.mean([autocorrelation_time(autoregressive(rng, 4000, keep)) for _ in range(10)])
+    found = np.mean([_autocorrelation_time(autoregressive(rng, 4000, keep)) for _ in range(10)])
     assert found == pytest.approx((1 + keep) / (1 - keep), rel=0.15)
 
 
 def test_blocks_are_longer_for_slower_errors_and_at_most_a_quarter():
     rng = np.random.default_rng(2)
-    fast, slow = (block_length(autoregressive(rng, 2000, keep)) for keep in (0.0, 0.95))
+    fast, slow = (_block_length(autoregressive(rng, 2000, keep)) for keep in (0.0, 0.95))
     assert slow > 3 * fast
-    assert block_length(np.linspace(0, 1, 100)) <= 25
+    assert _block_length(np.linspace(0, 1, 100)) <= 25
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.9])
@@ -68,7 +68,7 @@ def test_with_many_demonstrations_whole_ones_are_drawn():
 
 def test_demonstrations_count_by_their_samples():
     parts = [np.zeros(90), np.ones(10)]
-    means = drawn_demonstrations(parts, np.random.default_rng(0))
+    means = _drawn_demonstrations(parts, np.random.default_rng(0))
     assert set(np.round(means, 6)) == {0.0, 0.1, 1.0}
 
 

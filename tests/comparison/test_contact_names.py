@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.comparison.contact_names import Partners, box_of, subtree
+from concent_warp.comparison.contact_names import Partners, _box_of, _subtree
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -66,7 +66,7 @@ def test_what_falls_free_touches_nothing_and_a_brush_is_not_told():
 def test_a_body_carries_its_children_and_its_box_holds_all_its_geoms():
     m = Scene(XML.format(height=0.12)).model
     arm, hand = m.body("arm").id, m.body("hand").id
-    assert subtree(m, arm) == [arm, hand]
-    low, high = box_of(m, m.body("box").id)
+    assert _subtree(m, arm) == [arm, hand]
+    low, high = _box_of(m, m.body("box").id)
     assert low == pytest.approx([-0.05, -0.05, -0.05])
     assert high == pytest.approx([0.05, 0.05, 0.05])

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.residuals import mean_norm, residuals
+from concent_warp.comparison.residuals import _mean_norm, residuals
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack
@@ -162,9 +162,9 @@ def test_noise_floor_is_the_mean_error_that_noise_alone_leaves(engine, exact):
 
 
 def test_mean_norm_is_that_of_the_chi_distribution():
-    assert mean_norm(1) == pytest.approx(np.sqrt(2 / np.pi))
+    assert _mean_norm(1) == pytest.approx(np.sqrt(2 / np.pi))
     draws = np.random.default_rng(0).normal(size=(200_000, 4))
-    assert mean_norm(4) == pytest.approx(np.linalg.norm(draws, axis=1).mean(), rel=5e-3)
+    assert _mean_norm(4) == pytest.approx(np.linalg.norm(draws, axis=1).mean(), rel=5e-3)
 
 
 def test_a_sensor_that_the_model_lacks_is_named(engine, exact):

@@ -8,7 +8,7 @@ import pytest
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.worst_spans import LEAST, channel_places, ranked, smoothed, worst_places
+from concent_warp.comparison.worst_spans import LEAST, _channel_places, _smoothed, ranked, worst_places
 from concent_warp.estimation.sensors import Kind
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -53,7 +53,7 @@ def test_two_bumps_are_two_places_the_worse_first():
 def test_noise_alone_has_no_places(seed):
     value = np.random.default_rng(seed).normal(0, 1e-4, (len(TIME), 3))
     quiet = replace(residual(0), value=value, error=np.linalg.norm(value, axis=1))
-    assert list(channel_places(quiet, PHASES, None, "demo_0")) == []
+    assert list(_channel_places(quiet, PHASES, None, "demo_0")) == []
 
 
 def test_channels_of_one_body_that_fail_together_are_one_place():
@@ -69,22 +69,22 @@ def test_channels_of_one_body_that_fail_together_are_one_place():
 
 def test_a_shoulder_of_a_peak_is_no_second_place():
     decay = np.where(TIME > 1, np.exp(-(TIME - 1) / 0.8), 0)[:, None] * [5e-3, 0, 0]
-    assert len(list(channel_places(residual(decay), PHASES, None, "d"))) == 1
+    assert len(list(_channel_places(residual(decay), PHASES, None, "d"))) == 1
 
 
 def test_an_error_that_stays_is_traced_to_the_phase_it_arose_in():
     jump = np.interp(TIME, [2.0, 2.4], [0, 4e-3])[:, None] * [1, 0, 0]
-    place = next(channel_places(residual(jump), PHASES, None, "d"))
+    place = next(_channel_places(residual(jump), PHASES, None, "d"))
     assert (place.phase, place.arose) == ("insert", "free")
     assert place.sentence().endswith("mostly from the free phase")
-    late = next(channel_places(residual(bump(3.2, 0.1, 4e-3)), PHASES, None, "d"))
+    late = next(_channel_places(residual(bump(3.2, 0.1, 4e-3)), PHASES, None, "d"))
     assert late.arose == late.phase == "insert"
     assert "mostly from" not in late.sentence()
 
 
 def test_a_residual_that_swings_points_to_and_fro():
     wave = np.sin(100 * TIME)[:, None] * [0, 2e-3, 0]
-    place = next(channel_places(residual(wave), (), None, "d"))
+    place = next(_channel_places(residual(wave), (), None, "d"))
     assert place.direction == "to and fro along y"
     assert place.phase is None
     assert np.linalg.norm(place.vector) < 0.5
@@ -101,7 +101,7 @@ def test_a_diverged_replay_is_the_worst_place_and_stays_json():
 
 def test_without_known_noise_a_place_is_told_in_units():
     exact = replace(residual(bump(1, 0.1, 0.02)), noise=None, std=None)
-    place = next(channel_places(exact, (), None, "d"))
+    place = next(_channel_places(exact, (), None, "d"))
     assert place.ratio is None
     assert place.size.endswith(" mm")
     assert "noise" not in place.sentence()
@@ -109,8 +109,8 @@ def test_without_known_noise_a_place_is_told_in_units():
 
 def test_smoothing_counts_only_what_was_measured():
     ratio = np.where(np.arange(400) % 3 == 0, np.nan, 2.0)
-    assert smoothed(TIME, ratio) == pytest.approx(2.0)
-    assert smoothed(TIME[:1], np.array([2.0])) == pytest.approx([2.0])
+    assert _smoothed(TIME, ratio) == pytest.approx(2.0)
+    assert _smoothed(TIME[:1], np.array([2.0])) == pytest.approx([2.0])
 
 
 PUSH = """
@@ -189,7 +189,7 @@ def test_places_are_in_the_json_with_their_sentence(pushed):
 
 
 def test_places_alike_in_many_demonstrations_leave_room_for_others():
-    place = next(channel_places(residual(bump(1, 0.1, 4e-3)), PHASES, None, "d"))
+    place = next(_channel_places(residual(bump(1, 0.1, 4e-3)), PHASES, None, "d"))
     many = [replace(place, demonstration=f"demo_{i}", ratio=50.0 + i) for i in range(30)]
     other = replace(place, channels=("lid_position",), demonstration="demo_3", ratio=5.0)
     found = ranked([other, *many])

@@ -5,7 +5,7 @@ import pytest
 
 from concent_warp.diagnosis import procedure
 from concent_warp.diagnosis.cfg import DiagnosisCfg
-from concent_warp.diagnosis.checkpoint import load, save
+from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search.steps import Screened
 from concent_warp.effects.registry import effect_class
@@ -30,13 +30,13 @@ def done(recording, tmp_path_factory):
 def counted(monkeypatch):
     """Count the pieces of work that are done and not read."""
     tasks = []
-    run_all = procedure.run_all
+    run_all = procedure._run_all
 
     def watched(work, given, jobs):
         tasks.extend(work.__name__ for _ in given)
         return run_all(work, given, jobs)
 
-    monkeypatch.setattr(procedure, "run_all", watched)
+    monkeypatch.setattr(procedure, "_run_all", watched)
     return tasks
 
 
@@ -98,12 +98,12 @@ def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monke
 def test_what_is_kept_comes_back_as_it_was(recording, tmp_path):
     effect = effect_class("joint_damping")("hinge")
     kept = Screened(effect, 0.5, float("-inf"), np.array([1.0, np.inf]), (), 2.5)
-    save(tmp_path / "a.npz", kept)
-    found = load(tmp_path / "a.npz", drawing(recording))
+    _save(tmp_path / "a.npz", kept)
+    found = _load(tmp_path / "a.npz", drawing(recording))
     assert (found.effect.name, found.effect.target) == ("joint_damping", ("hinge",))
     assert (found.gain, found.scanned, found.pieces, found.simulated) == (0.5, float("-inf"), (), 2.5)
     assert found.start.tolist() == [1.0, np.inf]
-    assert load(tmp_path / "b.npz", drawing(recording)) is None
+    assert _load(tmp_path / "b.npz", drawing(recording)) is None
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 

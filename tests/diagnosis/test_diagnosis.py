@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, joined, number
+from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, _joined, _number
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -104,6 +104,6 @@ def test_an_interval_that_holds_the_null_value_does_not_exclude_it():
 
 
 def test_numbers_and_lists_of_names():
-    assert number(np.float64(1.5)) == 1.5
-    assert number(np.inf) is None
-    assert [joined(["a"]), joined(["a", "b"]), joined(["a", "b", "c"])] == ["a", "a or b", "a, b or c"]
+    assert _number(np.float64(1.5)) == 1.5
+    assert _number(np.inf) is None
+    assert [_joined(["a"]), _joined(["a", "b"]), _joined(["a", "b", "c"])] == ["a", "a or b", "a, b or c"]

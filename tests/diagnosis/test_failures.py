@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import failures as module
-from concent_warp.diagnosis.failures import located, where, with_starts
+from concent_warp.diagnosis.failures import _located, _with_starts, where
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observe import observe
@@ -64,7 +64,7 @@ def test_right_model_has_no_place():
 
 
 def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "located", lambda *args: locate_forces(*args[:2], engine=args[2]))
+    monkeypatch.setattr(module, "_located", lambda *args: locate_forces(*args[:2], engine=args[2]))
     found = where(model(), recorded(3.0), seconds=60)
     assert found[0]["start"] is not None
     assert found[-1]["channel"] == "rail"
@@ -74,7 +74,7 @@ def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch
 
 def test_search_for_forces_that_takes_too_long_is_given_up():
     before = time.monotonic()
-    assert located(model(), recorded(3.0), "mujoco", seconds=0.01) is None
+    assert _located(model(), recorded(3.0), "mujoco", seconds=0.01) is None
     assert time.monotonic() - before < 5
 
 
@@ -90,7 +90,7 @@ def test_replay_starts_where_the_window_was_fitted_to_start():
     started_off = recorded(0.5, start=0.004)
     windows = observe(model(), started_off)
     offset = np.array([0.004, 0.0]) / windows[0].spread
-    moved = with_starts(model(), started_off, windows, [offset] * len(windows))
+    moved = _with_starts(model(), started_off, windows, [offset] * len(windows))
     np.testing.assert_allclose(np.asarray(moved.demonstrations[0].qpos, dtype=float), [0.004])
     assert where(model(), started_off) != []
     assert where(model(), started_off, windows=windows, offsets=[offset] * len(windows)) == []

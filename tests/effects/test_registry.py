@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from concent_warp.effects.catalogue import catalogue
+from concent_warp.effects.catalogue import _catalogue
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
@@ -71,4 +71,4 @@ def test_documentation_lists_the_effects_as_they_are():
     page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
     begin, end = "python -m concent_warp.effects.catalogue` -->\n", "<!-- end of effects -->"
     listed = page[page.index(begin) + len(begin) : page.index(end)]
-    assert listed == catalogue(ShapeSorterCfg().build().model)
+    assert listed == _catalogue(ShapeSorterCfg().build().model)

@@ -8,7 +8,7 @@ from gripper_task import Task, insert_from
 
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.extract import extract, from_log
+from concent_warp.events.extract import _from_log, extract
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEventSequence, Entity
 from concent_warp.events.touches import Motion
@@ -65,7 +65,7 @@ def touch(
 
 
 def events(*rows: list[Row], cfg: StagingCfg | None = None) -> ContactEventSequence:
-    return from_log(log(*(row for part in rows for row in part)), ROLES, still(), cfg=cfg)
+    return _from_log(log(*(row for part in rows for row in part)), ROLES, still(), cfg=cfg)
 
 
 def test_an_interval_has_times_peak_force_point_and_normal_in_the_frame_of_b():
@@ -150,8 +150,8 @@ def test_no_contact_at_all_gives_an_empty_sequence_that_can_be_saved(tmp_path):
 def test_only_the_chosen_variant_is_read():
     both = log(*touch(range(20, 40), LINK, 1))
     other = ContactLog(**{**vars(both), "variant": np.ones(len(both.step), dtype=int)})
-    assert from_log(other, ROLES, still()).body_contacts == ()
-    assert len(from_log(other, ROLES, still(), variant=1).body_contacts) == 1
+    assert _from_log(other, ROLES, still()).body_contacts == ()
+    assert len(_from_log(other, ROLES, still(), variant=1).body_contacts) == 1
 
 
 def test_geoms_of_another_model_are_refused():

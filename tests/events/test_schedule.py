@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from concent_warp.events.schedule import label_levels, plot_schedule, schedule_rows
+from concent_warp.events.schedule import _label_levels, plot_schedule, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 
 
@@ -46,4 +46,4 @@ def test_a_sequence_without_contact_can_be_drawn(insertion: ContactEventSequence
 
 
 def test_labels_of_stages_close_in_time_are_set_above_one_another():
-    assert label_levels([0.0, 0.1, 0.2, 5.0], room=0.5) == [0, 1, 2, 0]
+    assert _label_levels([0.0, 0.1, 0.2, 5.0], room=0.5) == [0, 1, 2, 0]

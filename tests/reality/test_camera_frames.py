@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.reality.sensors.camera import edges, film
+from concent_warp.reality.sensors.camera import _edges, film
 from concent_warp.reality.sensors.sensing import SLACK, SensingCfg, seen
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
@@ -48,7 +48,7 @@ def test_depth_is_that_of_the_physical_surfaces_within_the_noise_of_the_camera(s
     for t in range(3):
         _, expected = cast(model, qpos[t], Pinhole.of(stream), *SENSING.image_size)
         measured = stream.depth[t]
-        sure = (expected > 0) & (measured > 0) & ~edges(expected, 0.008)
+        sure = (expected > 0) & (measured > 0) & ~_edges(expected, 0.008)
         assert sure.mean() > 0.85
         scaled = (measured - expected)[sure] / (SENSING.depth_noise * expected[sure] ** 2)
         assert abs(scaled.mean()) < 0.03
@@ -60,7 +60,7 @@ def test_depth_lifted_with_intrinsics_and_pose_lands_on_table_and_block(scenes):
     model, qpos, stream = scenes
     camera = Pinhole.of(stream)
     geom, expected = cast(model, qpos[0], camera, *SENSING.image_size)
-    sure = (stream.depth[0] > 0) & ~edges(expected, 0.008)
+    sure = (stream.depth[0] > 0) & ~_edges(expected, 0.008)
     points = camera.lift(pixel_grid(*SENSING.image_size), stream.depth[0])
     table = points[sure & (geom == model.geom("table").id)]
     assert len(table) > 5000
@@ -80,7 +80,7 @@ def test_depth_lifted_with_intrinsics_and_pose_lands_on_table_and_block(scenes):
 def test_depth_is_lost_only_at_edges_and_reported_in_steps(scenes):
     model, qpos, stream = scenes
     _, expected = cast(model, qpos[1], Pinhole.of(stream), *SENSING.image_size)
-    edge = edges(expected, SENSING.depth_jump)
+    edge = _edges(expected, SENSING.depth_jump)
     lost = (stream.depth[1] == 0) & (expected > 0)
     assert lost.sum() > 50
     assert (lost & edge).sum() > 0.97 * lost.sum()

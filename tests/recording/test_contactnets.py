@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.formats.contactnets import EDGE, INERTIA, MASS, PERIOD, read_contactnets, toss_scene
+from concent_warp.recording.formats.contactnets import EDGE, INERTIA, MASS, PERIOD, _toss_scene, read_contactnets
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "contactnets_cube"
 torch = pytest.importorskip("torch")
@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 
 @pytest.fixture
 def model():
-    return mujoco.MjModel.from_xml_string(toss_scene())
+    return mujoco.MjModel.from_xml_string(_toss_scene())
 
 
 def fly(model, qpos, qvel, time):

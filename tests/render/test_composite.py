@@ -4,9 +4,9 @@ import pytest
 import torch
 from small_arm import XML, ball, states
 
-from concent_warp.render.composite import HybridCamera, composed
+from concent_warp.render.composite import HybridCamera, _composed
 from concent_warp.render.figure import Album, decomposition
-from concent_warp.render.raw import camera_ids
+from concent_warp.render.raw import _camera_ids
 from concent_warp.render.shadows import ShadowCfg
 from concent_warp.scene.scene import Scene
 
@@ -25,7 +25,7 @@ def test_composition_is_the_formula_of_layers():
     background, objects = torch.full((1, 1, 1, 3, 3), 0.8), torch.zeros(1, 1, 1, 3, 3)
     objects[..., 1, :], objects[..., 2, :] = 0.5, 2.0
     alpha, shadow = torch.tensor([[[[0.0, 0.5, 1.0]]]]), torch.tensor([[[[0.25, 0.5, 0.9]]]])
-    image = composed(background, objects, alpha, shadow)[0, 0, 0, :, 0]
+    image = _composed(background, objects, alpha, shadow)[0, 0, 0, :, 0]
     assert torch.allclose(image, torch.tensor([0.6, 0.5 + 0.5 * 0.4, 1.0]))
 
 
@@ -102,7 +102,7 @@ def test_figure_has_a_row_for_each_sample_and_camera(tmp_path):
     picture = cv2.imread(str(tmp_path / "layers.png"))
     assert picture is not None
     assert picture.shape[1] / picture.shape[0] == pytest.approx(5 / 4, rel=0.1)
-    assert len(camera_ids(Scene(XML).model, camera.cameras)) == 2
+    assert len(_camera_ids(Scene(XML).model, camera.cameras)) == 2
 
 
 @pytest.mark.gpu

@@ -16,8 +16,8 @@ from concent_warp.render.networks.cfg import (
 from concent_warp.render.networks.flow import draw, flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
-from concent_warp.render.networks.pairs import Pairs, columns, frames_before
-from concent_warp.render.networks.super_resolution import SuperResolution, enlarged, reduced
+from concent_warp.render.networks.pairs import Pairs, _columns, _frames_before
+from concent_warp.render.networks.super_resolution import SuperResolution, _enlarged, reduced
 from concent_warp.render.networks.train import RenderTraining
 
 SMALL = FlowNetworkCfg(size=16, width=8, factors=(1, 2))
@@ -47,7 +47,7 @@ def pairs(name="base", body=None, count=12) -> Pairs:
     for k in range(count):
         real[k, 0, 16:32, 4 * k : 4 * k + 16] = 250
         simulated[k, :, 16:32, 4 * k : 4 * k + 16] = 80
-    return Pairs(camera, real, simulated, torch.rand(count, 9), frames_before([count]))
+    return Pairs(camera, real, simulated, torch.rand(count, 9), _frames_before([count]))
 
 
 def test_flow_of_a_perfect_network_ends_at_its_image():
@@ -93,7 +93,7 @@ def test_super_resolution_starts_as_bicubic_and_enlarges_four_times():
     network = SuperResolution(SuperResolutionCfg(width=8, blocks=2))
     small = torch.rand(2, 3, 10, 12)
     assert network(small).shape == (2, 3, 40, 48)
-    assert torch.allclose(network(small), enlarged(small))
+    assert torch.allclose(network(small), _enlarged(small))
     flat = torch.full((1, 3, 32, 32), 0.3)
     assert torch.allclose(reduced(flat, 8), torch.full((1, 3, 8, 8), 0.3))
 
@@ -185,11 +185,11 @@ def test_columns_are_those_of_the_rotation():
     quaternion = torch.tensor(turns.as_quat()[:, [3, 0, 1, 2]])
     matrices = turns.as_matrix()
     expected = np.concatenate([matrices[:, :, 0], matrices[:, :, 1]], axis=1)
-    assert np.allclose(columns(quaternion).numpy(), expected)
+    assert np.allclose(_columns(quaternion).numpy(), expected)
 
 
 def test_frame_before_the_first_is_none():
-    assert frames_before([3, 2]).tolist() == [-1, 0, 1, -1, 3]
+    assert _frames_before([3, 2]).tolist() == [-1, 0, 1, -1, 3]
 
 
 @pytest.mark.gpu

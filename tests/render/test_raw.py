@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from concent_warp.errors import RenderError, SceneError
-from concent_warp.render.raw import RawCamera, Stage, camera_ids, matrix_quaternions
+from concent_warp.render.raw import RawCamera, Stage, _camera_ids, _matrix_quaternions
 from concent_warp.scene.cameras import BASE, WRIST, with_cameras
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
@@ -65,7 +65,7 @@ def test_depth_and_segmentation_are_those_of_c_mujoco(sorter):
 
 def cast_through_pixels(model, data, name, matrix):
     """Return planar depths [m] and geom ids, shape SIZE, by C MuJoCo's rays."""
-    row = camera_ids(model, [name])[0]
+    row = _camera_ids(model, [name])[0]
     depth, geom, hit = np.zeros(SIZE), np.full(SIZE, -1), np.zeros(1, dtype=np.int32)
     turned = data.cam_xmat[row].reshape(3, 3)
     shown = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
@@ -119,7 +119,7 @@ def test_wrist_camera_moves_with_the_hand_and_poses_are_those_of_mujoco(sorter):
         data.qpos[0] += angle
         stage.place(data.qpos[None].copy())
         mujoco.mj_forward(model, data)
-        row = camera_ids(model, [WRIST])[0]
+        row = _camera_ids(model, [WRIST])[0]
         pose = stage.camera_poses([WRIST])[0, 0].numpy()
         expected = np.zeros(4)
         mujoco.mju_mat2Quat(expected, data.cam_xmat[row])
@@ -142,7 +142,7 @@ def test_quaternions_are_those_of_the_matrices_whatever_the_rotation():
     matrices = np.zeros((200, 9))
     for matrix, quaternion in zip(matrices, given, strict=True):
         mujoco.mju_quat2Mat(matrix, quaternion)
-    found = matrix_quaternions(torch.tensor(matrices).view(10, 20, 3, 3)).view(200, 4).numpy()
+    found = _matrix_quaternions(torch.tensor(matrices).view(10, 20, 3, 3)).view(200, 4).numpy()
     assert np.allclose(np.abs((found * given).sum(axis=1)), 1, atol=1e-9)
 
 

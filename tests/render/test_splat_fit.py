@@ -8,7 +8,7 @@ from photographed import ball, cameras, photographed
 
 from concent_warp.errors import RenderError, SceneError
 from concent_warp.render.splats.cfg import RatesCfg, SplatFitCfg
-from concent_warp.render.splats.fit import SplatFit, turned
+from concent_warp.render.splats.fit import SplatFit, _turned
 from concent_warp.render.splats.initial import read_start, visual_hull
 from concent_warp.render.splats.splats import Splats
 
@@ -131,4 +131,4 @@ def test_vectors_are_turned_as_by_scipy():
     rng = np.random.default_rng(0)
     quats, vectors = rng.normal(size=(20, 4)), rng.normal(size=(20, 3))
     expected = Rotation.from_quat(quats, scalar_first=True).apply(vectors)
-    np.testing.assert_allclose(turned(torch.tensor(quats), torch.tensor(vectors)), expected)
+    np.testing.assert_allclose(_turned(torch.tensor(quats), torch.tensor(vectors)), expected)

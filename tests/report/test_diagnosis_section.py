@@ -4,7 +4,7 @@ from html import unescape
 import pytest
 
 from concent_warp.comparison.compare import compare_replays
-from concent_warp.report.diagnosis import accepted, bars, diagnosis_section, headline
+from concent_warp.report.diagnosis import _accepted, _bars, _headline, diagnosis_section
 from concent_warp.report.report import write_report
 
 
@@ -49,7 +49,7 @@ def test_an_effect_is_named_with_its_gain_interval_p_and_parameter():
 
 def test_several_accepted_effects_are_all_named():
     both = {**NAMED, "effects": [effect("joint_friction", 0.4, 0.001), effect("load_friction", 0.3, 0.01)]}
-    text = headline(both)
+    text = _headline(both)
     assert "lacks joint friction (joints and drives) and load friction (joints and drives)." in text
     assert "joint friction takes away 40 % [30, 50] of the error (p = 0.001), load friction takes away 30 %" in text
 
@@ -76,7 +76,7 @@ def test_no_effect_is_said_in_words(verdict, said):
 def test_what_was_found_is_named_beside_what_no_effect_explains():
     partly = {**NAMED, "verdict": "none_of_these", "groups": [["joint_friction", "mass"], ["drag"]], "unexplained": 0.3}
     partly["effects"] = [effect("joint_friction", 0.5, 0.001), effect("drag", 0.2, 0.01), effect("wind", 0.1, 0.3)]
-    text = headline(partly)
+    text = _headline(partly)
     assert (
         "none of the effects in the library explains, beside what joint friction or mass and drag can account" in text
     )
@@ -87,7 +87,7 @@ def test_what_was_found_is_named_beside_what_no_effect_explains():
 
 
 def test_bars_span_from_zero_to_the_gain_and_whiskers_the_interval():
-    drawn = bars([effect("joint_friction", 0.8, 0.001), effect("drag", -0.1, 1.0)])
+    drawn = _bars([effect("joint_friction", 0.8, 0.001), effect("drag", -0.1, 1.0)])
     first, second = re.findall(r'class="effect (\w+)"(.*?)</div>', drawn)
     assert (first[0], second[0]) == ("accepted", "rejected")
     low, span = -0.2, 1.1
@@ -99,10 +99,10 @@ def test_bars_span_from_zero_to_the_gain_and_whiskers_the_interval():
 
 
 def test_what_the_diagnosis_says_of_acceptance_counts_more_than_p():
-    assert accepted(effect("a", 0.3, 0.01))
-    assert not accepted(effect("a", 0.3, 0.2))
-    assert not accepted(effect("a", 0.05, 0.01))
-    assert not accepted(effect("a", 0.3, 0.01, accepted=False))
+    assert _accepted(effect("a", 0.3, 0.01))
+    assert not _accepted(effect("a", 0.3, 0.2))
+    assert not _accepted(effect("a", 0.05, 0.01))
+    assert not _accepted(effect("a", 0.3, 0.01, accepted=False))
 
 
 def test_missing_entries_and_flat_forms_are_taken():

@@ -12,7 +12,7 @@ from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.units import shown
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.report.report import filled, write_report
+from concent_warp.report.report import _filled, write_report
 from concent_warp.report.scene_data import scene_bodies
 from concent_warp.report.where import numbered, shown_demonstrations
 from concent_warp.scene.scene import Scene
@@ -254,4 +254,4 @@ def test_meshes_of_any_size_stay_small(tmp_path):
 
 
 def test_what_is_put_into_a_template_is_not_looked_at_again():
-    assert filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"
+    assert _filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"

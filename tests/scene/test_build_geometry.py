@@ -8,7 +8,7 @@ from concent_warp.errors import ModelError, SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
-from concent_warp.scene.spheres.build import ContactGeometryCfg, apportion
+from concent_warp.scene.spheres.build import ContactGeometryCfg, _apportion
 from concent_warp.scene.spheres.disturb import disturb, offset_normal, toward_axis
 
 SCENE = Scene(
@@ -161,7 +161,7 @@ def test_default_geometry_takes_less_than_three_seconds():
 
 
 def test_apportioned_parts_sum_to_the_whole():
-    parts = apportion(10, np.array([1.0, 1.0, 1.0]))
+    parts = _apportion(10, np.array([1.0, 1.0, 1.0]))
     assert parts.sum() == 10
     assert parts.max() - parts.min() == 1
 

@@ -4,7 +4,7 @@ import numpy as np
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.scene.spheres.export import export_mjcf, save_mjcf
+from concent_warp.scene.spheres.export import _export_mjcf, save_mjcf
 
 SCENE = Scene(
     """<mujoco><option timestep=".002"/><default><geom friction=".9" margin=".0005"/>
@@ -29,7 +29,7 @@ def simulate(model: mujoco.MjModel) -> tuple[np.ndarray, int]:
 def test_export_simulates_as_the_model_does():
     model = Model(SCENE, ContactGeometryCfg(count=60).build(SCENE))
     expected, contacts = simulate(model.compile())
-    found, exported_contacts = simulate(mujoco.MjModel.from_xml_string(export_mjcf(model)))
+    found, exported_contacts = simulate(mujoco.MjModel.from_xml_string(_export_mjcf(model)))
     assert contacts > 100
     assert exported_contacts == contacts
     np.testing.assert_allclose(found, expected, atol=1e-9)
@@ -37,7 +37,7 @@ def test_export_simulates_as_the_model_does():
 
 def test_export_keeps_names_and_inertia():
     geometry = ContactGeometryCfg(count=30).build(SCENE)
-    exported = mujoco.MjModel.from_xml_string(export_mjcf(Model(SCENE, geometry)))
+    exported = mujoco.MjModel.from_xml_string(_export_mjcf(Model(SCENE, geometry)))
     for i, name in enumerate(geometry.names()):
         geom = exported.geom(name)
         assert geom.size[0] == geometry.radius[i]
@@ -60,5 +60,5 @@ def test_bodies_that_the_text_does_not_spell_out_are_exported():
         '<geom type="box" size=".02 .02 .02"/></body></replicate></worldbody></mujoco>'
     )
     model = Model(scene, ContactGeometryCfg(count=20).build(scene, ["b0", "b1"]))
-    found, _ = simulate(mujoco.MjModel.from_xml_string(export_mjcf(model)))
+    found, _ = simulate(mujoco.MjModel.from_xml_string(_export_mjcf(model)))
     np.testing.assert_allclose(found, simulate(model.compile())[0], atol=1e-9)

@@ -8,7 +8,7 @@ from pushing import STEPS, make_model
 from concent_warp.errors import EngineError
 from concent_warp.simulate import warp_engine as warp_engine_module
 from concent_warp.simulate.engine import Variants
-from concent_warp.simulate.warp_engine import WarpEngine, rung
+from concent_warp.simulate.warp_engine import WarpEngine, _rung
 from concent_warp.simulate.warp_program import Buffers, world_bytes
 
 ROWS = np.arange(0, STEPS + 1, 10)
@@ -215,7 +215,7 @@ def test_model_that_warp_cannot_simulate_names_the_other_engine(model, ctrl):
 
 
 def test_buffer_sizes_come_from_a_short_list():
-    assert [rung(x) for x in (1, 16, 17, 24.5, 33, 49, 96.0, 97)] == [16, 16, 24, 32, 48, 64, 96, 128]
+    assert [_rung(x) for x in (1, 16, 17, 24.5, 33, 49, 96.0, 97)] == [16, 16, 24, 32, 48, 64, 96, 128]
 
 
 def test_runge_kutta_records_the_state_before_its_stages(ctrl):

@@ -10,11 +10,11 @@ from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 
 from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
-from concent_warp.train.environment.worlds import make_environment, make_physics
+from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.policy.evaluate import run_episodes
 from concent_warp.train.resets.sample import InitialStates, draw_states
 from concent_warp.train.task.movable import movable
-from concent_warp.train.task.stages import worst_distance
+from concent_warp.train.task.stages import _worst_distance
 from concent_warp.train.task.task import Task
 
 WORLDS = 6
@@ -68,7 +68,7 @@ def test_world_moves_on_exactly_when_its_target_has_been_met_for_long_enough(as_
             break
         d.qpos[:] = environment.physics.qpos[1]
         mujoco.mj_kinematics(chain.compiled, d)
-        held = held + 1 if worst_distance(chain.table, d, stage) < CHAIN.chain.tolerance else 0
+        held = held + 1 if _worst_distance(chain.table, d, stage) < CHAIN.chain.tolerance else 0
         if held == CHAIN.chain.hold and stage < 2:
             stage, held = stage + 1, 0
             moves.append(k)
@@ -110,13 +110,13 @@ def test_observation_shows_the_stage_that_the_world_is_in(chain, drawn):
         s = int(drawn.stage[i])
         assert (shown[i, :, 0] > 0).tolist() == table.used[s].tolist()
         assert np.linalg.norm(shown[i, :, 4:7], axis=1).max() == pytest.approx(
-            worst_distance(chain.table, d, s), abs=1e-6
+            _worst_distance(chain.table, d, s), abs=1e-6
         )
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_block_falls_into_the_hole_wherever_a_world_has_it(chain, engine):
-    physics = make_physics(chain, replace(CHAIN, worlds=WORLDS, engine=engine), device="cpu")
+    physics = _make_physics(chain, replace(CHAIN, worlds=WORLDS, engine=engine), device="cpu")
     rng = np.random.default_rng(0)
     box = np.array([HOLE, 0]) + rng.uniform(-0.03, 0.03, (WORLDS, 2))
     block = rng.uniform(-0.001, 0.001, (WORLDS, 2))

@@ -14,7 +14,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.commands import Follower, Following
 from concent_warp.train.environment.effects import effects_of_worlds
-from concent_warp.train.environment.worlds import make_environment, make_physics
+from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.task.task import Task
 
 DELAY = AddedEffect(ActuatorDelay("x", "y"), (0.031,), ((0.0, 0.062),))
@@ -82,7 +82,7 @@ def test_worlds_that_begin_anew_forget_what_was_commanded(late):
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=DECIMATION)
-    physics = make_physics(late, settings, device="cpu")
+    physics = _make_physics(late, settings, device="cpu")
     values = effects_of_worlds(late, WORLDS, 0, draw=True).values
     assert len(np.unique(values[0])) == WORLDS
     physics.qpos[:] = torch.as_tensor(late.replay.qpos[0]).to(physics.qpos.dtype)
@@ -126,7 +126,7 @@ def test_saved_state_holds_what_was_commanded(late, states):
 
 def test_drawn_delay_is_of_the_arm_alone(task):
     cfg = replace(SETTINGS, worlds=4, randomisation=RandomisationCfg(delay=(0.05, 0.05)), decimation=2)
-    physics = make_physics(task, cfg, device="cpu")
+    physics = _make_physics(task, cfg, device="cpu")
     physics.qpos[:] = torch.as_tensor(task.replay.qpos[0])
     physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)
     physics.begin(torch.ones(4, dtype=torch.bool))

@@ -14,9 +14,9 @@ from concent_warp.effects.library.joints import JointDamping, Stribeck
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.effects import drawn, effects_of_worlds
+from concent_warp.train.environment.effects import _drawn, effects_of_worlds
 from concent_warp.train.environment.randomisation import drawn_fields
-from concent_warp.train.environment.worlds import make_physics
+from concent_warp.train.environment.worlds import _make_physics
 from concent_warp.train.task.task import Task
 
 DAMPING = AddedEffect(JointDamping("x", "y"), (30.0, 20.0), ((20.0, 40.0), (20.0, 20.0)))
@@ -42,7 +42,7 @@ def varied() -> Task:
 def test_parameters_have_the_interval_of_the_fit(varied):
     rng = np.random.default_rng(0)
     added = (DAMPING, STRIBECK, MASS)
-    damping, stribeck, mass = (drawn(a.effect.parameters(varied.compiled), a, 4000, rng) for a in added)
+    damping, stribeck, mass = (_drawn(a.effect.parameters(varied.compiled), a, 4000, rng) for a in added)
     for values, (low, high) in ((damping[:, 0], (20, 40)), (stribeck[:, 0], (2, 10)), (mass[:, 0], (1.0, 1.4))):
         assert ((values > low) & (values < high)).mean() == pytest.approx(0.95, abs=0.012)
         assert values.mean() == pytest.approx((low + high) / 2, abs=0.02 * (low + high))
@@ -87,7 +87,7 @@ def test_fields_are_those_of_models_with_the_drawn_values(varied):
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_each_world_moves_as_a_model_with_its_values(varied, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=5)
-    physics = make_physics(varied, settings, device="cpu")
+    physics = _make_physics(varied, settings, device="cpu")
     found = effects_of_worlds(varied, WORLDS, 0, draw=True)
     start = torch.as_tensor(varied.replay.qpos[0])
     physics.qpos[:] = start.to(physics.qpos.dtype)

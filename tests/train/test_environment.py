@@ -11,9 +11,9 @@ from small_insertion import SETTINGS
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
-from concent_warp.train.environment.physics import WarpPhysics, compiled_or_plain
+from concent_warp.train.environment.physics import WarpPhysics, _compiled_or_plain
 from concent_warp.train.environment.randomisation import drawn_fields
-from concent_warp.train.environment.worlds import make_environment, make_physics
+from concent_warp.train.environment.worlds import _make_physics, make_environment
 
 
 def still(environment: Environment) -> torch.Tensor:
@@ -209,7 +209,7 @@ def test_randomised_fields_differ_between_worlds_and_are_used(task):
     )
     gain, bias = fields["actuator_gainprm"][..., 0], fields["actuator_biasprm"][..., 1]
     np.testing.assert_allclose(gain, -bias)
-    physics = make_physics(task, replace(SETTINGS, worlds=4, engine="warp", randomisation=cfg), device="cpu")
+    physics = _make_physics(task, replace(SETTINGS, worlds=4, engine="warp", randomisation=cfg), device="cpu")
     assert isinstance(physics, WarpPhysics)
     start_qpos = physics.qpos.clone()
     physics.ctrl[:, :3] = 0.05
@@ -224,7 +224,7 @@ def test_drawn_joint_friction_holds_the_arm(task, engine):
     moved = []
     for randomisation in (SETTINGS.randomisation, cfg):
         settings = replace(SETTINGS, worlds=2, engine=engine, randomisation=randomisation)
-        physics = make_physics(task, settings, device="cpu")
+        physics = _make_physics(task, settings, device="cpu")
         physics.qpos[:] = torch.as_tensor(task.replay.qpos[0]).to(physics.qpos.dtype)
         physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)
         before = physics.qpos.clone()
@@ -243,10 +243,10 @@ def test_collidable_spheres_are_those_of_the_events(task):
 
 
 def test_solver_stops_at_the_iterations_that_are_asked_for(task):
-    limited = make_physics(task, replace(SETTINGS, worlds=1, solver_iterations=3, ls_iterations=7), device="cpu")
+    limited = _make_physics(task, replace(SETTINGS, worlds=1, solver_iterations=3, ls_iterations=7), device="cpu")
     assert (limited.model.opt.iterations, limited.model.opt.ls_iterations) == (3, 7)
     assert task.compiled.opt.iterations != 3
-    plain = make_physics(task, replace(SETTINGS, worlds=1), device="cpu")
+    plain = _make_physics(task, replace(SETTINGS, worlds=1), device="cpu")
     assert plain.model.opt.iterations == task.compiled.opt.iterations
 
 
@@ -294,7 +294,7 @@ def test_operations_that_no_compiler_fuses_are_carried_out_one_by_one():
             total.zero_()
 
     with pytest.warns(UserWarning, match="not fused"):
-        left = compiled_or_plain(part)
+        left = _compiled_or_plain(part)
     assert left is part
     left()
     assert (total > 0).all()

@@ -7,7 +7,7 @@ import pytest
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 from concent_warp.train.cfg import ActionCfg
 from concent_warp.train.resets.inverse_kinematics import reach
-from concent_warp.train.resets.inverse_kinematics_batch import reach_many, tool_chain
+from concent_warp.train.resets.inverse_kinematics_batch import _tool_chain, reach_many
 from concent_warp.train.task.robot import Robot
 
 Asked = tuple[mujoco.MjModel, Robot, np.ndarray, np.ndarray, np.ndarray]
@@ -70,7 +70,7 @@ def test_newton_reaches_all_poses_at_once(asked):
 
 def test_newton_chain_has_the_joints_of_the_arm(asked):
     m, robot, *_ = asked
-    chain, joints, link, offset = tool_chain(m, robot, "cpu")
+    chain, joints, link, offset = _tool_chain(m, robot, "cpu")
     assert joints.tolist() == robot.joint.tolist()
     assert chain.joint_count == 7
     assert link == 6

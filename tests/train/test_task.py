@@ -16,7 +16,7 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.resets.sample import draw_states
-from concent_warp.train.task.slots import choose
+from concent_warp.train.task.slots import _choose
 from concent_warp.train.task.task import Task
 
 
@@ -66,7 +66,7 @@ def test_observation_of_the_shape_sorter_reads_the_state(sorter):
 
 def test_slots_keep_every_pair_of_bodies_and_favour_the_stages_own(sorter):
     stage = sorter.events.stages[sorter.stage]
-    chosen = choose(sorter.events, stage, 8)
+    chosen = _choose(sorter.events, stage, 8)
     bodies = [(sorter.events.entity[p.a].body, sorter.events.entity[p.b].body) for p in chosen]
     every = {(sorter.events.entity[p.a].body, sorter.events.entity[p.b].body) for p in stage.event.pairs}
     assert len(chosen) == 8
@@ -74,7 +74,7 @@ def test_slots_keep_every_pair_of_bodies_and_favour_the_stages_own(sorter):
     touching = sum(sorter.events.entity[p.b].body == "box" for p in stage.event.pairs)
     assert bodies.count(("block", "box")) == min(touching, 8 - (len(every) - 1))
     assert len(set(chosen)) == 8
-    assert choose(sorter.events, stage, 1)[0] in stage.event.pairs
+    assert _choose(sorter.events, stage, 1)[0] in stage.event.pairs
 
 
 def test_place_of_success_is_the_seat_in_the_hole(task):

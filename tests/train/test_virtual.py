@@ -10,7 +10,7 @@ from small_insertion import SETTINGS
 from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.train.cfg import CollisionCfg
-from concent_warp.train.environment.vcp import surface_points, within
+from concent_warp.train.environment.vcp import _surface_points, _within
 from concent_warp.train.environment.worlds import make_environment
 
 HALF, RADIUS, SLACK = 0.02, 0.004, 0.0005
@@ -19,7 +19,7 @@ CUBE = Surface.of_solids([Box(np.full(3, HALF))])
 
 def test_spheres_within_an_object_shrink_by_the_slack():
     centre = np.array([[HALF - RADIUS, 0, 0], [0.0, 0.0, 0.0]])
-    moved, radius = within(CUBE, centre, np.full(2, RADIUS), SLACK)
+    moved, radius = _within(CUBE, centre, np.full(2, RADIUS), SLACK)
     np.testing.assert_allclose(moved, centre)
     np.testing.assert_allclose(radius, RADIUS - SLACK)
 
@@ -27,7 +27,7 @@ def test_spheres_within_an_object_shrink_by_the_slack():
 @pytest.mark.parametrize("out", [-0.001, 0.0, 0.002])
 def test_spheres_that_stand_out_end_the_slack_below_the_surface(out):
     centre = np.array([[HALF + out, 0.005, -0.003], [0.001, -HALF - out, 0.004]])
-    moved, radius = within(CUBE, centre, np.full(2, RADIUS), SLACK)
+    moved, radius = _within(CUBE, centre, np.full(2, RADIUS), SLACK)
     np.testing.assert_allclose(CUBE.signed_distance(moved) + radius, -SLACK, atol=1e-12)
     np.testing.assert_allclose(radius, max(-out - SLACK, 0.0), atol=1e-12)
     aside = [[1, 2], [0, 2]]
@@ -37,7 +37,7 @@ def test_spheres_that_stand_out_end_the_slack_below_the_surface(out):
 
 def test_points_lie_just_below_the_surface_and_reach_into_the_corners():
     cfg = CollisionCfg(points=300, slack=SLACK)
-    points = surface_points(CUBE, cfg)
+    points = _surface_points(CUBE, cfg)
     assert points.shape == (300, 3)
     depth = -CUBE.signed_distance(points)
     assert depth.min() > -1e-6

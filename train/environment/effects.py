@@ -61,12 +61,12 @@ def effects_of_worlds(
     values, varied, kept = [], [], []
     for added in effects:
         rows = np.tile(added.array, (worlds, 1))
-        if draw and any_open(added):
-            if can_vary(added.effect, added.effect.fields(m), variable):
+        if draw and _any_open(added):
+            if _can_vary(added.effect, added.effect.fields(m), variable):
                 parameters = added.effect.parameters(bare)
-                rows = drawn(parameters, added, worlds, rng)
+                rows = _drawn(parameters, added, worlds, rng)
                 varied.append(added.effect)
-            elif acts(added.effect):
+            elif _acts(added.effect):
                 kept.append(added.effect.name)
         values.append(rows)
     if kept:
@@ -74,35 +74,35 @@ def effects_of_worlds(
             f"the simulator cannot vary {', '.join(kept)} between worlds: all have the fitted value", stacklevel=2
         )
     laws = [(law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None]
-    late = tuple(following(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands)
-    fields = written_fields(bare, [added.effect for added in effects], varied, values)
+    late = tuple(_following(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands)
+    fields = _written_fields(bare, [added.effect for added in effects], varied, values)
     return EffectsOfWorlds(fields, laws, late, tuple(values), tuple(kept))
 
 
-def following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> Following:
+def _following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> Following:
     """Return how commands are followed under an effect on them; its parameters in the worlds are of shape (N, P)."""
     found = [effect.late(m, row) for row in values]
     delay, lag = (np.array([late[k] for late in found if late is not None]) for k in range(2))
     return Following(delay, (lag,))
 
 
-def any_open(added: AddedEffect) -> bool:
+def _any_open(added: AddedEffect) -> bool:
     """Return whether an interval leaves anything open."""
     return any(np.isfinite([low, high]).all() and high > low for low, high in added.intervals)
 
 
-def acts(effect: Effect) -> bool:
+def _acts(effect: Effect) -> bool:
     """Return whether an effect changes the motion, and not only what instruments read."""
     law, write = type(effect).law is not Effect.law, type(effect).write is not Effect.write
     return law or write or effect.edits or effect.commands
 
 
-def can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:
+def _can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:
     """Return whether the parameters of an effect can differ between worlds that share what is compiled."""
-    return acts(effect) and not effect.edits and all(map(variable or bool, fields))
+    return _acts(effect) and not effect.edits and all(map(variable or bool, fields))
 
 
-def drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rng: np.random.Generator) -> np.ndarray:
+def _drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rng: np.random.Generator) -> np.ndarray:
     """Return parameters of an effect for N worlds, shape (N, P)."""
     from scipy.stats import truncnorm
 
@@ -116,7 +116,7 @@ def drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rn
     return rows
 
 
-def written_fields(
+def _written_fields(
     bare: mujoco.MjModel, effects: list[Effect], varied: list[Effect], values: list[np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Return the model fields that varied effects set, shape (N, ...) each.

@@ -370,7 +370,7 @@ class Graph:
                 wp.capture_launch(self._graph, stream=stream)
 
 
-def compiled_or_plain(part: Callable[[], None]) -> Callable[[], None]:
+def _compiled_or_plain(part: Callable[[], None]) -> Callable[[], None]:
     """Do torch operations on fixed buffers; return them compiled into few kernels, or as they are where that fails."""
     from torch._dynamo.exc import TorchDynamoException
 
@@ -390,7 +390,7 @@ def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> 
     if not capture:
         return part
     if fuse:
-        part = compiled_or_plain(part)
+        part = _compiled_or_plain(part)
     with torch.no_grad():
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())

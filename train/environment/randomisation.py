@@ -46,7 +46,7 @@ def drawn_fields(
         values[where] *= factor.reshape(worlds, *[1] * (values[where].ndim - 1))
         found[name] = values
 
-    robot = np.isin(m.geom_bodyid, moved_by_robot(task))
+    robot = np.isin(m.geom_bodyid, _moved_by_robot(task))
     for extent, rows in ((cfg.friction, np.flatnonzero(~robot)), (cfg.grip, np.flatnonzero(robot))):
         if extent != ONE:
             scaled("geom_friction", rng.uniform(*extent, worlds), rows=rows, column=0)
@@ -82,7 +82,7 @@ def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -
     return Following(times[0], (times[1],))
 
 
-def moved_by_robot(task: Task) -> list[int]:
+def _moved_by_robot(task: Task) -> list[int]:
     """Return the ids of the bodies that the robot's joints move."""
     m: mujoco.MjModel = task.compiled
     moved = {int(i) for i in m.jnt_bodyid[task.robot.joint]}

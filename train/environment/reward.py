@@ -46,7 +46,7 @@ def disturbance(
     return -(cfg.disturb_position * moved + cfg.disturb_rotation * turned).sum(dim=1)
 
 
-def two_scales(distance: torch.Tensor, far: tuple[float, float], near: tuple[float, float]) -> torch.Tensor:
+def _two_scales(distance: torch.Tensor, far: tuple[float, float], near: tuple[float, float]) -> torch.Tensor:
     """Return A_f exp(-d / sigma_f) + A_n exp(-d / sigma_n) of distances [m], shape of `distance`."""
     return far[0] * torch.exp(-distance / far[1]) + near[0] * torch.exp(-distance / near[1])
 
@@ -63,4 +63,4 @@ def engineered(cfg: EngineeredCfg, place: torch.Tensor) -> torch.Tensor:
     above = (place[:, 2] - cfg.seat).clamp(min=0)
     gate = torch.sigmoid((cfg.gate - aside) / cfg.gate_width)
     seated = (aside < cfg.reached) & (above <= 0)
-    return two_scales(aside, cfg.far, cfg.near) + gate * two_scales(above, cfg.far, cfg.near) + cfg.bonus * seated
+    return _two_scales(aside, cfg.far, cfg.near) + gate * _two_scales(above, cfg.far, cfg.near) + cfg.bonus * seated

@@ -43,10 +43,10 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     for body in geometry.bodies:
         surface = Surface.of_body(task.model.scene, body)
         if cfg.points:
-            points.append(SphereSet(m.body(body).id, surface_points(surface, cfg), np.zeros(cfg.points)))
+            points.append(SphereSet(m.body(body).id, _surface_points(surface, cfg), np.zeros(cfg.points)))
         left = geometry.of(body)[~task.collidable[geometry.of(body)]]
         if len(left):
-            covered = within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
+            covered = _within(surface, geometry.position[left], geometry.radius[left], cfg.slack)
             sets.append(SphereSet(m.body(body).id, *covered))
     links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
     tool = int(m.site_bodyid[task.robot.tool])
@@ -54,12 +54,12 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     scene = task.model.scene.model
     targets: list[SphereSet | TargetMesh] = []
     for body in (*task.objects, *sorted(links - set(task.objects))):
-        mesh = body_mesh(scene, body, visual=body in task.objects)
+        mesh = _body_mesh(scene, body, visual=body in task.objects)
         if mesh is not None:
             targets.append(TargetMesh(body, *mesh))
     reaches = {0: range(len(targets)), 1: [j for j, b in enumerate(targets) if b.body in task.objects]}
     pairs = [
-        VirtualPair(i, j, cfg.margin, cfg.severe, tuple(gate(task, s, a.body, targets[j].body) for s in range(stages)))
+        VirtualPair(i, j, cfg.margin, cfg.severe, tuple(_gate(task, s, a.body, targets[j].body) for s in range(stages)))
         for i, a in enumerate([*sets, *points])
         for j in reaches[i >= len(sets)]
         if a.body != targets[j].body
@@ -80,7 +80,7 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
     )
 
 
-def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
+def _within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
     """Return spheres that stay `slack` [m] below an object's surface: centres [m], shape (n, 3), radii [m], shape (n,).
 
     Spheres centred on the surface stand out of it by their radius, which a fit has corrected for those alone that took
@@ -92,20 +92,20 @@ def within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: floa
     return centre - inward[:, None] * outward, np.maximum(deep - slack, 0.0)
 
 
-def surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
+def _surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
     """Return points spread over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
     found, _ = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
     return inset(surface, found[farthest_point_sampling(found, cfg.points)], cfg.slack)[0]
 
 
-def gate(task: Task, stage: int, a: int, b: int) -> float:
+def _gate(task: Task, stage: int, a: int, b: int) -> float:
     """Return 0 where a stage's target event has two bodies touch, else 1."""
     used = task.table.used[stage]
     touching = set(zip(task.table.body_a[stage][used], task.table.body_b[stage][used], strict=True))
     return 0.0 if touching & {(a, b), (b, a)} else 1.0
 
 
-def body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray, np.ndarray] | None:
+def _body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray, np.ndarray] | None:
     """Return vertices [m] (v, 3) and faces (f, 3) of a body's shapes, body frame; None where it has none.
 
     `visual` takes all shapes, else only those that collide.
@@ -114,7 +114,7 @@ def body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray
     for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
         if not visual and not (m.geom_contype[g] or m.geom_conaffinity[g]):
             continue
-        shape = geom_mesh(m, g)
+        shape = _geom_mesh(m, g)
         if shape is not None:
             rotation = np.empty(9)
             mujoco.mju_quat2Mat(rotation, m.geom_quat[g])
@@ -126,7 +126,7 @@ def body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
-def geom_mesh(m: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+def _geom_mesh(m: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
     """Return a geom as a `trimesh.Trimesh` in its own frame, None where it is not a closed shape."""
     import trimesh
 

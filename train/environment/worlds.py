@@ -33,15 +33,15 @@ def make_environment(
     task: Task, cfg: EnvironmentCfg, states: InitialStates, *, device: str | None = None, seed: int = 0
 ) -> Environment:
     """Return the environment of a task on a device, the first CUDA device by default where there is one."""
-    return Environment(task, cfg, make_physics(task, cfg, device=device, seed=seed), states)
+    return Environment(task, cfg, _make_physics(task, cfg, device=device, seed=seed), states)
 
 
-def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0) -> Physics:
+def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0) -> Physics:
     """Return the worlds of a task."""
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = preferred_device() if device is None else device
-    m = solver_chosen(task.compiled, cfg)
+    m = _solver_chosen(task.compiled, cfg)
     on_cpu = not device.startswith("cuda")
     plain = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
     if plain:
@@ -68,7 +68,7 @@ def make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, 
     )
 
 
-def solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
+def _solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
     """Return a model with the solver, friction cones and time step that the settings ask for."""
     limited = copy.copy(m)
     limited.opt.timestep *= cfg.stride

@@ -36,14 +36,14 @@ class SquashedGaussian(GaussianDistribution):
     def log_prob(self, outputs: torch.Tensor) -> torch.Tensor:
         """Return the log density of actions (..., A), shape (...)."""
         u = torch.atanh(outputs.clamp(-LARGEST, LARGEST))
-        return super().log_prob(u) - log_slope(u).sum(dim=-1)
+        return super().log_prob(u) - _log_slope(u).sum(dim=-1)
 
     @property
     def entropy(self) -> torch.Tensor:
         """Return the entropy, shape (...): that of u, and the mean of log da/du estimated from one draw."""
         assert self._distribution is not None
         u = self._distribution.rsample()
-        return super().entropy + log_slope(u).sum(dim=-1)
+        return super().entropy + _log_slope(u).sum(dim=-1)
 
     def deterministic_output(self, mlp_output: torch.Tensor) -> torch.Tensor:
         """Return the squashed mean."""
@@ -54,6 +54,6 @@ class SquashedGaussian(GaussianDistribution):
         return nn.Tanh()
 
 
-def log_slope(u: torch.Tensor) -> torch.Tensor:
+def _log_slope(u: torch.Tensor) -> torch.Tensor:
     """Return log(1 - tanh(u)^2), in the form that does not run out of precision."""
     return 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))

@@ -28,7 +28,7 @@ def curve(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
     """Give what writes a round, after those of the first `steps` environment steps; later ones are forgotten."""
     kept = [json.dumps(point) + "\n" for point in read_curve(folder) if point["steps"] <= steps]
     write_text(folder / CURVE, "".join(kept))
-    with (folder / CURVE).open("a") as file, tensorboard(folder, steps) as board:
+    with (folder / CURVE).open("a") as file, _tensorboard(folder, steps) as board:
 
         def write(point: Point) -> None:
             file.write(json.dumps(point) + "\n")
@@ -39,7 +39,7 @@ def curve(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
 
 
 @contextmanager
-def tensorboard(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
+def _tensorboard(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
     """Give what writes a round to TensorBoard, nothing where it is not installed."""
     try:
         from torch.utils.tensorboard.writer import SummaryWriter

@@ -89,10 +89,10 @@ class Trainer:
         self.ranks = Ranks() if ranks is None else ranks
         self.device = str(environment.device)
         torch.set_float32_matmul_precision("high" if cfg.ppo.tf32 else "highest")
-        seed_everything(cfg.seed)  # the same networks in all processes
-        self.algorithm = make_ppo(environment, cfg.ppo, self.ranks)
+        _seed_everything(cfg.seed)  # the same networks in all processes
+        self.algorithm = _make_ppo(environment, cfg.ppo, self.ranks)
         if not self.ranks.first:
-            seed_everything(self.ranks.seed(cfg.seed))
+            _seed_everything(self.ranks.seed(cfg.seed))
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
         self.history: list[Round] = []
         self._offended = False
@@ -212,7 +212,7 @@ class Trainer:
     def _writer(self) -> Iterator[Report]:
         """Give what writes a round to the run folder."""
         if self.folder is None or not self.ranks.first:
-            yield ignore
+            yield _ignore
             return
         with curve(self.folder, self.steps) as write:
 
@@ -234,7 +234,7 @@ class Trainer:
         if self.folder is None:
             return
         worlds = {name: value.cpu() for name, value in self.environment.state().items()}
-        ranks = self.ranks.gathered({"environment": worlds, "random": random_state(self.device)})
+        ranks = self.ranks.gathered({"environment": worlds, "random": _random_state(self.device)})
         if not self.ranks.first:
             return
         document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
@@ -279,7 +279,7 @@ class Trainer:
         self.algorithm.learning_rate = document["learning_rate"]
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
         self.environment.restore(mine["environment"])
-        restore_random_state(mine["random"], self.device)
+        _restore_random_state(mine["random"], self.device)
 
     def policy(self) -> Callable[[TensorDict], torch.Tensor]:
         """Return the policy without exploration: from observations to actions, shape (N, A)."""
@@ -287,12 +287,12 @@ class Trainer:
         return self.algorithm.get_policy()
 
 
-def ignore(this: Round) -> None:
+def _ignore(this: Round) -> None:
     """Do nothing with a round."""
     del this
 
 
-def make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
+def _make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
     """Return rsl-rl's PPO for an environment; its gradients are averaged over the processes."""
     settings = {
         "num_steps_per_env": cfg.steps,
@@ -353,21 +353,21 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     return document
 
 
-def seed_everything(seed: int) -> None:
+def _seed_everything(seed: int) -> None:
     """Seed all generators."""
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002
     torch.manual_seed(seed)
 
 
-def random_state(device: str) -> dict[str, Any]:
+def _random_state(device: str) -> dict[str, Any]:
     """Return the state of torch's generators on the CPU and on a device; nothing else draws while training."""
     cuda = torch.cuda.get_rng_state(device).cpu() if device.startswith("cuda") else None
     return {"cpu": torch.get_rng_state(), "cuda": cuda}
 
 
-def restore_random_state(state: dict[str, Any], device: str) -> None:
-    """Bring back what `random_state` returned."""
+def _restore_random_state(state: dict[str, Any], device: str) -> None:
+    """Bring back what `_random_state` returned."""
     torch.set_rng_state(state["cpu"].cpu())
     if state["cuda"] is not None and device.startswith("cuda"):
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)

@@ -52,16 +52,16 @@ def export(run: Run, weights: Mapping[str, Any], out: Path) -> dict[str, Any]:
             "the format of the export is not known", where=out, expected=f"a name in {' or '.join(SUFFIXES)}"
         )
     task = run.task()
-    described = describe(run.cfg, task) | {"rounds": weights["iteration"], "steps": weights["steps"]}
-    module = policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"])
+    described = _describe(run.cfg, task) | {"rounds": weights["iteration"], "steps": weights["steps"]}
+    module = _policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"])
     partial = out.with_name(f".{out.name}.partial")
-    write = write_onnx if out.suffix == ".onnx" else write_torchscript
+    write = _write_onnx if out.suffix == ".onnx" else _write_torchscript
     write(module, described, partial)
     partial.replace(out)
     return described
 
 
-def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapping[str, Any]) -> nn.Module:
+def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapping[str, Any]) -> nn.Module:
     """Return the policy as a module from observations (N, O), as the environment gives them, to actions (N, A)."""
     example = TensorDict({"policy": torch.zeros(1, observations)}, batch_size=[1])
     settings = network(cfg.ppo, actor=True)
@@ -75,7 +75,7 @@ def policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mappi
     return actor.as_jit().eval()
 
 
-def write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None:
+def _write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None:
     """Write a policy as ONNX, weights within, for batches of any size."""
     import onnx
 
@@ -99,7 +99,7 @@ def write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None
     path.write_bytes(model.SerializeToString())
 
 
-def write_torchscript(module: nn.Module, described: dict[str, Any], path: Path) -> None:
+def _write_torchscript(module: nn.Module, described: dict[str, Any], path: Path) -> None:
     """Write a policy as TorchScript."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -107,26 +107,26 @@ def write_torchscript(module: nn.Module, described: dict[str, Any], path: Path) 
         torch.jit.save(traced, str(path), _extra_files={f"{METADATA}.json": json.dumps(described)})
 
 
-def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
+def _describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     """Return what one needs to run a task's policy elsewhere, as plain data; in m, rad and s."""
     dt = task.replay.timestep
     return {
         "format": FORMAT,
         "version": VERSION,
         "stages": [task.events.stages[s].name for s in task.chained],
-        "moving on": described_chain(cfg, task),
+        "moving on": _described_chain(cfg, task),
         "control period": cfg.environment.decimation * dt,
         "decimation": cfg.environment.decimation,
         "simulation step": dt,
         "episode": cfg.environment.seconds,
-        "observation": described_observation(cfg, task),
-        "action": described_action(task),
-        "gripper": described_gripper(task),
+        "observation": _described_observation(cfg, task),
+        "action": _described_action(task),
+        "gripper": _described_gripper(task),
         "versions": {name: version(name) for name in PACKAGES},
     }
 
 
-def described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
+def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     """Return names, order and meaning of the numbers that the policy takes."""
     m, robot = task.compiled, task.robot
     joints = [m.joint(j).name for j in robot.joint]
@@ -153,11 +153,11 @@ def described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "size": layout.size,
         "parts": parts,
         "normalisation": "within the policy: give it the numbers as they are" if cfg.ppo.normalise else "none",
-        "slots": described_slots(task),
+        "slots": _described_slots(task),
     }
 
 
-def described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
+def _described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
     """Return when the slots are to show the next stage, None where there is one alone."""
     if len(task.chained) == 1:
         return None
@@ -170,7 +170,7 @@ def described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
     }
 
 
-def described_slots(task: Task) -> dict[str, Any]:
+def _described_slots(task: Task) -> dict[str, Any]:
     """Return what each contact slot is made from, in each stage."""
     table, m = task.table, task.compiled
     pairs = []
@@ -197,18 +197,18 @@ def described_slots(task: Task) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def described_action(task: Task) -> dict[str, Any]:
+def _described_action(task: Task) -> dict[str, Any]:
     """Return what the numbers do that the policy gives."""
     m, robot = task.compiled, task.robot
     rows = []
     for i, (actuator, joint) in enumerate(zip(robot.actuator, robot.joint, strict=True)):
         row = {"name": m.actuator(actuator).name, "joint": m.joint(joint).name}
         row |= {"unit": "rad" if robot.turning[i] else "m", "scale": float(robot.step[i])}
-        rows.append(row | {"limits": limits(task, int(actuator)), "lead": float(robot.lead[i])})
+        rows.append(row | {"limits": _limits(task, int(actuator)), "lead": float(robot.lead[i])})
     if len(robot.gripper):
         names = [m.actuator(a).name for a in robot.gripper]
         row = {"name": "gripper", "actuators": names, "unit": "m", "scale": float(robot.step[-1])}
-        rows.append(row | {"limits": limits(task, int(robot.gripper[0])), "lead": None})
+        rows.append(row | {"limits": _limits(task, int(robot.gripper[0])), "lead": None})
     return {
         "output": OUTPUT,
         "size": robot.actions,
@@ -219,13 +219,13 @@ def described_action(task: Task) -> dict[str, Any]:
     }
 
 
-def limits(task: Task, actuator: int) -> list[float] | None:
+def _limits(task: Task, actuator: int) -> list[float] | None:
     """Return the smallest and largest command of an actuator, None where it has no limits."""
     m = task.compiled
     return [float(v) for v in m.actuator_ctrlrange[actuator]] if m.actuator_ctrllimited[actuator] else None
 
 
-def described_gripper(task: Task) -> dict[str, Any] | None:
+def _described_gripper(task: Task) -> dict[str, Any] | None:
     """Return how the gripper's number and its opening are meant, None without a gripper."""
     m, robot = task.compiled, task.robot
     if not len(robot.gripper):

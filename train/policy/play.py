@@ -81,7 +81,7 @@ class Player:
             quaternion=quaternion,
             touching=self.touches.of(environment.physics.qpos[0].cpu().numpy(), position, quaternion),
             stage=task.events.stages[stage].name,
-            pairs=pairs(task, stage, position, quaternion),
+            pairs=_pairs(task, stage, position, quaternion),
             time=self._length * environment.control_step,
         )
 
@@ -118,7 +118,7 @@ class Touches:
         return touching
 
 
-def pairs(task: Task, stage: int, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+def _pairs(task: Task, stage: int, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     """Return contact points and target points of a stage's target event [m], world frame, shape (P, 2, 3)."""
     table = task.table
     slots = np.flatnonzero(table.used[stage])

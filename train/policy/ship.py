@@ -49,7 +49,7 @@ def ship(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any
     kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
     torch.save(kept, partial / CHECKPOINT)
     length = {"rounds": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
-    origin = length | origin_of(policy.folder / COMMAND)
+    origin = length | _origin_of(policy.folder / COMMAND)
     write_text(partial / ORIGIN, tomli_w.dumps(origin))
     if out.exists():
         shutil.rmtree(out)
@@ -57,15 +57,15 @@ def ship(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any
     return origin
 
 
-def origin_of(settings: Path) -> dict[str, Any]:
+def _origin_of(settings: Path) -> dict[str, Any]:
     """Return the command and the versions that a run folder was made by, as far as it says so."""
     if not settings.is_file():
         return {}
     stored = tomllib.loads(settings.read_text())
-    found: dict[str, Any] = {"command": without_folders(stored["command"])} if "command" in stored else {}
+    found: dict[str, Any] = {"command": _without_folders(stored["command"])} if "command" in stored else {}
     return found | ({"versions": stored["versions"]} if "versions" in stored else {})
 
 
-def without_folders(command: str) -> str:
+def _without_folders(command: str) -> str:
     """Return a command with the files in it named without the folders that they lay in."""
     return shlex.join(Path(part).name if "/" in part else part for part in shlex.split(command))

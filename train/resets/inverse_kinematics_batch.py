@@ -55,7 +55,7 @@ def reach_many(
     count = len(qpos)
     if not count:
         return np.empty((0, len(robot.qpos))), np.empty(0, dtype=bool)
-    chain, joints, link, offset = tool_chain(m, robot, device)
+    chain, joints, link, offset = _tool_chain(m, robot, device)
     lower, upper = chain.joint_limit_lower, chain.joint_limit_upper
     assert lower is not None
     assert upper is not None
@@ -85,10 +85,10 @@ def reach_many(
         solver.step(start, found, iterations=ITERATIONS)
         angles = found.numpy().astype(float) + reference
     order = [list(joints).index(j) for j in robot.joint]
-    return angles[:, order], reached(m, robot, qpos, angles[:, order], position, rotation)
+    return angles[:, order], _reached(m, robot, qpos, angles[:, order], position, rotation)
 
 
-def reached(
+def _reached(
     m: mujoco.MjModel, robot: Robot, qpos: np.ndarray, angles: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
     """Return whether joint positions (P, J) bring the tool to its poses within the limits, shape (P,) bool."""
@@ -107,7 +107,7 @@ def reached(
     return fine
 
 
-def tool_chain(
+def _tool_chain(
     m: mujoco.MjModel, robot: Robot, device: str | None
 ) -> tuple[newton.Model, np.ndarray, int, tuple[np.ndarray, np.ndarray]]:
     """Return the links from the world to the tool as a Newton model.

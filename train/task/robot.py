@@ -76,14 +76,14 @@ class Robot:
             turning=turning,
             actuator=np.array(actuator, dtype=int),
             gripper=np.array(gripper, dtype=int),
-            opening=opening(m, gripper),
+            opening=_opening(m, gripper),
             tool=tool,
             step=np.append(np.where(turning, cfg.turn, cfg.slide), [cfg.gripper] * bool(gripper)),
             lead=np.where(turning, cfg.turn_lead, cfg.slide_lead),
         )
 
 
-def opening(m: mujoco.MjModel, gripper: list[int]) -> np.ndarray:
+def _opening(m: mujoco.MjModel, gripper: list[int]) -> np.ndarray:
     """Return the weights, shape (nq,), with which positions add up to the mean length that the actuators hold."""
     weights = np.zeros(m.nq)
     for i in gripper:

@@ -22,7 +22,7 @@ def slot_table(compiled: mujoco.MjModel, events: ContactEventSequence, count: in
     body = np.zeros((2, *shape), dtype=int)
     vectors = np.zeros((3, *shape, 3))
     for s, stage in enumerate(events.stages):
-        for k, pair in enumerate(choose(events, stage, count)):
+        for k, pair in enumerate(_choose(events, stage, count)):
             sides = events.entity[pair.a], events.entity[pair.b]
             active[s, k] = True
             held[s, k] = sides[0].role == "robot"
@@ -33,7 +33,7 @@ def slot_table(compiled: mujoco.MjModel, events: ContactEventSequence, count: in
     return PairTable(body[0], vectors[0], none, body[1], vectors[1], none, vectors[2], active), held
 
 
-def choose(events: ContactEventSequence, stage: Stage, count: int) -> list[ContactPair]:
+def _choose(events: ContactEventSequence, stage: Stage, count: int) -> list[ContactPair]:
     """Return at most `count` pairs of a stage's target event.
 
     Each pair of bodies keeps one contact; what room is left goes to the bodies whose contact opened the stage, then to
@@ -43,7 +43,7 @@ def choose(events: ContactEventSequence, stage: Stage, count: int) -> list[Conta
     groups: dict[tuple[str, str], list[ContactPair]] = {}
     for pair in stage.event.pairs:
         groups.setdefault((events.entity[pair.a].body, events.entity[pair.b].body), []).append(pair)
-    ordered = {bodies: spread(pairs) for bodies, pairs in groups.items()}
+    ordered = {bodies: _spread(pairs) for bodies, pairs in groups.items()}
     robot = {e.body for e in events.entities if e.role == "robot"}
     opening = [bodies for bodies in ordered if tuple("robot" if b in robot else b for b in bodies) == stage.bodies]
     ranked = [*opening, *(bodies for bodies in ordered if bodies not in opening)]
@@ -56,7 +56,7 @@ def choose(events: ContactEventSequence, stage: Stage, count: int) -> list[Conta
     return [pair for bodies in ranked for pair in ordered[bodies][: share.get(bodies, 0)]]
 
 
-def spread(pairs: Sequence[ContactPair]) -> list[ContactPair]:
+def _spread(pairs: Sequence[ContactPair]) -> list[ContactPair]:
     """Return pairs ordered by farthest point sampling of their target points, the strongest first."""
     points = np.array([pair.point_b for pair in pairs])
     order = [int(np.argmax([pair.force for pair in pairs]))]

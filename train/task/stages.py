@@ -61,7 +61,7 @@ def demonstrated_stages(
     for row in range(0, count, period):
         d.qpos[:] = qpos[row]
         mujoco.mj_kinematics(m, d)
-        distance = worst_distance(table, d, now)
+        distance = _worst_distance(table, d, now)
         closest = min(closest, distance)
         held = held + 1 if distance < cfg.tolerance else 0
         stage[row : row + period] = now
@@ -80,7 +80,7 @@ def demonstrated_stages(
     return DemonstratedStages(stage, start, end)
 
 
-def worst_distance(table: PairTable, d: mujoco.MjData, stage: int) -> float:
+def _worst_distance(table: PairTable, d: mujoco.MjData, stage: int) -> float:
     """Return the distance of the pair of a stage's target that is farthest apart [m]; `d` holds the poses."""
     used = table.used[stage]
 

@@ -95,7 +95,7 @@ class Task:
         if model.geometry is None:
             raise TrainError("the model has no contact geometry to train with", fix="make one with concent fit")
         events = extract(model, demonstration, MujocoEngine(model, threads=1)) if events is None else events
-        first, stage = chain(events, cfg.stage)
+        first, stage = _chain(events, cfg.stage)
         collidable = np.ones(len(model.geometry), dtype=bool)
         if cfg.collision == "vcp":
             touched = [e.sphere for e in events.entities if e.sphere is not None]
@@ -110,8 +110,8 @@ class Task:
                 found=[effect.name for effect in odd],
             )
         table, held = slot_table(compiled, events, cfg.observation.slots)
-        objects = tuple(int(compiled.body(name).id) for name in ranked(model, events))
-        replay = replayed(compiled, replayer, demonstration, collidable)
+        objects = tuple(int(compiled.body(name).id) for name in _ranked(model, events))
+        replay = _replayed(compiled, replayer, demonstration, collidable)
         task = Task(
             model=model,
             events=events,
@@ -124,7 +124,7 @@ class Task:
             objects=objects,
             table=table,
             held=held,
-            place=place(compiled, replay, events, stage, objects),
+            place=_place(compiled, replay, events, stage, objects),
         )
         if first == stage:
             return task
@@ -148,7 +148,7 @@ class Task:
         return tuple(self.keeps(stage) and body in touched for body in self.objects)
 
 
-def chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
+def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
     """Return the first and the last of the stages that a name asks for.
 
     Raises:
@@ -162,7 +162,7 @@ def chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
     return names.index(name), names.index(name)
 
 
-def ranked(model: Model, events: ContactEventSequence) -> list[str]:
+def _ranked(model: Model, events: ContactEventSequence) -> list[str]:
     """Return the names of the objects, those first that robot links touched for longest."""
     assert model.geometry is not None
     robot = {e.body for e in events.entities if e.role == "robot"}
@@ -173,7 +173,7 @@ def ranked(model: Model, events: ContactEventSequence) -> list[str]:
     return sorted(held, key=lambda name: -held[name])
 
 
-def replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, collidable: np.ndarray) -> Replay:
+def _replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, collidable: np.ndarray) -> Replay:
     """Replay a demonstration in C MuJoCo and count what contact buffers it needs.
 
     Raises:
@@ -195,7 +195,7 @@ def replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, coll
     return Replay(engine.timestep, rollout.qpos[0], rollout.qvel[0], ctrl, contacts, constraints)
 
 
-def place(
+def _place(
     m: mujoco.MjModel, replay: Replay, events: ContactEventSequence, stage: int, objects: tuple[int, ...]
 ) -> np.ndarray | None:
     """Return the demonstrated origin of object 1 in the frame of object 2 at a stage's target event [m], shape (3,).

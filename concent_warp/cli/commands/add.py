@@ -56,7 +56,7 @@ class Arguments:
 def run(arguments: Arguments) -> FittedEffects | Model | None:
     """Add, fit, save; or list."""
     if arguments.list:
-        say_effects(None if arguments.model is None else Model.load(arguments.model))
+        _say_effects(None if arguments.model is None else Model.load(arguments.model))
         return None
     for given, option in ((arguments.effect, "EFFECT"), (arguments.model, "--model"), (arguments.out, "--out")):
         if not given:
@@ -64,8 +64,8 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     assert arguments.model is not None
     assert arguments.out is not None
     model = Model.load(arguments.model)
-    check_out(arguments.out, arguments.overwrite)
-    added = model.add_effect(arguments.effect, arguments.target, assigned(arguments.set))
+    _check_out(arguments.out, arguments.overwrite)
+    added = model.add_effect(arguments.effect, arguments.target, _assigned(arguments.set))
     fitted = None
     if arguments.fit is not None:
         from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
@@ -88,7 +88,7 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     return fitted or added
 
 
-def check_out(path: Path, overwrite: bool) -> None:
+def _check_out(path: Path, overwrite: bool) -> None:
     """Check that a model can be written there.
 
     Raises:
@@ -99,7 +99,7 @@ def check_out(path: Path, overwrite: bool) -> None:
     claim_file(path, overwrite=overwrite)
 
 
-def assigned(given: Sequence[str]) -> dict[str, float]:
+def _assigned(given: Sequence[str]) -> dict[str, float]:
     """Return parameters' values from ``name=value``.
 
     Raises:
@@ -117,7 +117,7 @@ def assigned(given: Sequence[str]) -> dict[str, float]:
     return found
 
 
-def say_effects(model: Model | None) -> None:
+def _say_effects(model: Model | None) -> None:
     """Write a table of all effects; with a model, where in it each may act."""
     from rich.table import Table
 
@@ -134,14 +134,14 @@ def say_effects(model: Model | None) -> None:
             table.add_section()
         family = kind.family
         selections = kind.targets(m)
-        cells = [kind.name, kind.summary, parameters_text([p for s in selections for p in kind(*s).parameters(m)])]
+        cells = [kind.name, kind.summary, _parameters_text([p for s in selections for p in kind(*s).parameters(m)])]
         if model is not None:
             cells.append("; ".join(", ".join(s) or "the world" for s in selections) or "nothing here")
         table.add_row(*map(escape, cells))
     say(table)
 
 
-def parameters_text(parameters: Sequence[Parameter]) -> str:
+def _parameters_text(parameters: Sequence[Parameter]) -> str:
     """Return names and units of parameters; several of a kind as one."""
     found: dict[str, list[str]] = {}
     for p in parameters:

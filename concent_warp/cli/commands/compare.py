@@ -70,11 +70,11 @@ def run(arguments: Arguments) -> Comparison:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     elif arguments.markdown:
         print(markdown_table(found, every_phase=arguments.every_phase), end="")
-        print("".join(f"\n{i + 1}. {text}" for i, text in enumerate(place_lines(found, arguments.places))))
+        print("".join(f"\n{i + 1}. {text}" for i, text in enumerate(_place_lines(found, arguments.places))))
     else:
         say(rich_table(found, every_phase=arguments.every_phase))
-        say_noise(found)
-        say_places(found, arguments.places)
+        _say_noise(found)
+        _say_places(found, arguments.places)
         say_diverged(found)
     if arguments.html is not None:
         from concent_warp.report.report import write_report
@@ -87,7 +87,7 @@ def run(arguments: Arguments) -> Comparison:
     return found
 
 
-def say_noise(comparison: Comparison) -> None:
+def _say_noise(comparison: Comparison) -> None:
     """Write where the noise floors are from."""
     found: dict[str, list[str]] = {}
     for channel in comparison.channels:
@@ -97,16 +97,16 @@ def say_noise(comparison: Comparison) -> None:
     say(escape("\n".join(lines)))
 
 
-def say_places(comparison: Comparison, most: int) -> None:
+def _say_places(comparison: Comparison, most: int) -> None:
     """Write where the last model fails worst."""
-    lines = place_lines(comparison, most)
+    lines = _place_lines(comparison, most)
     if most > 0:
         say("\n[bold]Worst places[/bold]" if lines else f"\nNowhere above {LEAST:g} x noise.")
     for i, line in enumerate(lines):
         say(escape(f"{i + 1}. {line}"))
 
 
-def place_lines(comparison: Comparison, most: int) -> list[str]:
+def _place_lines(comparison: Comparison, most: int) -> list[str]:
     """Return the worst places in words, one for each that recurs in several demonstrations."""
     several = len(comparison.demonstrations) > 1
     lines, seen = [], set()

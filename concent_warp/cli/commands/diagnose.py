@@ -74,18 +74,18 @@ def run(arguments: Arguments) -> Diagnosis:
     """Diagnose, and print or write what was asked for."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     model = given_model(arguments.model, recording)
-    check_numbers(arguments)
-    check_effects(model, recording, arguments.effects)
+    _check_numbers(arguments)
+    _check_effects(model, recording, arguments.effects)
     for path in (arguments.html, arguments.apply):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
-    found = diagnosed(arguments, model, recording)
+    found = _diagnosed(arguments, model, recording)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     else:
-        say_diagnosis(found)
+        _say_diagnosis(found)
     if arguments.apply is not None:
-        save_accepted(arguments, found, recording)
+        _save_accepted(arguments, found, recording)
     if arguments.html is not None:
         from concent_warp.report.report import write_report
 
@@ -101,7 +101,7 @@ def run(arguments: Arguments) -> Diagnosis:
     return found
 
 
-def check_numbers(arguments: Arguments) -> None:
+def _check_numbers(arguments: Arguments) -> None:
     """Check the settings that are numbers.
 
     Raises:
@@ -115,7 +115,7 @@ def check_numbers(arguments: Arguments) -> None:
         raise ConcentError("no length of a window", expected="--window above 0 s", found=arguments.window)
 
 
-def check_effects(model: Model, recording: Recording, names: Sequence[str]) -> None:
+def _check_effects(model: Model, recording: Recording, names: Sequence[str]) -> None:
     """Check that each of the effects asked for could be missing.
 
     Raises:
@@ -131,7 +131,7 @@ def check_effects(model: Model, recording: Recording, names: Sequence[str]) -> N
             )
 
 
-def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagnosis:
+def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagnosis:
     """Return the diagnosis; an interruption says how to continue."""
     cfg = DiagnosisCfg(
         effects=arguments.effects,
@@ -151,7 +151,7 @@ def diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagn
         raise KeyboardInterrupt(advice) from None
 
 
-def say_diagnosis(found: Diagnosis) -> None:
+def _say_diagnosis(found: Diagnosis) -> None:
     """Write the verdict in sentences, where the model fails, and the table of effects."""
     say(f"[bold]{escape(found.headline.capitalize())}[/bold]")
     for sentence in found.sentences():
@@ -162,10 +162,10 @@ def say_diagnosis(found: Diagnosis) -> None:
         for k, sentence in enumerate(places[:MOST_PLACES]):
             say(escape(f"{k + 1}. {sentence}"))
     if found.effects:
-        say_effects(found.effects)
+        _say_effects(found.effects)
 
 
-def say_effects(effects: Sequence[Finding]) -> None:
+def _say_effects(effects: Sequence[Finding]) -> None:
     """Write the table of all effects that were fitted, addition by addition, the best first."""
     from rich.table import Table
 
@@ -190,7 +190,7 @@ def say_effects(effects: Sequence[Finding]) -> None:
     say(table)
 
 
-def save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
+def _save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
     """Fit all accepted effects together and save the model; say so where none was accepted."""
     path = arguments.apply
     if path is None:

@@ -55,7 +55,7 @@ def run(arguments: Arguments) -> Grounded:
     """Fit and write the run folder."""
     recording = load_recording(arguments.recording)
     recording.only(arguments.demonstrations)
-    start = starting_model(arguments, recording)
+    start = _starting_model(arguments, recording)
     folder = arguments.out or Path("runs") / arguments.recording.stem
     cfg = GroundCfg(
         geometry=arguments.geometry,
@@ -80,7 +80,7 @@ def run(arguments: Arguments) -> Grounded:
     return found
 
 
-def starting_model(arguments: Arguments, recording: Recording) -> Model:
+def _starting_model(arguments: Arguments, recording: Recording) -> Model:
     """Return the model to start from."""
     if arguments.model is not None:
         return given_model(arguments.model, recording.only(arguments.demonstrations))

@@ -47,7 +47,7 @@ def run(arguments: Arguments) -> Model:
     for path in (arguments.out, arguments.export):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
-    model = build(arguments)
+    model = _build(arguments)
     if arguments.out is not None:
         make_folder(arguments.out.parent)
         model.save(arguments.out)
@@ -65,7 +65,7 @@ def run(arguments: Arguments) -> Model:
     return model
 
 
-def build(arguments: Arguments) -> Model:
+def _build(arguments: Arguments) -> Model:
     """Return the model of a scene, a recording or a model file."""
     path = arguments.scene
     if path.suffix == ".toml":

@@ -65,15 +65,15 @@ def run(arguments: Arguments) -> list[Score]:
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
         write_settings(folder, arguments)
         try:
-            fit = fitted(arguments, views, folder / CHECKPOINT)
+            fit = _fitted(arguments, views, folder / CHECKPOINT)
         except KeyboardInterrupt:
             saved = (folder / CHECKPOINT).exists()
             ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was saved yet."
             raise KeyboardInterrupt(ending) from None
-        return write_results(fit, folder)
+        return _write_results(fit, folder)
 
 
-def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFit:
+def _fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFit:
     """Return the fit, gone through to its end."""
     import numpy as np
     import torch
@@ -88,7 +88,7 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
         raise RenderError(
             "no such device", expected='"cpu" or "cuda:0"', found=f"{device!r} ({str(error).splitlines()[0]})"
         ) from None
-    fit = SplatFit(views, start(arguments, views, np.random.default_rng(cfg.seed)), cfg, device=device)
+    fit = SplatFit(views, _start(arguments, views, np.random.default_rng(cfg.seed)), cfg, device=device)
     if arguments.resume and checkpoint.exists():
         fit.resume(checkpoint)
     first, begun = fit.iteration, time.monotonic()
@@ -102,7 +102,7 @@ def fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFi
     return fit
 
 
-def start(arguments: Arguments, views: SplatViews, rng: np.random.Generator) -> np.ndarray:
+def _start(arguments: Arguments, views: SplatViews, rng: np.random.Generator) -> np.ndarray:
     """Return the points to start from [m], shape (n, 3)."""
     from concent_warp.render.splats.initial import read_start, visual_hull
 
@@ -111,7 +111,7 @@ def start(arguments: Arguments, views: SplatViews, rng: np.random.Generator) -> 
     return read_start(arguments.points, arguments.fit.start, arguments.scale, rng)
 
 
-def write_results(fit: SplatFit, folder: Path) -> list[Score]:
+def _write_results(fit: SplatFit, folder: Path) -> list[Score]:
     """Write the splats, their scores and the picture, and say what came out."""
     import cv2
     import numpy as np

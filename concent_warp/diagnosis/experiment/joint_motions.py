@@ -54,7 +54,7 @@ class Drives:
             low, high = min(r.value.min() for r in rows), max(r.value.max() for r in rows)
             if high - low < 1e-6:
                 continue
-            speed = min(max(map(top_speed, rows)), (high - low) / QUICKEST)
+            speed = min(max(map(_top_speed, rows)), (high - low) / QUICKEST)
             found.append((a, float(bench.longest.action[m.actuator(a).name].value[0]), low, high, speed))
         if not found:
             return None
@@ -77,7 +77,7 @@ class Drives:
         return float((self.half / self.speed).max())
 
 
-def top_speed(channel: Channel) -> float:
+def _top_speed(channel: Channel) -> float:
     """Return the highest speed of commands over `WINDOW` [1/s]."""
     time = np.arange(channel.time[0], channel.time[-1] + WINDOW, 0.1 * WINDOW)
     row = np.maximum(np.searchsorted(channel.time, time + 1e-9, side="right") - 1, 0)
@@ -89,27 +89,27 @@ def drive_motions(bench: Bench, tilted: bool) -> Iterator[Motion]:
     """Yield what drives could do; where the table or base may be `tilted`, with it turned too."""
     if not bench.m.nu:
         return
-    yield from repeats(bench, tilted)
+    yield from _repeats(bench, tilted)
     drives = Drives.of(bench)
     if drives is None:
         return
-    made = list(courses(bench, drives))
+    made = list(_courses(bench, drives))
     yield from made
-    for link in payload_links(bench, drives):
+    for link in _payload_links(bench, drives):
         for motion in made:
             if motion.name != "steps":
                 text = f"with {100 * EXTRA:.0f} % more mass on {words(link)}, {motion.text}"
                 yield replace(motion, name=f"{motion.name} with payload", text=text, change=heavier(link))
 
 
-def payload_links(bench: Bench, drives: Drives) -> list[str]:
+def _payload_links(bench: Bench, drives: Drives) -> list[str]:
     """Return the names of the last links that the drives carry and that something can be fastened to."""
     m = bench.m
     moved = {int(m.jnt_bodyid[j]) for a in drives.ids for j in driven_joints(m, a)}
-    return [m.body(b).name for b in last_links(m) if m.body(b).name and m.body_mass[b] > 0 and above(m, b) & moved]
+    return [m.body(b).name for b in last_links(m) if m.body(b).name and m.body_mass[b] > 0 and _above(m, b) & moved]
 
 
-def above(m: mujoco.MjModel, body: int) -> set[int]:
+def _above(m: mujoco.MjModel, body: int) -> set[int]:
     """Return a body and those that carry it."""
     found = {0}
     while body:
@@ -118,7 +118,7 @@ def above(m: mujoco.MjModel, body: int) -> set[int]:
     return found
 
 
-def courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
+def _courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
     """Yield the motions that drives are asked for together, each in its own range, with objects out of the way."""
     m = bench.m
     who = words(m.actuator(drives.ids[0]).name) if len(drives.ids) == 1 else "all drives together"
@@ -131,12 +131,12 @@ def courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
     def course(parts: Sequence[np.ndarray]) -> np.ndarray:
         """Return commands (K, D): from the first ones to where the parts begin, then the parts in units of `half`."""
         begin = drives.middle + drives.half * parts[0][0]
-        there = ramp(0.0, 1.0, max(quick * float(np.abs(entry - parts[0][0]).max()), 0.3))
+        there = _ramp(0.0, 1.0, max(quick * float(np.abs(entry - parts[0][0]).max()), 0.3))
         lead = drives.first + (begin - drives.first) * there[:, None]
         return np.concatenate([lead, drives.middle + drives.half * np.concatenate(parts)[:, None]])
 
     def motion(name: str, text: str, parts: Sequence[np.ndarray]) -> Motion:
-        return commanded(bench, drives, name, f"{text}{cleared_text(bench)}", course(parts))
+        return _commanded(bench, drives, name, f"{text}{_cleared_text(bench)}", course(parts))
 
     if len(drives.ids) == 1:
         span = f"between {drives.low[0]:.2g} and {drives.high[0]:.2g} {unit}"
@@ -144,11 +144,11 @@ def courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
     else:
         span, speeds = "over their ranges", ", ".join(f"{p:g}" for p in PACES) + " times the highest speed"
     ways = [(-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)]
-    legs = [ramp(a, b, min(2 * quick / p, LONGEST / 2)) for (a, b), p in zip(ways, PACES, strict=True)]
+    legs = [_ramp(a, b, min(2 * quick / p, LONGEST / 2)) for (a, b), p in zip(ways, PACES, strict=True)]
     yield motion("sweeps", f"sweep {who} {span} at {speeds}", legs)
     reach = 0.15
     slow = 2 * reach * quick / PACES[0]
-    turns = [ramp(middle + a, middle + b, slow) for a, b in ((-reach, reach), (reach, -reach))] * 2
+    turns = [_ramp(middle + a, middle + b, slow) for a, b in ((-reach, reach), (reach, -reach))] * 2
     yield motion("slow reversals", f"move {who} to and fro slowly over {100 * reach:.0f} % of the range", turns)
     top = float(np.clip(1 / (2 * np.pi * 0.3 * quick), 1.0, 8.0))
     time = np.arange(0, 6.0, 1 / RATE)
@@ -158,23 +158,23 @@ def courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
     yield motion("steps", f"command steps of up to 40 % of the range to {who}", jumps)
     stands, here = [], -1.0
     for place in (-1.0, -0.5, 0.0, 0.5, 1.0):
-        stands += [ramp(here, place, max(quick, 0.4)), np.full(int(0.7 * RATE), place)]
+        stands += [_ramp(here, place, max(quick, 0.4)), np.full(int(0.7 * RATE), place)]
         here = place
     yield motion("holds", f"hold {who} in five poses across the range", stands)
 
 
-def ramp(a: float, b: float, duration: float) -> np.ndarray:
+def _ramp(a: float, b: float, duration: float) -> np.ndarray:
     """Return a straight line of commands from `a` to `b` over `duration` [s], shape (K,)."""
     return np.linspace(a, b, max(int(duration * RATE), 2))
 
 
-def cleared_text(bench: Bench) -> str:
+def _cleared_text(bench: Bench) -> str:
     """Return which objects are put away, in words."""
     names = [words(bench.m.body(b).name) for b in bench.bodies]
     return f", with {' and '.join(names)} out of the way" if names else ""
 
 
-def commanded(bench: Bench, drives: Drives, name: str, text: str, course: np.ndarray) -> Motion:
+def _commanded(bench: Bench, drives: Drives, name: str, text: str, course: np.ndarray) -> Motion:
     """Return a motion from commands (K, D); the other actuators hold still."""
     course = course[: int(LONGEST * RATE)]
     time = np.arange(len(course)) / RATE
@@ -189,7 +189,7 @@ def commanded(bench: Bench, drives: Drives, name: str, text: str, course: np.nda
     return Motion(name, text, len(course) / RATE, qpos, 0 * qvel, action, tuple(away))
 
 
-def repeats(bench: Bench, tilted: bool) -> Iterator[Motion]:
+def _repeats(bench: Bench, tilted: bool) -> Iterator[Motion]:
     """Yield what was commanded in the longest demonstration, done otherwise."""
     d, m = bench.longest, bench.m
     qpos, qvel = bench.starts[bench.recording.demonstrations.index(d)]
@@ -207,10 +207,10 @@ def repeats(bench: Bench, tilted: bool) -> Iterator[Motion]:
         text = "push without a grasp: repeat the same commands with the gripper left as it is at first"
         yield Motion("push without grasp", text, duration, qpos, qvel, still)
         text = f"grip with {100 * LIGHTER:.0f} % of the commanded closing and repeat the other commands"
-        yield Motion("lighter grip", text, duration, qpos, qvel, loosened(d.action, hands))
+        yield Motion("lighter grip", text, duration, qpos, qvel, _loosened(d.action, hands))
 
 
-def loosened(action: Mapping[str, Channel], hands: Sequence[str]) -> dict[str, Channel]:
+def _loosened(action: Mapping[str, Channel], hands: Sequence[str]) -> dict[str, Channel]:
     """Return commands in which grippers go a part of their way only."""
     found = dict(action)
     for name in hands:

@@ -38,7 +38,7 @@ PAYLOAD_RADIUS = 0.01
 """[m]."""
 
 
-def as_it_is(model: Model) -> Model:
+def _as_it_is(model: Model) -> Model:
     """Leave the set-up as it is, see `Change`."""
     return model
 
@@ -61,7 +61,7 @@ class Motion:
     """Commands by actuator."""
     away: tuple[str, ...] = ()
     """Bodies that are out of the way, so that nothing of them is measured."""
-    change: Change = as_it_is
+    change: Change = _as_it_is
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Bench:
         found = {}
         for name in self.noise:
             steps = [
-                np.diff(d.measured[name].time) for d in self.recording.demonstrations if len(read(d, name).time) > 1
+                np.diff(d.measured[name].time) for d in self.recording.demonstrations if len(_read(d, name).time) > 1
             ]
             found[name] = float(np.median(np.concatenate(steps))) if steps else 0.01
         return found
@@ -145,7 +145,7 @@ class Bench:
         return {self.m.actuator(i).name: Channel(np.zeros(1), first[i : i + 1]) for i in range(self.m.nu)}
 
 
-def read(d: Demonstration, channel: str) -> Channel:
+def _read(d: Demonstration, channel: str) -> Channel:
     """Return a channel of a demonstration, empty where it has none."""
     return d.measured.get(channel, Channel(np.zeros(0), np.zeros((0, 1))))
 

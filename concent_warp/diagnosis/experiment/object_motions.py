@@ -115,9 +115,9 @@ def body_motions(bench: Bench, engine: EngineName, tilted: bool) -> Iterator[Mot
     """Yield what could be done with objects; where the table may be `tilted`, with it turned too."""
     for body in bench.bodies[:MOST_BODIES]:
         toy = Toy(bench, body, engine)
-        moves = [*surface_motions(toy), *flights(toy)]
+        moves = [*_surface_motions(toy), *_flights(toy)]
         yield from moves
-        yield from turned_starts(toy)
+        yield from _turned_starts(toy)
         first = moves[:1]
         for motion in first:
             text = f"with {100 * EXTRA:.0f} % more mass on {words(toy.name)}, {motion.text}"
@@ -127,7 +127,7 @@ def body_motions(bench: Bench, engine: EngineName, tilted: bool) -> Iterator[Mot
                 yield replace(motion, name=f"{motion.name}, turned table", text=text, change=slope_turned)
 
 
-def surface_motions(toy: Toy) -> Iterator[Motion]:
+def _surface_motions(toy: Toy) -> Iterator[Motion]:
     """Yield slides, spins, rolls and drops where there is a place on which the body rests."""
     rest, what, v = toy.rest, words(toy.name), toy.speed
     if rest is None:
@@ -147,7 +147,7 @@ def surface_motions(toy: Toy) -> Iterator[Motion]:
         yield toy.motion("spin in place", text, MOMENT[1], rest, spin=spin * UP)
     text = f"push {what} off along +x at {v:.2g} m/s, spinning at {SPINS[1]:g} rad/s"
     yield toy.motion("slide and spin", text, 0.3 + v / DECELERATION, rest, (v, 0, 0), SPINS[1] * UP)
-    if (rolling := roll(toy, rest)) is not None:
+    if (rolling := _roll(toy, rest)) is not None:
         direction, radius = rolling
         for speed in (v, SLOW * v):
             text = f"roll {what} at {speed:.2g} m/s"
@@ -162,7 +162,7 @@ def surface_motions(toy: Toy) -> Iterator[Motion]:
     yield toy.motion("tilted drop", text, np.sqrt(2 * HEIGHTS[1] / 9.81) + 0.6, lifted)
 
 
-def flights(toy: Toy) -> Iterator[Motion]:
+def _flights(toy: Toy) -> Iterator[Motion]:
     """Yield throws as the fastest one of those recorded, faster, slower and the other way."""
     thrown = [
         (qpos, qvel)
@@ -189,7 +189,7 @@ def flights(toy: Toy) -> Iterator[Motion]:
         yield toy.motion("throw", text, duration, qpos, launch + velocity * UP, turning)
 
 
-def turned_starts(toy: Toy) -> Iterator[Motion]:
+def _turned_starts(toy: Toy) -> Iterator[Motion]:
     """Yield what was commanded to a robot, with the object turned about the vertical before."""
     d, bench = toy.bench.longest, toy.bench
     if not d.action:
@@ -203,7 +203,7 @@ def turned_starts(toy: Toy) -> Iterator[Motion]:
     yield Motion("repeat, heavier", text, d.duration, qpos, qvel, d.action, change=heavier(toy.name))
 
 
-def roll(toy: Toy, rest: np.ndarray) -> tuple[np.ndarray, float] | None:
+def _roll(toy: Toy, rest: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return direction (3,) and radius [m] of the body's rolling from its rest, None for one that is not round."""
     m = toy.bench.m
     geoms = np.flatnonzero((m.geom_bodyid == toy.body) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0)))

@@ -78,57 +78,57 @@ def suggest(
     bench = Bench(first, recording, channel_noises(first, recording))
     tilted = any(a.effect.name == "gravity_tilt" for model in chosen.values() for a in model.effects)
     menu = [*drive_motions(bench, tilted), *body_motions(bench, engine, tilted)]
-    looked = [(score(found), k) for k, motion in enumerate(menu) if (found := rough(chosen, bench, motion, engine))]
+    looked = [(_score(found), k) for k, motion in enumerate(menu) if (found := _rough(chosen, bench, motion, engine))]
     best = None
     for _, k in sorted(looked, key=lambda pair: (-pair[0], pair[1]))[:FINALISTS]:
-        found = close(chosen, bench, menu[k], engine, seed)
-        if found and (best is None or score(found) > score(best[1])):
+        found = _close(chosen, bench, menu[k], engine, seed)
+        if found and (best is None or _score(found) > _score(best[1])):
             best = menu[k], found
     if best is None or max(value for value, _ in best[1].values()) < LEAST:
         return None
-    return experiment(*best, first=next(iter(chosen)))
+    return _experiment(*best, first=next(iter(chosen)))
 
 
 Separations = dict[tuple[str, str], tuple[float, str]]
 """How far two hypotheses differ [noise], and in which channel, by their names."""
 
 
-def score(found: Separations) -> float:
+def _score(found: Separations) -> float:
     """Return a number that is larger the better a motion tells all pairs apart: one well apart makes up for little."""
     return float(np.mean([np.log1p(value) for value, _ in found.values()]))
 
 
-def rough(models: Mapping[str, Model], bench: Bench, motion: Motion, engine: EngineName) -> Separations | None:
+def _rough(models: Mapping[str, Model], bench: Bench, motion: Motion, engine: EngineName) -> Separations | None:
     """Return how far hypotheses differ in a motion from the very same start; None where one cannot be simulated."""
-    window = imagined(bench, motion, motion.duration)
-    return None if window is None else separations(models, motion, window, engine)
+    window = _imagined(bench, motion, motion.duration)
+    return None if window is None else _separations(models, motion, window, engine)
 
 
-def close(
+def _close(
     models: Mapping[str, Model], bench: Bench, motion: Motion, engine: EngineName, seed: int
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion whose start is known only as well as it is measured.
 
     It counts for as long as errors of the start have effects in proportion to them: what is chaotic tells nothing.
     """
-    whole = imagined(bench, motion, motion.duration)
+    whole = _imagined(bench, motion, motion.duration)
     if whole is None:
         return None
     model = motion.change(bench.model)
     source = Source(model, bench.recording, bench.noise)
     reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, seed)
-    if (window := imagined(bench, motion, reach)) is None:
+    if (window := _imagined(bench, motion, reach)) is None:
         return None
-    starts = start_effects(model, window, engine)
-    return None if starts is None else separations(models, motion, window, engine, starts)
+    starts = _start_effects(model, window, engine)
+    return None if starts is None else _separations(models, motion, window, engine, starts)
 
 
-def start_effects(model: Model, window: Window, engine: EngineName) -> np.ndarray | None:
+def _start_effects(model: Model, window: Window, engine: EngineName) -> np.ndarray | None:
     """Return what an error of the start of one standard deviation does to the readings [noise], shape (count, 2 nv).
 
     None where a motion with such an error cannot be simulated.
     """
-    values = readings(model, window, engine)
+    values = _readings(model, window, engine)
     if not all(np.isfinite(v).all() for v in values):
         return None
     filled = tuple(replace(r, value=v) for r, v in zip(window.readings, values, strict=True))
@@ -138,7 +138,7 @@ def start_effects(model: Model, window: Window, engine: EngineName) -> np.ndarra
     return np.stack(found, axis=1) / PROBE
 
 
-def imagined(bench: Bench, motion: Motion, duration: float) -> Window | None:
+def _imagined(bench: Bench, motion: Motion, duration: float) -> Window | None:
     """Return the beginning of a motion as a window of a recording yet to be made; None where nothing is measured."""
     m = bench.m
     channels, readings, clock, count = bench.channels(motion.away), [], [], 0
@@ -161,7 +161,7 @@ def imagined(bench: Bench, motion: Motion, duration: float) -> Window | None:
     return Window(d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks)
 
 
-def separations(
+def _separations(
     models: Mapping[str, Model], motion: Motion, window: Window, engine: EngineName, starts: np.ndarray | None = None
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion; None where one cannot be simulated.
@@ -175,7 +175,7 @@ def separations(
             account for is taken out.
     """
     try:
-        seen = {name: readings(motion.change(model), window, engine) for name, model in models.items()}
+        seen = {name: _readings(motion.change(model), window, engine) for name, model in models.items()}
     except (ConcentError, ValueError, mujoco.FatalError):
         # A payload may not fit a scene that asks for something special of its bodies: one motion less.
         return None
@@ -183,7 +183,7 @@ def separations(
         return None
     found: Separations = {}
     for a, b in itertools.combinations(models, 2):
-        residual = difference(window, seen[a], seen[b])
+        residual = _difference(window, seen[a], seen[b])
         if starts is not None:
             normal = starts.T @ starts + np.eye(starts.shape[1])
             residual = residual - starts @ np.linalg.solve(normal, starts.T @ residual)
@@ -192,7 +192,7 @@ def separations(
     return found
 
 
-def readings(model: Model, window: Window, engine: EngineName) -> list[np.ndarray]:
+def _readings(model: Model, window: Window, engine: EngineName) -> list[np.ndarray]:
     """Return what instruments would read in a window from time 0, one (T, dim) for each of its readings."""
     prediction = Prediction(model, (), [window], engine=engine)
     (reader,) = prediction.readers([Trial(0, prediction.start)])
@@ -202,7 +202,7 @@ def readings(model: Model, window: Window, engine: EngineName) -> list[np.ndarra
     return [reader(r.channel, r.time) for r in window.readings]
 
 
-def difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> np.ndarray:
+def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> np.ndarray:
     """Return how far two sets of readings are apart in units of noise, shape (count,)."""
     found = np.empty(window.count)
     for r, a, b in zip(window.readings, first, second, strict=True):
@@ -210,7 +210,7 @@ def difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np.
     return found
 
 
-def experiment(motion: Motion, found: Separations, first: str) -> Experiment:
+def _experiment(motion: Motion, found: Separations, first: str) -> Experiment:
     """Return the experiment, in words that tell what separates the likeliest hypothesis, `first`, from the others."""
     best = max(found, key=lambda pair: found[pair][0])
     pairs = sorted((pair for pair in found if first in pair), key=lambda pair: -found[pair][0])

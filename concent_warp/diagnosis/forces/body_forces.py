@@ -44,7 +44,7 @@ class Part:
         return self.state.phase[self.valid]
 
 
-def body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows]) -> list[Part]:
+def _body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows]) -> list[Part]:
     """Return a body in each demonstration in which it was measured."""
     found = [
         (motion, window, body, body_windows(motion, window, body))
@@ -68,7 +68,7 @@ def body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows])
 
 def body_force(model: Model, name: str, motions: Sequence[Motion], windows: Sequence[Windows], seed: int) -> BodyForce:
     """Return the unexplained force on a free body."""
-    parts = body_parts(name, motions, windows)
+    parts = _body_parts(name, motions, windows)
     everything = joined([part.seen for part in parts])
     forces, torques = [], []
     for part in parts:
@@ -80,13 +80,13 @@ def body_force(model: Model, name: str, motions: Sequence[Motion], windows: Sequ
     least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
     spread = np.sqrt(np.einsum("nii->n", everything.covariance[:, 3:, 3:]) / 3) * everything.size
     force, torque = (
-        dependences(values, std, projected(sight, tables), everything.block, seed, least)
+        dependences(values, std, _projected(sight, tables), everything.block, seed, least)
         for values, std, sight, tables in (
             (everything.force, everything.std, everything.free[:, :3, :3], forces),
             (everything.torque, spread, everything.free[:, 3:, 3:], torques),
         )
     )
-    phases = body_phases(model, parts, seed)
+    phases = _body_phases(model, parts, seed)
     values = [force.p, torque.p, *(phase.p for phase in phases)]
     expected = np.einsum("nii->n", everything.covariance[:, :3, :3])
     square = (everything.force**2).sum(axis=1)
@@ -108,20 +108,20 @@ def body_force(model: Model, name: str, motions: Sequence[Motion], windows: Sequ
     )
 
 
-def projected(sight: np.ndarray, tables: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _projected(sight: np.ndarray, tables: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Return features (n, 3) of several demonstrations together, as far as contacts leave them to be seen."""
     together = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return {name: np.einsum("nij,nj->ni", sight, value) for name, value in together.items()}
 
 
-def body_phases(model: Model, parts: Sequence[Part], seed: int) -> list[PhaseForce]:
+def _body_phases(model: Model, parts: Sequence[Part], seed: int) -> list[PhaseForce]:
     """Return the steady force and its place in each phase but rest, which shows no forces."""
     names = {str(phase) for part in parts for phase in part.phase} - {REST}
-    found = [body_phase(model, parts, phase, seed) for phase in sorted(names)]
+    found = [_body_phase(model, parts, phase, seed) for phase in sorted(names)]
     return [phase for phase in found if phase is not None]
 
 
-def body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> PhaseForce | None:
+def _body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> PhaseForce | None:
     """Return the steady force and its place in one phase; None where there is too little of it, or all is hidden."""
     chosen = [np.asarray(part.phase == phase) for part in parts]
     counts = [int(c.sum()) for c in chosen]
@@ -134,7 +134,7 @@ def body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> Ph
         return None
     body, spans, touches = parts[0].body, [], []
     for part, rows in zip(parts, chosen, strict=True):
-        spans += spans_of(part.windows, np.asarray(part.state.phase == phase) & part.valid)
+        spans += _spans_of(part.windows, np.asarray(part.state.phase == phase) & part.valid)
         touches += [part.state.touches[k] for k in np.flatnonzero(part.valid)[rows]]
     stride = parts[0].windows.length / 2
     return PhaseForce(
@@ -154,7 +154,7 @@ def body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> Ph
     )
 
 
-def spans_of(windows: Windows, chosen: np.ndarray) -> list[tuple[str, float, float]]:
+def _spans_of(windows: Windows, chosen: np.ndarray) -> list[tuple[str, float, float]]:
     """Return demonstration, start and end [s] of each run of `chosen` windows, shape (K,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int))).reshape(-1, 2)
     ends = windows.start + windows.length

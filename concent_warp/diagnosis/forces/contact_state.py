@@ -74,7 +74,7 @@ def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWind
     velocity = windows.qvel[:, body.dof : body.dof + 3]
     spin = rotation.apply(windows.qvel[:, body.dof + 3 : body.dof + 6])
     speed_std = np.sqrt(body.position.smooth.covariance(windows.time)[:, 1, 1])
-    size = body_size(m, body.body)
+    size = _body_size(m, body.body)
     log, owner = windows.contacts, m.geom_bodyid[windows.contacts.geom]
     first, second = np.asarray(owner[:, 0] == body.body), np.asarray(owner[:, 1] == body.body)
     phase = np.full(count, FREE, dtype=object)
@@ -102,9 +102,9 @@ def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWind
                 mean / max(float(np.linalg.norm(mean)), 1e-9),
                 len(np.unique(log.step[rows][mine])) / steps,
             )
-        share = lasting_share(np.unique(log.step[rows]), steps, round(HOP / m.opt.timestep))
+        share = _lasting_share(np.unique(log.step[rows]), steps, round(HOP / m.opt.timestep))
         matrix = rotation[k].as_matrix()
-        movers = {int(b) for b in np.unique(other) if moved_by_joints(m, int(b))}
+        movers = {int(b) for b in np.unique(other) if _moved_by_joints(m, int(b))}
         fixed = (
             ~np.isin(other, list(movers)) if len(movers) < len(np.unique(other)) else np.ones(len(other), dtype=bool)
         )
@@ -126,8 +126,8 @@ def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWind
         else:
             limit = max(SLIDING, 3 * float(speed_std[k]))
             speeds = windows.edge_qvel[:, k, body.dof : body.dof + 6]
-            ends = [speed_at(velocity[k], spin[k], centre, up, size)]
-            ends += [speed_at(v[:3], matrix @ v[3:], centre, up, size) for v in speeds]
+            ends = [_speed_at(velocity[k], spin[k], centre, up, size)]
+            ends += [_speed_at(v[:3], matrix @ v[3:], centre, up, size) for v in speeds]
             travel, slips = ends[0]
             if slips < GRIPPING * travel and travel > limit:
                 phase[k] = STICK
@@ -138,11 +138,11 @@ def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWind
         if share >= LASTING:
             push = np.concatenate([normal, np.cross(point, normal) / size], axis=1)
             both = np.kron(np.eye(2), matrix)
-            free[k] = both @ free_motions(push, len(np.unique(log.step[rows]))) @ both.T
+            free[k] = both @ _free_motions(push, len(np.unique(log.step[rows]))) @ both.T
     return BodyWindows(phase, tuple(touches), free, size, sliding, heading, velocity, spin, rotation.as_matrix())
 
 
-def speed_at(
+def _speed_at(
     velocity: np.ndarray, spin: np.ndarray, point: np.ndarray, up: np.ndarray, size: float
 ) -> tuple[float, float]:
     """Return how fast a body moves [m/s], and how fast it slips at a point, turning about the normal counted in.
@@ -159,7 +159,7 @@ def speed_at(
     return float(np.linalg.norm(velocity)), float(np.hypot(np.linalg.norm(slip), abs(float(spin @ up)) * size))
 
 
-def lasting_share(touched: np.ndarray, steps: int, hop: int) -> float:
+def _lasting_share(touched: np.ndarray, steps: int, hop: int) -> float:
     """Return the share of `steps` with contact, interruptions of up to `hop` steps counted in.
 
     Args:
@@ -172,7 +172,7 @@ def lasting_share(touched: np.ndarray, steps: int, hop: int) -> float:
     return 1 - float(gaps[gaps > hop].sum()) / steps
 
 
-def free_motions(push: np.ndarray, steps: int) -> np.ndarray:
+def _free_motions(push: np.ndarray, steps: int) -> np.ndarray:
     """Return the projector (6, 6) onto motions that contacts do not see.
 
     Args:
@@ -184,7 +184,7 @@ def free_motions(push: np.ndarray, steps: int) -> np.ndarray:
     return loose @ loose.T
 
 
-def moved_by_joints(m: mujoco.MjModel, body: int) -> bool:
+def _moved_by_joints(m: mujoco.MjModel, body: int) -> bool:
     """Return whether a body hangs on joints, as a robot's do, rather than being free or fixed."""
     root = body
     while m.body_parentid[root] != 0:
@@ -195,7 +195,7 @@ def moved_by_joints(m: mujoco.MjModel, body: int) -> bool:
     return not (joint >= 0 and m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
 
 
-def body_size(m: mujoco.MjModel, body: int) -> float:
+def _body_size(m: mujoco.MjModel, body: int) -> float:
     """Return half the mean extent of a body's geoms [m]."""
     low, high = extent(m, body)
     return max(float(np.mean(high - low)) / 2, 1e-3)

@@ -104,16 +104,16 @@ def dependences(
     x = np.stack([(kept[n] * weight).ravel() for n in names])
     block = np.repeat(block, force.shape[1])
     signs = flips(len(labels), np.random.default_rng(seed))
-    p = max_p(y, x, block, signs)
+    p = _max_p(y, x, block, signs)
     found = []
     for i, name in enumerate(names):
-        slope, slope_std = slope_of(y, x[i], block)
-        found.append(Dependence(name, correlation(y, x[i]), slope, slope_std, float(p[i])))
+        slope, slope_std = _slope_of(y, x[i], block)
+        found.append(Dependence(name, _correlation(y, x[i]), slope, slope_std, float(p[i])))
     found.sort(key=lambda d: -abs(d.correlation))
-    return Dependences(tuple(found), patterns(y, x, names, block, signs, least_share))
+    return Dependences(tuple(found), _patterns(y, x, names, block, signs, least_share))
 
 
-def patterns(
+def _patterns(
     y: np.ndarray, x: np.ndarray, names: Sequence[str], block: np.ndarray, signs: np.ndarray, least_share: float
 ) -> tuple[Pattern, ...]:
     """Return the features that explain `y` (n,), one after the other, of candidates `x` (F, n)."""
@@ -121,25 +121,25 @@ def patterns(
     total = float(y @ y)
     left, candidates, chosen = y, x, np.zeros((0, len(y)))
     for _ in range(MOST_PATTERNS):
-        p = max_p(left, candidates, block, signs)
-        strength = np.abs([correlation(left, c) for c in candidates])
+        p = _max_p(left, candidates, block, signs)
+        strength = np.abs([_correlation(left, c) for c in candidates])
         best = int(np.argmax(strength))
         if p[best] > LEVEL:
             break
         share = strength[best] ** 2 * float(left @ left) / total
         if share < least_share and not found:
             break
-        slope, slope_std = slope_of(left, candidates[best], block)
+        slope, slope_std = _slope_of(left, candidates[best], block)
         alternatives = tuple(
             str(names[i])
             for i in np.argsort(-strength)
             if i != best
             and names[i] not in {f.feature for f in found}
-            and alike(left, candidates[best], candidates[i], block)
+            and _alike(left, candidates[best], candidates[i], block)
         )
         found.append(Pattern(names[best], slope, slope_std, share, float(p[best]), alternatives))
         chosen = np.concatenate([chosen, x[best][None]])
-        left, candidates = without(y, chosen), np.stack([without(c, chosen) for c in x])
+        left, candidates = _without(y, chosen), np.stack([_without(c, chosen) for c in x])
         small = (candidates**2).sum(axis=1) < 1e-3 * (x**2).sum(axis=1)
         candidates[small] = 0
     return tuple(found)
@@ -164,7 +164,7 @@ def flips(count: int, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([np.ones((1, count)), rng.choice([-1.0, 1.0], size=(FLIPS, count))])
 
 
-def max_p(y: np.ndarray, x: np.ndarray, block: np.ndarray, signs: np.ndarray) -> np.ndarray:
+def _max_p(y: np.ndarray, x: np.ndarray, block: np.ndarray, signs: np.ndarray) -> np.ndarray:
     """Return the p-value of the correlation of `y` (n,) with each of `x` (F, n), corrected for their number."""
     size = np.sqrt((x**2).sum(axis=1))
     product = np.stack([np.bincount(block, weights=c * y, minlength=signs.shape[1]) for c in x])
@@ -173,13 +173,13 @@ def max_p(y: np.ndarray, x: np.ndarray, block: np.ndarray, signs: np.ndarray) ->
     return (highest[:, None] >= statistic[0] * (1 - 1e-12)).mean(axis=0)
 
 
-def correlation(y: np.ndarray, x: np.ndarray) -> float:
+def _correlation(y: np.ndarray, x: np.ndarray) -> float:
     """Return the correlation of `y` and `x` (n,) about 0."""
     size = np.sqrt((y @ y) * (x @ x))
     return float(y @ x / size) if size > 0 else 0.0
 
 
-def slope_of(y: np.ndarray, x: np.ndarray, block: np.ndarray) -> tuple[float, float]:
+def _slope_of(y: np.ndarray, x: np.ndarray, block: np.ndarray) -> tuple[float, float]:
     """Return the least-squares slope of `y` on `x` (n,) and its standard deviation from the scatter between blocks."""
     square = float(x @ x)
     slope = float(x @ y) / square
@@ -188,7 +188,7 @@ def slope_of(y: np.ndarray, x: np.ndarray, block: np.ndarray) -> tuple[float, fl
     return slope, float(np.sqrt((score**2).sum() * count / max(count - 1, 1)) / square)
 
 
-def alike(y: np.ndarray, best: np.ndarray, other: np.ndarray, block: np.ndarray) -> bool:
+def _alike(y: np.ndarray, best: np.ndarray, other: np.ndarray, block: np.ndarray) -> bool:
     """Return whether `other` explains `y` as well as `best` within the scatter between blocks, (n,) each."""
     if not np.any(other):
         return False
@@ -197,6 +197,6 @@ def alike(y: np.ndarray, best: np.ndarray, other: np.ndarray, block: np.ndarray)
     return bool(gain.sum() <= ALIKE * np.sqrt(len(gain)) * gain.std(ddof=1)) if len(gain) > 1 else True
 
 
-def without(y: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def _without(y: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Return `y` (n,) with its part along the rows of `chosen` (F, n) taken out."""
     return y - chosen.T @ np.linalg.lstsq(chosen.T, y, rcond=None)[0]

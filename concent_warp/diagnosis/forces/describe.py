@@ -47,13 +47,13 @@ def joint_sentence(found: JointForce) -> str:
     head = f"{found.joint}: {found.rms:.2g} {found.unit} unexplained (rms; noise {found.noise:.2g})"
     if found.significant and found.dependences.patterns:
         length = "rad" if found.unit == "N m" else "m"
-        return f"{head}; it {pattern_words(found.dependences, found.unit, length)}."
+        return f"{head}; it {_pattern_words(found.dependences, found.unit, length)}."
     if found.significant:
-        return f"{head}; it follows none of the features{where_words(found)}."
+        return f"{head}; it follows none of the features{_where_words(found)}."
     return f"{head}, no more than noise; a steady force of {found.detectable:.2g} {found.unit} would have shown."
 
 
-def where_words(found: JointForce) -> str:
+def _where_words(found: JointForce) -> str:
     """Return when a force is largest, in words."""
     worst = max(found.series, key=lambda s: np.nanmax(np.abs(s.force) / s.std, initial=0))
     k = int(np.nanargmax(np.abs(worst.force) / worst.std))
@@ -70,10 +70,10 @@ def nothing_sentence(found: BodyForce) -> str:
 
 def pattern_sentence(what: str, found: Dependences, unit: str) -> str:
     """Return a sentence about what a force depends on."""
-    return f"{what}: {pattern_words(found, unit, 'm' if unit == 'N' else 'rad')}."
+    return f"{what}: {_pattern_words(found, unit, 'm' if unit == 'N' else 'rad')}."
 
 
-def pattern_words(found: Dependences, unit: str, length: str) -> str:
+def _pattern_words(found: Dependences, unit: str, length: str) -> str:
     """Return what a force depends on, in words."""
     parts = []
     for pattern in found.patterns:
@@ -94,15 +94,15 @@ def body_sentence(body: str, found: PhaseForce) -> str:
     spans = ", ".join(f"{d} {a:.2f}-{b:.2f} s" for d, a, b in found.spans[:2])
     more = f" and {len(found.spans) - 2} more" if len(found.spans) > 2 else ""
     text = f"{body}, {found.phase} ({spans}{more}): {found.size:.2g} ± {1.96 * found.size_std:.1g} N unexplained"
-    text += f" {direction_words(found.vector, found.frame)}"
+    text += f" {_direction_words(found.vector, found.frame)}"
     if found.place is not None:
-        text += place_words(found.place)
+        text += _place_words(found.place)
     if found.phase == "impact":
         text += f"; {np.linalg.norm(found.impulse):.2g} N s a time"
     return f"{text}; p = {found.p:.2g}."
 
 
-def place_words(place: ForcePlace) -> str:
+def _place_words(place: ForcePlace) -> str:
     """Return where a force acts, in words, to follow on what it is."""
     if place.against is not None:
         words = f", at its contact with {place.against} ({place.face})"
@@ -123,7 +123,7 @@ def place_words(place: ForcePlace) -> str:
     return words
 
 
-def direction_words(vector: np.ndarray, frame: str) -> str:
+def _direction_words(vector: np.ndarray, frame: str) -> str:
     """Return the direction of a force in words: "along -x", "along +x -y of block", "against its sliding"."""
     if frame == SLIP:
         return "against its sliding" if vector[0] < 0 else "with its sliding"

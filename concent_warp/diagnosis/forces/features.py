@@ -61,7 +61,7 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
         d.qvel[:] = 0
         mujoco.mj_fwdVelocity(m, d)
         load[i] = d.qfrc_bias - d.qfrc_gravcomp
-    touching = contact_shares(motion.compiled, windows)
+    touching = _contact_shares(motion.compiled, windows)
     found = {}
     for joint in motion.joints:
         v = qvel[:, joint.dof]
@@ -83,17 +83,17 @@ def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.n
         }
         mean = {name: value.reshape(count, -1) @ WEIGHTS for name, value in raw.items()}
         mean[CONTACT] = touching[:, joint.dof]
-        found[joint.name] = {name: value[:, None] for name, value in mean.items() if varies(name, value)}
+        found[joint.name] = {name: value[:, None] for name, value in mean.items() if _varies(name, value)}
     return found
 
 
-def varies(name: str, value: np.ndarray) -> bool:
+def _varies(name: str, value: np.ndarray) -> bool:
     """Return whether a feature says more than a constant does."""
     size = float(np.abs(value).max(initial=0))
     return name == CONSTANT or (size > 0 and float(np.ptp(value)) > 1e-6 * size)
 
 
-def contact_shares(m: mujoco.MjModel, windows: Windows) -> np.ndarray:
+def _contact_shares(m: mujoco.MjModel, windows: Windows) -> np.ndarray:
     """Return in which share of the steps of a window something beyond a degree of freedom touches, shape (K, nv)."""
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1
     log = windows.contacts

@@ -55,7 +55,7 @@ class JointForce:
         names = ("joint", "unit", "rms", "noise", "ratio", "detectable", "p", "significant")
         return {
             **{name: getattr(self, name) for name in names},
-            **dependences_json(self.dependences),
+            **_dependences_json(self.dependences),
             "series": [s.to_json() for s in self.series],
         }
 
@@ -100,7 +100,7 @@ class PhaseForce:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON, SI units."""
-        values = {name: plain(value) for name, value in vars(self).items() if name not in ("place", "spans")}
+        values = {name: _plain(value) for name, value in vars(self).items() if name not in ("place", "spans")}
         spans = [{"demonstration": d, "start": a, "end": b} for d, a, b in self.spans]
         place = None if self.place is None else self.place.to_json()
         return {**values, "size": self.size, "size_std": self.size_std, "spans": spans, "place": place}
@@ -132,14 +132,14 @@ class BodyForce:
         names = ("body", "rms", "noise", "ratio", "p", "significant")
         return {
             **{name: getattr(self, name) for name in names},
-            "force": dependences_json(self.force),
-            "torque": dependences_json(self.torque),
+            "force": _dependences_json(self.force),
+            "torque": _dependences_json(self.torque),
             "phases": [phase.to_json() for phase in self.phases],
             "series": [s.to_json() for s in self.series],
         }
 
 
-def dependences_json(found: Dependences) -> dict[str, Any]:
+def _dependences_json(found: Dependences) -> dict[str, Any]:
     """Return dependences as JSON."""
     return {
         "dependences": [vars(d) for d in found.all],
@@ -147,6 +147,6 @@ def dependences_json(found: Dependences) -> dict[str, Any]:
     }
 
 
-def plain(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     """Return an array as a list, anything else as it is."""
     return value.tolist() if isinstance(value, np.ndarray) else value

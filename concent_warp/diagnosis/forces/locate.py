@@ -64,7 +64,7 @@ def locate_forces(
     simulator = make_engine(engine, model)
     chosen = recording.demonstrations
     motions = [measured_motion(model, d, simulator) for d in chosen]
-    report = progress or ignore
+    report = progress or _ignore
     report(0.1)
     if cfg.length is None:
         # One length for all, so that their forces can be taken together.
@@ -74,9 +74,9 @@ def locate_forces(
         windows.append(window_forces(d.name, simulator, motion, cfg))
         report(0.1 + 0.6 * (k + 1) / len(chosen))
     features = [joint_features(w, m) for w, m in zip(windows, motions, strict=True)]
-    joints = [joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in all_joints(motions)]
-    bodies = [body_force(model, name, motions, windows, cfg.seed) for name in all_bodies(motions)]
-    accepted = holm([f.p for f in joints] + [f.p for f in bodies])
+    joints = [_joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in _all_joints(motions)]
+    bodies = [body_force(model, name, motions, windows, cfg.seed) for name in _all_bodies(motions)]
+    accepted = _holm([f.p for f in joints] + [f.p for f in bodies])
     joints = [
         replace(f, significant=f.ratio > BEYOND_NOISE or (ok and bool(f.dependences.patterns)))
         for f, ok in zip(joints, accepted[: len(joints)], strict=True)
@@ -90,24 +90,24 @@ def locate_forces(
     return found
 
 
-def ignore(share: float) -> None:
+def _ignore(share: float) -> None:
     """Do nothing with the progress."""
     del share
 
 
-def all_joints(motions: Sequence[Motion]) -> list[tuple[str, str, int]]:
+def _all_joints(motions: Sequence[Motion]) -> list[tuple[str, str, int]]:
     """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
     return sorted(
         {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
     )
 
 
-def all_bodies(motions: Sequence[Motion]) -> list[str]:
+def _all_bodies(motions: Sequence[Motion]) -> list[str]:
     """Return the names of the free bodies measured in any demonstration."""
     return list(dict.fromkeys(b.name for m in motions for b in m.bodies))
 
 
-def joint_force(
+def _joint_force(
     name: str,
     unit: str,
     dof: int,
@@ -129,10 +129,10 @@ def joint_force(
     return JointForce(
         joint=name,
         unit=unit,
-        rms=root_mean_square(force[valid]),
-        noise=root_mean_square(std[valid]),
-        ratio=root_mean_square(force[valid] / std[valid]),
-        detectable=detectable(std[valid], least),
+        rms=_root_mean_square(force[valid]),
+        noise=_root_mean_square(std[valid]),
+        ratio=_root_mean_square(force[valid] / std[valid]),
+        detectable=_detectable(std[valid], least),
         p=found.p,
         significant=False,
         dependences=found,
@@ -140,7 +140,7 @@ def joint_force(
     )
 
 
-def detectable(std: np.ndarray, share: float) -> float:
+def _detectable(std: np.ndarray, share: float) -> float:
     """Return the smallest steady force that would be seen in windows with errors `std` (n,); NaN without any.
 
     It stands out from their mean's error, and makes a `share` of all forces.
@@ -151,7 +151,7 @@ def detectable(std: np.ndarray, share: float) -> float:
     return max(DETECTABLE, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
 
 
-def holm(p: Sequence[float]) -> list[bool]:
+def _holm(p: Sequence[float]) -> list[bool]:
     """Return which hypotheses are rejected at `LEVEL` over all of them (Holm, 1979)."""
     accepted = [False] * len(p)
     for rank, i in enumerate(np.argsort(p)):
@@ -161,6 +161,6 @@ def holm(p: Sequence[float]) -> list[bool]:
     return accepted
 
 
-def root_mean_square(values: np.ndarray) -> float:
+def _root_mean_square(values: np.ndarray) -> float:
     """Return the RMS of values (n,); NaN of none."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan

@@ -42,23 +42,23 @@ def plot_location(location: Location, model: Model, path: Path) -> None:
     grid = figure.add_gridspec(max(len(heights), 1), columns, height_ratios=heights or [1])
     for i, name in enumerate(bodies):
         axes = figure.add_subplot(grid[0, i], projection="3d")
-        draw_body(axes, m, name, [arrow for arrow in arrows if arrow["body"] == name])
+        _draw_body(axes, m, name, [arrow for arrow in arrows if arrow["body"] == name])
     for i, joint in enumerate(joints):
-        draw_joint(figure.add_subplot(grid[bool(bodies) + i, :]), joint, last=i == len(joints) - 1)
+        _draw_joint(figure.add_subplot(grid[bool(bodies) + i, :]), joint, last=i == len(joints) - 1)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     figure.savefig(partial, dpi=130)
     plt.close(figure)
     partial.replace(path)
 
 
-def draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, Any]]) -> None:
+def _draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, Any]]) -> None:
     """Draw a body in its own frame [mm], with arrows that end where the forces act."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     body = m.body(name).id
     corners = []
     for g in range(int(m.body_geomadr[body]), int(m.body_geomadr[body] + m.body_geomnum[body])):
-        if (mesh := geom_mesh(m, g)) is None:
+        if (mesh := _geom_mesh(m, g)) is None:
             continue
         triangles = 1e3 * np.asarray(mesh.triangles)
         corners.append(triangles.reshape(-1, 3))
@@ -94,7 +94,7 @@ def draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, An
     axes.set_title(name if arrows else f"{name}: no unexplained force with a place", fontsize=9)
 
 
-def draw_joint(axes: Any, joint: JointForce, *, last: bool) -> None:
+def _draw_joint(axes: Any, joint: JointForce, *, last: bool) -> None:
     """Draw the force of a joint over time, demonstrations one after the other, with what noise leaves."""
     offset = 0.0
     for series in joint.series:
@@ -112,7 +112,7 @@ def draw_joint(axes: Any, joint: JointForce, *, last: bool) -> None:
         axes.set_xlabel("time [s]", fontsize=8)
 
 
-def geom_mesh(m: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
+def _geom_mesh(m: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
     """Return a geom as triangles in the frame of its body [m]; None for planes and height fields."""
     import trimesh
 

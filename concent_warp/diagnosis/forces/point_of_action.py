@@ -86,14 +86,14 @@ def force_place(
     """
     if not w.turned:
         return None
-    point, axes, std = line_of_action(w, steady)
+    point, axes, std = _line_of_action(w, steady)
     low, high = extent(m, body)
     known, open_axes = axes[:, std < OPEN * w.size], axes[:, std >= OPEN * w.size]
     known_std = std[std < OPEN * w.size]
     direction = np.einsum("nji,nj->i", w.rotation, steady.steady)
     steadiness = np.linalg.norm(direction) / max(float(np.linalg.norm(steady.steady, axis=1).sum()), 1e-12)
     direction /= max(float(np.linalg.norm(direction)), 1e-12)
-    sampled = surface_points(model, m, body)
+    sampled = _surface_points(model, m, body)
     reach = np.concatenate([sampled[0], np.zeros((0, 3))])
     spacing = float(np.sqrt(((high - low) ** 2).sum())) / 60
     miss = (reach - point) @ known
@@ -110,7 +110,7 @@ def force_place(
     normal = np.average(sampled[1][chosen], axis=0, weights=weight)
     off = float(np.sqrt((miss**2).sum(axis=1)).min()) if known.shape[1] else 0.0
     off = max(0.0, off - spacing - 3 * float(known_std.max(initial=0)))
-    contact = at_contact(w, steady, touches, point, known, known_std, direction)
+    contact = _at_contact(w, steady, touches, point, known, known_std, direction)
     if contact is not None:
         settled, normal = contact[1], -contact[2]
         variance = np.maximum(variance, contact[3] ** 2)
@@ -127,7 +127,7 @@ def force_place(
         point=settled,
         std=error,
         normal=normal / max(float(np.linalg.norm(normal)), 1e-9),
-        face=face_words((settled - middle) / half, normal, hidden),
+        face=_face_words((settled - middle) / half, normal, hidden),
         hidden=hidden,
         off=off if off > NEAR else 0.0,
         against=None if contact is None else contact[0],
@@ -135,7 +135,7 @@ def force_place(
     )
 
 
-def line_of_action(w: Wrenches, steady: SteadyForce) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _line_of_action(w: Wrenches, steady: SteadyForce) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where forces explain torques best [m] (3,), body frame, with axes (3, 3) and sizes (3,) of the error.
 
     The torque rows of P [f, (R p) x f / size] = what is seen, linear in p.
@@ -144,13 +144,13 @@ def line_of_action(w: Wrenches, steady: SteadyForce) -> tuple[np.ndarray, np.nda
     chance = np.zeros((3, 3))
     for k in range(len(w.force)):
         force = steady.each[k]
-        rows = w.free[k, 3:, 3:] @ lever(force, w.rotation[k]) / w.size
+        rows = w.free[k, 3:, 3:] @ _lever(force, w.rotation[k]) / w.size
         seen = w.torque[k] / w.size - w.free[k, 3:, :3] @ force
         value, axes = np.linalg.eigh(w.covariance[k, 3:, 3:])
         kept = value > 1e-8 * max(float(value.max()), 1e-30)
         white = axes[:, kept].T / np.sqrt(value[kept])[:, None]
         for axis in steady.taken * w.std[k] * w.free[k, :3, :3]:
-            apparent = white @ w.free[k, 3:, 3:] @ lever(axis, w.rotation[k]) / w.size
+            apparent = white @ w.free[k, 3:, 3:] @ _lever(axis, w.rotation[k]) / w.size
             chance += apparent.T @ apparent
         rows, seen = white @ rows, white @ seen
         normal += rows.T @ rows
@@ -168,13 +168,13 @@ def line_of_action(w: Wrenches, steady: SteadyForce) -> tuple[np.ndarray, np.nda
     return point, axes, std
 
 
-def lever(force: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def _lever(force: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return the matrix (3, 3) that takes a point in the body frame to the torque of a force (3,) there, (R p) x f."""
     cross = np.array([[0, -force[2], force[1]], [force[2], 0, -force[0]], [-force[1], force[0], 0]])
     return -cross @ rotation
 
 
-def surface_points(model: Model, m: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+def _surface_points(model: Model, m: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points on the surface of a body [m] and outward normals, (S, 3) each, in its frame.
 
     Of its shapes; where these have no closed surface, of its contact spheres; else of the box about it.
@@ -201,7 +201,7 @@ def surface_points(model: Model, m: mujoco.MjModel, body: int) -> tuple[np.ndarr
         return (low + high) / 2 + unit * (high - low) / 2, normal
 
 
-def at_contact(
+def _at_contact(
     w: Wrenches,
     steady: SteadyForce,
     touches: Sequence[dict[str, Touch]],
@@ -234,7 +234,7 @@ def at_contact(
     return None if best is None else best[1]
 
 
-def face_words(place: np.ndarray, normal: np.ndarray, hidden: Sequence[str]) -> str:
+def _face_words(place: np.ndarray, normal: np.ndarray, hidden: Sequence[str]) -> str:
     """Return a place in words.
 
     Args:

@@ -127,10 +127,12 @@ class WindowSolver:
         frame = np.eye(6)
         frame[3:, 3:] = Rotation.from_quat(window.qpos[body.qpos + 3 : body.qpos + 7], scalar_first=True).as_matrix()
         inertia = frame @ mass[body.dof : body.dof + 6, body.dof : body.dof + 6] @ frame.T
-        damping = sliding_damping(self.model, window, body)
+        damping = _sliding_damping(self.model, window, body)
         rate = -np.linalg.solve(inertia, damping)[:count, :count]
         groups = np.repeat([0, 1], 3)[:count]
-        found, covariance = fitted(readings, response(np.zeros((count, count)), rate, self.length), self.length, groups)
+        found, covariance = _fitted(
+            readings, _response(np.zeros((count, count)), rate, self.length), self.length, groups
+        )
         back = frame[:count, :count]
         dofs = slice(body.dof, body.dof + count)
         acceleration[:, dofs] = found @ back
@@ -156,8 +158,8 @@ class WindowSolver:
                 readings.append(
                     self._readings(window.start, joint.velocity, path, np.array([count + i]), turning=False)
                 )
-        law = response(*self._drives(joints), self.length)
-        found, covariance = fitted(readings, law, self.length, np.arange(count))
+        law = _response(*self._drives(joints), self.length)
+        found, covariance = _fitted(readings, law, self.length, np.arange(count))
         acceleration[:, dofs] = found
         noise[np.ix_(dofs, dofs)] = covariance
 
@@ -191,7 +193,7 @@ class WindowSolver:
         return Readings(clock, off, signal.std, rows)
 
 
-def sliding_damping(m: mujoco.MjModel, window: Simulated, body: BodyMotion) -> np.ndarray:
+def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: BodyMotion) -> np.ndarray:
     """Return the damping of a body's motion (world frame, about its origin) by sliding on what is fixed, shape (6, 6).
 
     Friction f against the slip v, |f| fixed: df/dv = -|f| / |v| (1 - n n' - v v' / |v|^2), n the normal.
@@ -225,7 +227,7 @@ def sliding_damping(m: mujoco.MjModel, window: Simulated, body: BodyMotion) -> n
     return np.einsum("cki,ckl,clj->ij", carry, local, carry) / (window.path.shape[1] - 1)
 
 
-def response(stiffness: np.ndarray, damping: np.ndarray, length: float) -> np.ndarray:
+def _response(stiffness: np.ndarray, damping: np.ndarray, length: float) -> np.ndarray:
     """Return how departures answer to their start and to a constant acceleration, shape (SUBSTEPS + 1, 3n, 3n).
 
     Rows are position, velocity and acceleration of the departures, columns what they are at the start.
@@ -247,14 +249,14 @@ def response(stiffness: np.ndarray, damping: np.ndarray, length: float) -> np.nd
     return law
 
 
-def fitted(
+def _fitted(
     readings: list[Readings], law: np.ndarray, length: float, groups: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the accelerations (V, n) that fit readings best, and the covariance (n, n) that their noise leaves.
 
     Args:
         readings: Of positions, and of velocities.
-        law: See `response`.
+        law: See `_response`.
         length: [s].
         groups: Which degrees of freedom share their misfit, shape (n,).
     """
@@ -273,12 +275,12 @@ def fitted(
     inverse = size[:, None] * np.linalg.pinv(matrix * size)
     left = target.mean(axis=0) - matrix @ (inverse @ target.mean(axis=0))
     freedom = {g: int((owner == g).sum()) - 3 * int((groups == g).sum()) for g in np.unique(groups)}
-    scale = np.array([misfit(float((left[owner == g] ** 2).sum()), freedom[g]) for g in groups])
+    scale = np.array([_misfit(float((left[owner == g] ** 2).sum()), freedom[g]) for g in groups])
     inverse = inverse[2 * n :]
     return target @ inverse.T, np.sqrt(scale[:, None] * scale) * (inverse @ inverse.T)
 
 
-def misfit(square: float, freedom: int) -> float:
+def _misfit(square: float, freedom: int) -> float:
     """Return by how much variances grow where a window does not fit its law: its mean square, 1 where that is chance.
 
     Args:

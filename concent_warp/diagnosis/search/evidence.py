@@ -54,7 +54,7 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 
     costs, or by `SAME` of it; by `slack` times that. And where the best is so much rarer that this outweighs what the
     other leaves more: a law that is close to the missing one may fit a little better than it, as simulations of one
     law differ too. Among them those come first that leave less, need fewer parameters and smaller values of them, see
-    `plausibility`.
+    `_plausibility`.
     """
     best = max(good, key=lambda pair: pair[1].gain)[0]
     group = []
@@ -63,18 +63,18 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 
         # A cost is half a sum of squares, an error a whole one.
         rough = 2 * np.hypot(c.rough, best.rough) if c is not best else 0.0
         error = np.hypot(np.sqrt(len(difference)) * difference.std(), rough)
-        rarer = best.effect.rarity - c.effect.rarity > log_errors(base, c) - log_errors(base, best)
+        rarer = best.effect.rarity - c.effect.rarity > _log_errors(base, c) - _log_errors(base, best)
         if rarer or difference.sum() <= slack * max(2 * error, SAME * best.errors.sum()):
             group.append((c, f))
-    return sorted(group, key=lambda pair: -plausibility(base, *pair))
+    return sorted(group, key=lambda pair: -_plausibility(base, *pair))
 
 
-def log_errors(base: Node, c: Candidate) -> float:
+def _log_errors(base: Node, c: Candidate) -> float:
     """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, blocks of time."""
     return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))
 
 
-def plausibility(base: Node, c: Candidate, f: Finding) -> float:
+def _plausibility(base: Node, c: Candidate, f: Finding) -> float:
     """Return twice the log posterior of a candidate, up to a constant.
 
     Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
@@ -83,7 +83,7 @@ def plausibility(base: Node, c: Candidate, f: Finding) -> float:
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    fit = -log_errors(base, c) - len(scale) * np.log(base.blocks.count)
+    fit = -_log_errors(base, c) - len(scale) * np.log(base.blocks.count)
     return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 

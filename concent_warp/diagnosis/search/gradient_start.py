@@ -57,14 +57,14 @@ class GradientStarts:
             except ConcentError:
                 return list(screened)
             self._effects = base.model.effects
-        factor = [factor_of(s.effect, self.factors) for s in screened]
+        factor = [_factor_of(s.effect, self.factors) for s in screened]
         rows = [k for k, f in enumerate(factor) if f != 1.0]
-        found = parallel(started, [(base, screened[k], factor[k]) for k in rows], "trying what gradients lead to", 0.0)
+        found = parallel(_started, [(base, screened[k], factor[k]) for k in rows], "trying what gradients lead to", 0.0)
         led = dict(zip(rows, found, strict=True))
         return [led.get(k, s) for k, s in enumerate(screened)]
 
 
-def factor_of(effect: Effect, found: Factors) -> float:
+def _factor_of(effect: Effect, found: Factors) -> float:
     """Return the factor on what an effect changes; 1 where gradients say nothing of it."""
     if effect.name == "sliding_friction":
         return found.friction
@@ -75,7 +75,7 @@ def factor_of(effect: Effect, found: Factors) -> float:
     return 1.0
 
 
-def moved(effect: Effect, values: np.ndarray, factor: float) -> np.ndarray:
+def _moved(effect: Effect, values: np.ndarray, factor: float) -> np.ndarray:
     """Return an effect's parameters (P,) with a factor on the friction, the stiffness or the mass that they stand for.
 
     The first parameter is a coefficient or a factor, or the time constant of contacts: their stiffness goes with its
@@ -86,13 +86,13 @@ def moved(effect: Effect, values: np.ndarray, factor: float) -> np.ndarray:
     return result
 
 
-def started(base: Node, screened: Screened, factor: float) -> Screened:
+def _started(base: Node, screened: Screened, factor: float) -> Screened:
     """Return a screened candidate that starts from a factor, where that takes away more of the error than its start."""
     effect = screened.effect
     solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))
     values = solver.p.start.copy()
     mine = solver.p.split[-1]
-    values[mine] = moved(effect, values[mine], factor)
+    values[mine] = _moved(effect, values[mine], factor)
     values = solver.inside(values)
     before = total(base, [piece.residual for piece in base.pieces])
     best = screened

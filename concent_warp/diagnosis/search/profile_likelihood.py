@@ -63,12 +63,12 @@ AllOf = Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look
 """Does independent pieces of work, and returns their results in order."""
 
 
-def solver_of(base: Node, c: Candidate) -> Solver:
+def _solver_of(base: Node, c: Candidate) -> Solver:
     """Return what fits a candidate."""
     return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine))
 
 
-def ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int, float]]:
+def _ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int, float]]:
     """Return where to look next: parameter of the candidate, and how far along its profile in standard deviations.
 
     Both sides of each parameter at first; farther on the sides where the valley does not show yet.
@@ -78,7 +78,7 @@ def ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int
     found = []
     for k in range(prediction.owned, len(prediction.parameters)):
         p, value = prediction.parameters[k], c.fit.values[k]
-        rough = roughness(c, tried, k)
+        rough = _roughness(c, tried, k)
         for side in (-1.0, 1.0):
             mine = [s for s in tried if s.parameter == k and s.reach * side > 0]
             far = max(mine, key=lambda s: abs(s.reach), default=None)
@@ -90,15 +90,15 @@ def ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int
     return found
 
 
-def roughness(c: Candidate, tried: Sequence[Look], parameter: int) -> float:
+def _roughness(c: Candidate, tried: Sequence[Look], parameter: int) -> float:
     """Return by how much the cost rises more than derivatives promise where it is looked at first, 0 if it does not."""
     near = [s for s in tried if s.parameter == parameter and abs(s.reach) == NEAR]
     return max(float(np.mean([s.cost - c.fit.cost - s.expected for s in near])), 0.0) if near else 0.0
 
 
-def look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
+def _look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
     """Look at the cost some way along the profile of a parameter."""
-    solver, known = solver_of(base, c), covariance(c.sums, base.blocks)
+    solver, known = _solver_of(base, c), covariance(c.sums, base.blocks)
     move = reach * known[parameter] / np.sqrt(known[parameter, parameter])
     move = np.where(np.isfinite(c.fit.values), move, 0.0)
     values = solver.inside(c.fit.values + move * solver.scale)
@@ -109,9 +109,9 @@ def look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
     return Look(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
 
 
-def taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
+def _taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
     """Fit a candidate from where a look has found a lower cost; what is not better in the end is dropped."""
-    solver = solver_of(base, c)
+    solver = _solver_of(base, c)
     found = judged(base, c.effect, solver, solver.fit(seen.values, seen.offsets, seen.starts))
     return found if found.fit.cost < c.fit.cost else c
 
@@ -125,39 +125,39 @@ def settled(base: Node, c: Candidate, all_of: AllOf) -> Candidate:
         all_of: Does independent pieces of work.
     """
     for _ in range(HOPS):
-        seen = looks(base, c, all_of)
+        seen = _looks(base, c, all_of)
         best = min(seen, key=lambda s: s.cost, default=None)
         if best is None or best.cost > c.fit.cost - WORTH:
-            return told(base, c, seen)
+            return _told(base, c, seen)
         for _ in range(STRIDES):
-            further = look(base, c, best.parameter, 2 * best.reach)
+            further = _look(base, c, best.parameter, 2 * best.reach)
             if further.cost > best.cost:
                 break
             best = further
-        c = taken_up(base, c, best)
-    return told(base, c, looks(base, c, all_of, WIDTH_ONLY))
+        c = _taken_up(base, c, best)
+    return _told(base, c, _looks(base, c, all_of, WIDTH_ONLY))
 
 
-def told(base: Node, c: Candidate, seen: Sequence[Look]) -> Candidate:
+def _told(base: Node, c: Candidate, seen: Sequence[Look]) -> Candidate:
     """Return a candidate with what looks around it tell: how sharp its values are, and how rough its cost."""
-    rough = max((roughness(c, seen, s.parameter) for s in seen), default=0.0)
-    return replace(c, spread=spreads(base, c, seen), rough=rough)
+    rough = max((_roughness(c, seen, s.parameter) for s in seen), default=0.0)
+    return replace(c, spread=_spreads(base, c, seen), rough=rough)
 
 
-def looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[Look]:
+def _looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[Look]:
     """Look around a fit, farther where need be; stop where a lower cost is found."""
     seen: list[Look] = []
     for _ in range(1 + EXTENSIONS):
-        untried = ways(base, c, seen)
+        untried = _ways(base, c, seen)
         if not untried:
             break
-        seen += all_of(look, [(base, c, *way) for way in untried])
+        seen += all_of(_look, [(base, c, *way) for way in untried])
         if min(s.cost for s in seen) < c.fit.cost - worth:
             break
     return seen
 
 
-def spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
+def _spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
     """Return the standard deviations of a candidate's parameters, in units of their scale, shape (P,).
 
     Those of the linear fit, larger by what the valley is flatter, by how far its middle is off, and by how far the
@@ -165,13 +165,13 @@ def spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
     """
     spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
     for k in {s.parameter for s in seen}:
-        mine, rough = [s for s in seen if s.parameter == k], roughness(c, seen, k)
+        mine, rough = [s for s in seen if s.parameter == k], _roughness(c, seen, k)
         far = [
             max((s for s in mine if s.reach * side > 0), key=lambda s: abs(s.reach), default=None) for side in (-1, 1)
         ]
         ends = [s for s in far if s is not None]
         at = np.array([s.reach for s in ends])
-        linear, curved = parabola(at, np.array([s.cost - c.fit.cost - rough for s in ends]))
+        linear, curved = _parabola(at, np.array([s.cost - c.fit.cost - rough for s in ends]))
         if curved <= 0:
             spread[k] *= WIDEST
             continue
@@ -181,7 +181,7 @@ def spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
     return spread
 
 
-def parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
+def _parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
     """Return b and c of the parabola b x + c x^2 through two points; b is zero where they lie on one side only."""
     both = len(at) > 1
     columns = np.column_stack([at, at**2] if both else [at**2])

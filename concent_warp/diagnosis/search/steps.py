@@ -48,7 +48,7 @@ class Node:
     @property
     def ratio(self) -> float:
         """Root mean square of the residuals over the noise, robust: 1 where the model explains all but noise."""
-        return noise_ratio(self.pieces)
+        return _noise_ratio(self.pieces)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Candidate:
         return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
 
 
-def noise_ratio(pieces: Sequence[Linear]) -> float:
+def _noise_ratio(pieces: Sequence[Linear]) -> float:
     """Return the root mean square of residuals in units of noise, rows beyond `HUBER` times it weighed down."""
     pooled = np.concatenate([piece.residual for piece in pieces])
     return float(np.sqrt(np.mean(2 * huber(pooled, HUBER))))
@@ -127,7 +127,7 @@ def node(
     if len(fit.values) and not rough:
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
-    return assessed(model, windows, blocks, fit, engine)
+    return _assessed(model, windows, blocks, fit, engine)
 
 
 def without(last: Node, effect: int) -> Node:
@@ -135,10 +135,10 @@ def without(last: Node, effect: int) -> Node:
     model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
     solver = Solver(Prediction(model, (), last.windows, engine=last.engine))
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
-    return assessed(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
+    return _assessed(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
 
 
-def assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> Node:
+def _assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> Node:
     """Return a fitted model as a node."""
     pieces = tuple(projected(fit))
     limit = huber_limit([piece.residual for piece in pieces])
@@ -153,7 +153,7 @@ def strengthened(base: Node, rivals: Sequence[Candidate]) -> Node:
     """
     solver = Solver(Prediction(base.model, (), base.windows, engine=base.engine))
     fit = solver.better_starts(base.fit, [c.fit.offsets for c in rivals])
-    found = assessed(base.model, base.windows, base.blocks, fit, base.engine)
+    found = _assessed(base.model, base.windows, base.blocks, fit, base.engine)
     return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 
 
@@ -165,17 +165,17 @@ def screen(base: Node, effect: Effect) -> Screened:
     """
     solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))
     values = solver.p.start.copy()
-    at = sensitive_start(solver, values)
+    at = _sensitive_start(solver, values)
     # What matters is the residual of the node itself; at a start off the null value it is another.
     pieces = with_residuals(projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces)
-    gain = linear_gain(base, pieces, base.pieces, base.errors)
+    gain = _linear_gain(base, pieces, base.pieces, base.errors)
     if max(float(np.abs(o).max()) for o in base.fit.offsets) > FAR:
         zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
         there = projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
         before = HeldOut(block_sums(plain, base.blocks, base.limit), base.blocks).own()
-        gain = max(gain, linear_gain(base, there, plain, before))
-    scanned, start = scan(solver, base, values)
+        gain = max(gain, _linear_gain(base, there, plain, before))
+    scanned, start = _scan(solver, base, values)
     return Screened(effect, gain, scanned, start, pieces, solver.p.simulated)
 
 
@@ -184,18 +184,18 @@ def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Line
     return tuple(replace(piece, residual=known.residual) for piece, known in zip(pieces, of, strict=True))
 
 
-def linear_gain(base: Node, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
+def _linear_gain(base: Node, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
     """Return the share of the held-out error that a linear step with the sensitivities takes away."""
     errors = HeldOut(block_sums(with_residuals(pieces, plain), base.blocks, base.limit), base.blocks).own()
     return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
 
 
-def sensitive_start(solver: Solver, values: np.ndarray) -> np.ndarray:
+def _sensitive_start(solver: Solver, values: np.ndarray) -> np.ndarray:
     """Return where sensitivities are taken: the null values, and finite values for limits that are infinite there."""
     return np.where(np.isfinite(values), values, solver.scale)
 
 
-def scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndarray]:
+def _scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndarray]:
     """Try the values that parameters name for that; return the best one's gain, and where a fit is to start."""
     trials = []
     for k, parameter in enumerate(solver.p.parameters):
@@ -298,7 +298,7 @@ def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Windo
 
 def extended(base: Node, added: Candidate) -> Node:
     """Return the node of the model that a candidate makes of a node's."""
-    return assessed(added.model, base.windows, base.blocks, added.fit, base.engine)
+    return _assessed(added.model, base.windows, base.blocks, added.fit, base.engine)
 
 
 def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
@@ -313,7 +313,7 @@ def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
         sums,
         pieces,
         errors,
-        noise_ratio(pieces),
+        _noise_ratio(pieces),
         solver.p.simulated,
     )
 

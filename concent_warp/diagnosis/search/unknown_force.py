@@ -93,18 +93,18 @@ def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> Unk
     if last.ratio > cfg.adequate or not runs:
         return None
     lacked = max(max(first.ratio, last.ratio) ** 2 - 1, LEAST)
-    if last.ratio**2 >= 1 + LEAST and (found := best_force(last, None, lacked, cfg, results)) is not None:
+    if last.ratio**2 >= 1 + LEAST and (found := _best_force(last, None, lacked, cfg, results)) is not None:
         return found
     effects = [len(n.model.effects) for n in nodes]
     if any(after <= before for before, after in pairwise(effects)):
         return None  # some were left out again: what each found is not what the last ones explain
     for before, after in reversed(list(pairwise(nodes[1:]))):
-        if (found := best_force(before, after, lacked, cfg, results)) is not None:
+        if (found := _best_force(before, after, lacked, cfg, results)) is not None:
             return found
     return None
 
 
-def best_force(
+def _best_force(
     base: Node, rival: Node | None, lacked: float, cfg: Settings, results: Results
 ) -> UnknownForceFound | None:
     """Return the force that explains most of what a node leaves.
@@ -116,15 +116,15 @@ def best_force(
         cfg: Settings.
         results: See `Results`.
     """
-    base = dealt_in_turn(replace(base, engine="mujoco"))
-    left = base.errors if rival is None else dealt_in_turn(rival).errors
+    base = _dealt_in_turn(replace(base, engine="mujoco"))
+    left = base.errors if rival is None else _dealt_in_turn(rival).errors
     instead = 1 - float(left.sum() / base.errors.sum())
-    screened = list(results(screen, [(base, force) for force in forces(base)]))
+    screened = list(results(screen, [(base, force) for force in _forces(base)]))
     if not screened:
         return None
-    tried = [weighed(base, s, share) for s in screened for share in SHARES]
-    tried += [together(base, screened, share) for share in SHARES]
-    errors = [held_out(base, s) for s in tried]
+    tried = [_weighed(base, s, share) for s in screened for share in SHARES]
+    tried += [_together(base, screened, share) for share in SHARES]
+    errors = [_held_out(base, s) for s in tried]
     gains = [1 - float(e.sum() / base.errors.sum()) for e in errors]
     best = int(np.argmax(gains))
     more = gains[best] - instead
@@ -143,13 +143,13 @@ def best_force(
     return UnknownForceFound(force.words, gains[best], p, min(share, 1.0), None if rival is None else instead)
 
 
-def held_out(base: Node, s: Screened) -> np.ndarray:
+def _held_out(base: Node, s: Screened) -> np.ndarray:
     """Return the held-out error of each block, shape (B,), after a linear step with the sensitivities."""
     pieces = with_residuals(s.pieces, base.pieces)
     return HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
 
 
-def dealt_in_turn(base: Node) -> Node:
+def _dealt_in_turn(base: Node) -> Node:
     """Return a node whose blocks are dealt to the folds in turn, even where its folds are whole demonstrations.
 
     A force of no known form says nothing of places where it was not seen, and few throws go where others went.
@@ -160,7 +160,7 @@ def dealt_in_turn(base: Node) -> Node:
     return replace(base, blocks=blocks, errors=errors)
 
 
-def weighed(base: Node, s: Screened, share: float) -> Screened:
+def _weighed(base: Node, s: Screened, share: float) -> Screened:
     """Return a force whose bumps are each expected to explain as much, together a share of the error."""
     own = base.pieces[0].jacobian.shape[1]
     square = np.sum([(piece.jacobian[:, own:] ** 2).sum(axis=0) for piece in s.pieces], axis=0)
@@ -171,10 +171,10 @@ def weighed(base: Node, s: Screened, share: float) -> Screened:
     return replace(s, pieces=tuple(replace(piece, jacobian=piece.jacobian * scale) for piece in s.pieces))
 
 
-def together(base: Node, screened: Sequence[Screened], share: float) -> Screened:
+def _together(base: Node, screened: Sequence[Screened], share: float) -> Screened:
     """Return all forces at once, each expected to explain as much, together a share of the error."""
     own = base.pieces[0].jacobian.shape[1]
-    parts = [weighed(base, s, share / len(screened)).pieces for s in screened]
+    parts = [_weighed(base, s, share / len(screened)).pieces for s in screened]
     pieces = tuple(
         replace(same[0], jacobian=np.hstack([same[0].jacobian[:, :own], *(p.jacobian[:, own:] for p in same)]))
         for same in zip(*parts, strict=True)
@@ -182,10 +182,10 @@ def together(base: Node, screened: Sequence[Screened], share: float) -> Screened
     return replace(screened[0], pieces=pieces)
 
 
-def forces(base: Node) -> list[Effect]:
+def _forces(base: Node) -> list[Effect]:
     """Return the forces that are tried: on all joints by position, by velocity; on each free body in several ways."""
     m = base.model.compile()
-    qpos, qvel = visited(base, m)
+    qpos, qvel = _visited(base, m)
     found: list[Effect] = []
     if not len(qpos):
         return found
@@ -202,20 +202,20 @@ def forces(base: Node) -> list[Effect]:
         centre = np.linspace(low[kept], high[kept], count, axis=1)
         ids = joints[kept]
         law = UnknownJointForce(of[kept], dof_of(m, ids), centre, typical_torque(m, ids), moving=moving)
-        found.append(UnknownForce(f"a force that depends on {words} of {listed(m, ids)}", law))
+        found.append(UnknownForce(f"a force that depends on {words} of {_listed(m, ids)}", law))
     for body in free_bodies(m):
-        found += body_forces(m, body, qpos, qvel)
+        found += _body_forces(m, body, qpos, qvel)
     return found
 
 
-def body_forces(m: mujoco.MjModel, body: int, qpos: np.ndarray, qvel: np.ndarray) -> list[Effect]:
+def _body_forces(m: mujoco.MjModel, body: int, qpos: np.ndarray, qvel: np.ndarray) -> list[Effect]:
     """Return the forces on a free body that was at positions (T, nq) with velocities (T, nv)."""
     joint = int(m.body_jntadr[body])
     place, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
     force = GENTLE * float(m.body_subtreemass[body]) * max(float(np.linalg.norm(m.opt.gravity)), 1.0)
     where, speed = qpos[:, place : place + 3], np.linalg.norm(qvel[:, dof : dof + 3], axis=1)
     rate = np.linalg.norm(qvel[:, dof + 3 : dof + 6], axis=1)
-    centre, width = spread_out(where)
+    centre, width = _spread_out(where)
     laid: list[tuple[str, Way, np.ndarray, float, float]] = []
     if width > 1e-4:
         laid.append(("a force that depends on the place", "field", centre, width, force))
@@ -235,7 +235,7 @@ def body_forces(m: mujoco.MjModel, body: int, qpos: np.ndarray, qvel: np.ndarray
     ]
 
 
-def spread_out(points: np.ndarray) -> tuple[np.ndarray, float]:
+def _spread_out(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Return up to `PLACES` of some points (T, 3) far from one another (farthest first), and how far [m]."""
     chosen = [points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]]
     distance = np.linalg.norm(points - chosen[0], axis=1)
@@ -250,7 +250,7 @@ def spread_out(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.array(chosen), width
 
 
-def visited(base: Node, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def _visited(base: Node, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the states that the node's model goes through, positions (T, nq) and velocities (T, nv)."""
     engine = MujocoEngine(base.model)
     qpos, qvel = [np.zeros((0, m.nq))], [np.zeros((0, m.nv))]
@@ -269,7 +269,7 @@ def visited(base: Node, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(qpos), np.concatenate(qvel)
 
 
-def listed(m: mujoco.MjModel, joints: np.ndarray) -> str:
+def _listed(m: mujoco.MjModel, joints: np.ndarray) -> str:
     """Return the names of joints in words."""
     names = [name(m, mujoco.mjtObj.mjOBJ_JOINT, int(j)) or f"joint {int(j)}" for j in joints]
     return names[0] if len(names) == 1 else f"each of {len(names)} joints"

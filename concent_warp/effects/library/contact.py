@@ -39,7 +39,7 @@ class SurfaceEffect(Effect):
 
     def suits(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the body collides."""
-        return collides(m, i)
+        return _collides(m, i)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -61,10 +61,10 @@ class FrictionEffect(SurfaceEffect):
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Give the contacts the dimension, with next to no friction where it comes anew."""
-        raised = [geom for n in self.target for geom in colliding(spec.body(n).geoms) if geom.condim < self.condim]
+        raised = [geom for n in self.target for geom in _colliding(spec.body(n).geoms) if geom.condim < self.condim]
         if not raised:
             return
-        for geom in colliding(spec.geoms):
+        for geom in _colliding(spec.geoms):
             for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
                 if geom.condim < needed <= self.condim:
                     geom.friction[column] = NEXT_TO_NOTHING
@@ -242,7 +242,7 @@ class PadFriction(Effect):
 
     def suits(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the finger collides."""
-        return collides(m, i)
+        return _collides(m, i)
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -255,9 +255,9 @@ class PadFriction(Effect):
 
         With priority the pads' other parameters count alone, too, so they take on what the contact had.
         """
-        held = colliding(geom for body in loose(spec) for geom in body.geoms)
+        held = _colliding(geom for body in _loose(spec) for geom in body.geoms)
         for n in self.target:
-            for pad in colliding(tree_geoms(spec.body(n))):
+            for pad in _colliding(_tree_geoms(spec.body(n))):
                 pad.priority += 1
                 if held:
                     pad.friction = np.max([pad.friction, *(geom.friction for geom in held)], axis=0)
@@ -287,22 +287,22 @@ class PadFriction(Effect):
         m.geom_friction[self.geoms(m), SLIDING] = max(float(values[0]), NEXT_TO_NOTHING)
 
 
-def collides(m: mujoco.MjModel, body: int) -> bool:
+def _collides(m: mujoco.MjModel, body: int) -> bool:
     """Return whether any geom of a body takes part in collisions."""
     geoms = geoms_of(m, body)
     return bool(((m.geom_contype[geoms] != 0) | (m.geom_conaffinity[geoms] != 0)).any())
 
 
-def colliding(geoms: Iterable[mujoco.MjsGeom]) -> list[mujoco.MjsGeom]:
+def _colliding(geoms: Iterable[mujoco.MjsGeom]) -> list[mujoco.MjsGeom]:
     """Return those of some geoms that take part in collisions."""
     return [geom for geom in geoms if geom.contype or geom.conaffinity]
 
 
-def loose(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
+def _loose(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     """Return the bodies of an MJCF that have a free joint."""
     return [body for body in spec.bodies if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in body.joints)]
 
 
-def tree_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
+def _tree_geoms(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
     """Return the geoms of a body and of those fixed to it."""
-    return [*body.geoms, *(geom for child in body.bodies if not child.joints for geom in tree_geoms(child))]
+    return [*body.geoms, *(geom for child in body.bodies if not child.joints for geom in _tree_geoms(child))]

@@ -103,7 +103,7 @@ class Pull(Law):
         self.gap = gap
         colliding = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
         geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies) & colliding)
-        points = [outermost(m, int(g)) for g in geoms]
+        points = [_outermost(m, int(g)) for g in geoms]
         self.geom = np.repeat(geoms, [len(p) for p in points]).astype(np.int32)
         self.point = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
         """In the frame of its geom [m], shape (P, 3)."""
@@ -202,7 +202,7 @@ class Pull(Law):
         force_models.pull(m, d, *self._device, values, self.gap)
 
 
-def outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:
+def _outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return the points of a geom that may touch a plane first, in its frame [m], shape (P, 3)."""
     kind, (x, y, z) = int(m.geom_type[geom]), m.geom_size[geom]
     sides = np.array(list(product((-1.0, 1.0), repeat=3)))

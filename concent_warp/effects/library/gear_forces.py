@@ -104,8 +104,8 @@ class Gear:
         gear, kp = float(m.actuator_gear[actuator, 0]), float(m.actuator_gainprm[actuator, 0])
         constant, position, damping = (float(b) for b in m.actuator_biasprm[actuator, :3])
         kv, dt = max(-damping, 1e-9 * kp), float(m.opt.timestep)
-        lowest, highest = limits_of(m.actuator_ctrllimited[actuator], m.actuator_ctrlrange[actuator])
-        weakest, strongest = limits_of(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator])
+        lowest, highest = _limits_of(m.actuator_ctrllimited[actuator], m.actuator_ctrlrange[actuator])
+        weakest, strongest = _limits_of(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator])
         return cls(
             actuator,
             int(m.jnt_qposadr[joint]),
@@ -143,6 +143,6 @@ class Gear:
         return self.gear * change, after
 
 
-def limits_of(limited: bool, bounds: np.ndarray) -> tuple[float, float]:
+def _limits_of(limited: bool, bounds: np.ndarray) -> tuple[float, float]:
     """Return the bounds, shape (2,), infinite where there are none."""
     return (float(bounds[0]), float(bounds[1])) if limited else (-math.inf, math.inf)

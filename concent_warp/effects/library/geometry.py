@@ -46,11 +46,11 @@ class ContactGeometryOffset(BodyEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body with shapes that can be moved."""
-        return tuple((n,) for b in free_bodies(m) if len(shapes(m, b)) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return tuple((n,) for b in free_bodies(m) if len(_shapes(m, b)) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
     def suits(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether a body has shapes that can be moved."""
-        return i > 0 and len(shapes(m, i)) > 0
+        return i > 0 and len(_shapes(m, i)) > 0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """An outward offset of each face."""
@@ -64,8 +64,8 @@ class ContactGeometryOffset(BodyEffect):
             keep_inertia(body, compiled)
             offsets = Offsets.of(compiled, b, values)
             geoms, first = list(body.geoms), int(compiled.body_geomadr[b])
-            for i in shapes(compiled, b):
-                write(body, geoms[i - first], *offsets.moved(compiled, int(i)))
+            for i in _shapes(compiled, b):
+                _write(body, geoms[i - first], *offsets.moved(compiled, int(i)))
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ class Offsets:
     @staticmethod
     def of(m: mujoco.MjModel, body: int, values: np.ndarray) -> Offsets:
         """Return offsets by `values` (6,), in the order of `FACES`, of the box about a body's shapes."""
-        ids = shapes(m, body)
-        reach = np.array([extent(m, i) for i in ids])
+        ids = _shapes(m, body)
+        reach = np.array([_extent(m, i) for i in ids])
         low, high = (m.geom_pos[ids] - reach).min(axis=0), (m.geom_pos[ids] + reach).max(axis=0)
         return Offsets(low, high, np.reshape(values, (2, 3)))
 
@@ -96,19 +96,19 @@ class Offsets:
 
     def moved(self, m: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return position, orientation (wxyz) and size of a shape after the move, shapes (3,), (4,), (3,)."""
-        position, size, reach = m.geom_pos[geom], m.geom_size[geom].copy(), extent(m, geom)
+        position, size, reach = m.geom_pos[geom], m.geom_size[geom].copy(), _extent(m, geom)
         quaternion = m.geom_quat[geom]
-        axes = np.abs(rotation(m, geom))
+        axes = np.abs(_rotation(m, geom))
         small = (reach < SMALL * (self.high - self.low) / 2).all()
         aligned = m.geom_type[geom] == SPHERE or np.abs(axes - axes.round()).max() < ALIGNED
         if small or not aligned:
             return position + self.at(position, SKIN * reach), quaternion, size
         ends = self.at(position + reach), self.at(position - reach)
-        grown = resized(int(m.geom_type[geom]), size, axes.round().T @ (ends[0] - ends[1]) / 2)
+        grown = _resized(int(m.geom_type[geom]), size, axes.round().T @ (ends[0] - ends[1]) / 2)
         return position + (ends[0] + ends[1]) / 2, quaternion, np.maximum(grown, LEAST * size)
 
 
-def resized(kind: int, size: np.ndarray, change: np.ndarray) -> np.ndarray:
+def _resized(kind: int, size: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the size (3,) of a shape whose reach along its own axes changes by `change` (3,) [m]."""
     if kind == SPHERE:
         return size + np.array([change.mean(), 0.0, 0.0])
@@ -119,27 +119,27 @@ def resized(kind: int, size: np.ndarray, change: np.ndarray) -> np.ndarray:
     return size + change
 
 
-def shapes(m: mujoco.MjModel, body: int) -> np.ndarray:
+def _shapes(m: mujoco.MjModel, body: int) -> np.ndarray:
     """Return the colliding geoms of a body that can be moved, shape (n,) int."""
     ids = np.flatnonzero(m.geom_bodyid == body)
     collides = (m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)
     return ids[collides & np.isin(m.geom_type[ids], SHAPES)]
 
 
-def rotation(m: mujoco.MjModel, geom: int) -> np.ndarray:
+def _rotation(m: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return the rotation of a geom in its body, shape (3, 3)."""
     flat = np.empty(9)
     mujoco.mju_quat2Mat(flat, m.geom_quat[geom])
     return flat.reshape(3, 3)
 
 
-def extent(m: mujoco.MjModel, geom: int) -> np.ndarray:
+def _extent(m: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return how far a geom reaches from its middle along the axes of its body [m], shape (3,)."""
     half = m.geom_aabb[geom, 3:]
-    return half.copy() if m.geom_type[geom] == SPHERE else np.abs(rotation(m, geom)) @ half
+    return half.copy() if m.geom_type[geom] == SPHERE else np.abs(_rotation(m, geom)) @ half
 
 
-def write(
+def _write(
     body: mujoco.MjsBody, geom: mujoco.MjsGeom, position: np.ndarray, quaternion: np.ndarray, size: np.ndarray
 ) -> None:
     """Give a geom position and orientation in the frame of its body, however the MJCF told them, and a size."""

@@ -126,7 +126,7 @@ class Size(BodyEffect):
             for geom in body.geoms:
                 geom.pos = scale * np.array(geom.pos)
                 if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
-                    scale_mesh(spec, geom, scale)
+                    _scale_mesh(spec, geom, scale)
                 else:
                     geom.size = scale * np.array(geom.size)
                     geom.fromto = scale * np.array(geom.fromto)
@@ -140,7 +140,7 @@ def keep_inertia(body: mujoco.MjsBody, compiled: mujoco.MjModel) -> None:
     body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
 
 
-def scale_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, scale: float) -> None:
+def _scale_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, scale: float) -> None:
     """Give a geom a scaled copy of its mesh."""
     mesh = spec.mesh(geom.meshname)
     copy = spec.add_mesh(name=f"{mesh.name}_{geom.name or geom.id}_scaled")

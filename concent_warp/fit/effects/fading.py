@@ -62,7 +62,7 @@ def residuals_near(
     begun = {w: prediction.observed(w, first[w].reader, known[w].trial.values) for w in windows}
     for i, course in zip(short, courses[len(windows) :], strict=True):
         w, trial = trials[i].window, trials[i]
-        if has_faded(prediction, trial, known[w].trial, course, first[w]):
+        if _has_faded(prediction, trial, known[w].trial, course, first[w]):
             window = prediction.windows[w]
             change = prediction.observed(w, course.reader, trial.values) - begun[w]
             found[i] = known[w].residual + np.where(window.clock - window.start <= AFTER, change, 0.0)
@@ -72,7 +72,7 @@ def residuals_near(
     return [r for r in found if r is not None], [i not in set(rest) for i in range(len(trials))]
 
 
-def has_faded(prediction: Prediction, trial: Trial, other: Trial, course: Course, first: Course) -> bool:
+def _has_faded(prediction: Prediction, trial: Trial, other: Trial, course: Course, first: Course) -> bool:
     """Return whether a simulation has found to the way of another one."""
     m, spread = prediction.compiled, prediction.windows[trial.window].spread
     none = np.zeros_like(spread)

@@ -129,7 +129,7 @@ def fit_effects(
     cfg = cfg or FitEffectsCfg()
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
-    said = progress or silent
+    said = progress or _silent
     said(0.0, "cutting windows")
     windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed)
     solver = Solver(Prediction(model, (), windows, engine=engine), cfg.least_squares)
@@ -137,18 +137,18 @@ def fit_effects(
     said(0.1, "initial states")
     start = solver.p.start
     offsets, starts = solver.refine_starts(start, [np.zeros(len(w.spread)) for w in windows])
-    given = rest(solver, start, offsets, starts)
+    given = _rest(solver, start, offsets, starts)
     said(0.3, "trial values")
-    chosen = best_start(solver, start, offsets, starts)
+    chosen = _best_start(solver, start, offsets, starts)
     fit = solver.fit(chosen, offsets, starts, lambda share: said(0.3 + 0.5 * share, "fitting"))
     said(0.8, "fitting again")
     fit = solver.polish(fit)
     pieces = projected(fit)
     found = [piece.residual for piece in pieces]
     said(1.0, "done")
-    parameters, correlation = fitted_parameters(solver, fit, pieces, windows)
-    remarks = doubts(solver, fit, parameters, correlation)
-    before, after = noise_ratio(given), noise_ratio(found)
+    parameters, correlation = _fitted_parameters(solver, fit, pieces, windows)
+    remarks = _doubts(solver, fit, parameters, correlation)
+    before, after = _noise_ratio(given), _noise_ratio(found)
     if after > max(before, AT_NOISE):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
@@ -156,7 +156,7 @@ def fit_effects(
         tuple(tuple(parameters[part]) for part in solver.p.split),
         before,
         after,
-        by_channel(windows, given, found),
+        _by_channel(windows, given, found),
         fit.converged,
         tuple(remarks),
     )
@@ -165,7 +165,7 @@ def fit_effects(
     return fitted
 
 
-def silent(share: float, text: str) -> None:
+def _silent(share: float, text: str) -> None:
     """Say nothing of progress."""
     del share, text
 
@@ -189,7 +189,7 @@ def check_finite(prediction: Prediction, source: str) -> None:
         )
 
 
-def rest(
+def _rest(
     solver: Solver, values: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the residuals at some values with the initial states eliminated, one (n,) a window."""
@@ -202,7 +202,7 @@ TELLING = 1.0
 """By how much a trial value must lower the cost, half a sum of squares in units of noise, to be set out from."""
 
 
-def best_start(
+def _best_start(
     solver: Solver, given: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
 ) -> np.ndarray:
     """Return the values from which a fit is to start, shape (P,): those given, or some that parameters name."""
@@ -216,14 +216,14 @@ def best_start(
                 trials.append(moved)
     if len(trials) == 1:
         return trials[0]
-    residuals = [rest(solver, values, offsets, starts) for values in trials]
+    residuals = [_rest(solver, values, offsets, starts) for values in trials]
     limit = huber_limit(residuals[0])
     costs = [sum(start_cost(r, np.zeros(1), limit) for r in of_trial) for of_trial in residuals]
     best = int(np.argmin(costs))
     return trials[best] if costs[best] < costs[0] - TELLING else trials[0]
 
 
-def fitted_parameters(
+def _fitted_parameters(
     solver: Solver, fit: Fit, pieces: Sequence[Linear], windows: Sequence[Window]
 ) -> tuple[list[FittedParameter], np.ndarray]:
     """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
@@ -251,7 +251,7 @@ def fitted_parameters(
     return found, covered / np.outer(std, std)
 
 
-def doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], correlation: np.ndarray) -> list[str]:
+def _doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], correlation: np.ndarray) -> list[str]:
     """Return what is doubtful about a fit, a sentence each."""
     found = []
     if not fit.converged:
@@ -277,12 +277,12 @@ def doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], corr
     return found
 
 
-def noise_ratio(residuals: Sequence[np.ndarray]) -> float:
+def _noise_ratio(residuals: Sequence[np.ndarray]) -> float:
     """Return the root mean square of residuals in units of noise, rows beyond `HUBER` times it weighed down."""
     return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), HUBER))))
 
 
-def by_channel(
+def _by_channel(
     windows: Sequence[Window], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
 ) -> tuple[ChannelError, ...]:
     """Return the residual over noise of each channel, largest first."""
@@ -290,6 +290,6 @@ def by_channel(
     found = []
     for name in names:
         rows = [(k, r.rows) for k, w in enumerate(windows) for r in w.readings if r.channel == name]
-        first, last = (noise_ratio([residuals[k][s] for k, s in rows]) for residuals in (before, after))
+        first, last = (_noise_ratio([residuals[k][s] for k, s in rows]) for residuals in (before, after))
         found.append(ChannelError(name, first, last))
     return tuple(sorted(found, key=lambda c: -c.before))

@@ -177,7 +177,7 @@ class StartSearch:
             for w, look in zip(unsettled, looks, strict=True):
                 there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
                 if np.mean(residuals[w] ** 2) > odd**2:
-                    there += around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
+                    there += _around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
                 tried.append(there)
                 rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
                 hoped += [bool(self.fading[w].all())] * len(there)
@@ -219,7 +219,7 @@ def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limi
     return -np.linalg.solve(normal, weighted @ residual + near * offset)
 
 
-def around(
+def _around(
     residual: np.ndarray,
     start: np.ndarray,
     offset: np.ndarray,

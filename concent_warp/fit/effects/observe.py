@@ -116,7 +116,7 @@ def observe(
             end = last
             if measured is not None:
                 reach = length if length is not None else keeps_close(source, d, start, last, engine, seed)
-                end = last if last - start - reach < SHORTEST else calmest(measured, start, reach)
+                end = last if last - start - reach < SHORTEST else _calmest(measured, start, reach)
             if (window := source.window(number, start, end)) is not None:
                 windows.append(window)
             start = end
@@ -163,7 +163,7 @@ def keeps_close(source: Source, d: Demonstration, start: float, last: float, eng
     return float(np.clip(reach, SHORTEST, span))
 
 
-def calmest(measured: Measured, start: float, reach: float) -> float:
+def _calmest(measured: Measured, start: float, reach: float) -> float:
     """Return where a reach had better end [s]: late, and not in an impact, where no velocity is to be had."""
     times = start + np.linspace(reach, 0.35 * reach, 27)
     rough = measured.roughness(times)
@@ -171,6 +171,6 @@ def calmest(measured: Measured, start: float, reach: float) -> float:
     return float(times[calm[0] if len(calm) else rough.argmin()])
 
 
-def demonstrations_of(windows: Sequence[Window]) -> list[int]:
+def _demonstrations_of(windows: Sequence[Window]) -> list[int]:
     """Return the demonstrations that windows are of, each once."""
     return sorted({w.number for w in windows})

@@ -50,13 +50,13 @@ class Faces:
             scene: Scene with the bodies' nominal surfaces.
             length: Length over which a face is smooth [m].
         """
-        found = [place for body in geometry.bodies for place in places(geometry, scene, body)]
+        found = [place for body in geometry.bodies for place in _places(geometry, scene, body)]
         sphere, normal, foot, first = (np.array(column) for column in zip(*found, strict=True))
         self.count = len(geometry)
         self.sphere, self.normal, self.first = sphere, normal, first
         self.height = np.einsum("pd,pd->p", geometry.position[sphere] - foot, normal) + geometry.radius[sphere]
         """How far the sphere stands out of the nominal face at the start [m], shape (places,)."""
-        self.basis, self.weight = neighbourhoods(foot, normal, geometry.body[sphere], length)
+        self.basis, self.weight = _neighbourhoods(foot, normal, geometry.body[sphere], length)
 
     def roughness(self, displacement: np.ndarray) -> np.ndarray:
         """Return how far each place stands out of the smooth course of its face [m], shape (places,).
@@ -107,7 +107,7 @@ def flattened(geometry: ContactGeometry, faces: Faces) -> ContactGeometry:
     return geometry.with_position(geometry.position + displacement)
 
 
-def places(geometry: ContactGeometry, scene: Scene, body: str) -> list[tuple[int, np.ndarray, np.ndarray, bool]]:
+def _places(geometry: ContactGeometry, scene: Scene, body: str) -> list[tuple[int, np.ndarray, np.ndarray, bool]]:
     """Return sphere, outward normal (3,), foot on the nominal face [m] (3,) and whether it is the nearest face."""
     points, normals = Surface.of_body(scene, body).sample(PROBES, np.random.default_rng(0))
     tree = KDTree(points)
@@ -128,7 +128,7 @@ def places(geometry: ContactGeometry, scene: Scene, body: str) -> list[tuple[int
     return result
 
 
-def neighbourhoods(
+def _neighbourhoods(
     foot: np.ndarray, normal: np.ndarray, body: np.ndarray, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a plane over each place's surroundings is made of, and which neighbours count how much.

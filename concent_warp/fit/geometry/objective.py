@@ -161,7 +161,7 @@ class Objective:
         from concent_warp.kernels.chamfer.distance import chamfer
 
         # Points are linear in the pose, so that is interpolated and not the larger clouds.
-        pose = transforms(position, quaternion)
+        pose = _transforms(position, quaternion)
         pose = torch.lerp(pose[:, aim.lower], pose[:, aim.lower + 1], aim.weight[None, :, None, None])
         predicted = (aim.anchor @ pose).float()
         return chamfer(predicted, aim.observed, aim.seen, aim.seen, squared=self.squared)
@@ -208,7 +208,7 @@ class Objective:
         return np.searchsorted(recorded, floor), np.clip(position - floor, 0.0, 1.0)
 
 
-def transforms(position: torch.Tensor, quaternion: torch.Tensor) -> torch.Tensor:
+def _transforms(position: torch.Tensor, quaternion: torch.Tensor) -> torch.Tensor:
     """Return what brings points (x, y, z, 1) of a body into the world, from the right, shape (..., 4, 3).
 
     Args:

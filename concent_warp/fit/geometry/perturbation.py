@@ -55,9 +55,9 @@ class Perturbation:
             if not len(rows):
                 continue
             points = geometry.position[rows]
-            slow = root(points, swelling_length)
+            slow = _root(points, swelling_length)
             if kind == "gaussian_process":
-                factor = root(points, length)
+                factor = _root(points, length)
             elif kind == "centroid":
                 factor = rbf(points, points.mean(axis=0, keepdims=True), length)
             else:
@@ -75,7 +75,7 @@ class Perturbation:
         return result
 
 
-def root(points: np.ndarray, length: float) -> np.ndarray:
+def _root(points: np.ndarray, length: float) -> np.ndarray:
     """Return the Cholesky factor of the RBF kernel over points (n, 3), shape (n, n)."""
     return np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(points)))
 

@@ -60,24 +60,24 @@ def gradient_segments(
             continue
         used = segment
         if segment.held_out is None:
-            used = replace(segment, targets=tuple(without(t, t.held_out(held_out, block)) for t in segment.targets))
-        limit = cfg.tumbling if max(map(tilt, segment.targets)) > cfg.tilt else cfg.calm
+            used = replace(segment, targets=tuple(_without(t, t.held_out(held_out, block)) for t in segment.targets))
+        limit = cfg.tumbling if max(map(_tilt, segment.targets)) > cfg.tilt else cfg.calm
         if len(segment.ctrl) * model.scene.model.opt.timestep <= 1.2 * limit:
             result.append(used)
             continue
-        found = windows_of(model, demonstrations[i], limit, used) if demonstrations else []
+        found = _windows_of(model, demonstrations[i], limit, used) if demonstrations else []
         result += found or [shortened(model.scene.model, used, limit)]
     if len(result) > cfg.most:
         result = [result[k] for k in np.linspace(0, len(result) - 1, cfg.most).round().astype(int)]
     return result
 
 
-def without(target: BodyTarget, frames: np.ndarray) -> BodyTarget:
+def _without(target: BodyTarget, frames: np.ndarray) -> BodyTarget:
     """Return a target in which nothing was seen in some frames, shape (T,) bool."""
     return replace(target, points=np.where(frames[:, None, None], np.nan, target.points))
 
 
-def tilt(target: BodyTarget) -> float:
+def _tilt(target: BodyTarget) -> float:
     """Return the largest change of the angle between a body and the vertical, as observed [rad]."""
     frames = np.flatnonzero(np.isfinite(target.points).all(axis=2).sum(axis=1) >= 3)
     if not len(frames):
@@ -87,7 +87,7 @@ def tilt(target: BodyTarget) -> float:
     return float(np.arccos(np.clip(up @ up[0], -1.0, 1.0)).max())
 
 
-def windows_of(model: Model, demonstration: Demonstration, length: float, whole: Segment) -> list[Segment]:
+def _windows_of(model: Model, demonstration: Demonstration, length: float, whole: Segment) -> list[Segment]:
     """Return windows of a demonstration in which something is touched; none where states were not measured.
 
     What `whole`, the demonstration as one segment, has not seen is not seen in the windows.
@@ -105,7 +105,7 @@ def windows_of(model: Model, demonstration: Demonstration, length: float, whole:
         for target in segment.targets:
             times = unseen[target.body]
             off = np.abs(target.time[:, None] + start - times[None]).min(axis=1, initial=np.inf)
-            targets.append(without(target, off < 2e-3))
+            targets.append(_without(target, off < 2e-3))
         targets = [t for t in targets if np.isfinite(t.points).any()]
         if targets:
             result.append(replace(segment, targets=tuple(targets)))

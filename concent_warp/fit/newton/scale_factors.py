@@ -83,7 +83,7 @@ class FactorDescent:
             EngineError: The scene cannot be simulated stably.
         """
         self.cfg = cfg = cfg or FactorCfg()
-        segments = stretches(model, recording, cfg.horizon)
+        segments = _stretches(model, recording, cfg.horizon)
         self.scene = newton_scene(model, segments, cfg.newton, lightest=MASS[0])
         self.loss = NewtonLoss(self.scene, 2 + len(self.scene.moving), device=cfg.device)
         geometry = model.geometry
@@ -172,7 +172,7 @@ class FactorDescent:
             )
 
 
-def stretches(model: Model, recording: Recording, cfg: HorizonCfg) -> list[Segment]:
+def _stretches(model: Model, recording: Recording, cfg: HorizonCfg) -> list[Segment]:
     """Return what is to be simulated of the demonstrations that show an object with contact geometry.
 
     Raises:

@@ -108,30 +108,30 @@ def newton_scene(
         raise ModelError("the model has no contact geometry to fit", fix="build one with `concent geometry`")
     engine = MujocoEngine(model)
     m = engine.compiled
-    moving = moving_bodies(model, m)
+    moving = _moving_bodies(model, m)
     rollout = engine.run(
         Variants(len(segments), qpos=np.stack([s.qpos for s in segments]), qvel=np.stack([s.qvel for s in segments])),
-        padded_commands(segments),
+        _padded_commands(segments),
         contacts="all",
     )
     if np.any(rollout.diverged):
         raise EngineError("the starting geometry diverges in MuJoCo, so that nothing can be replayed", fix="change it")
-    ids, pairs = near_pairs(model, moving, looked_at(m, segments, rollout), cfg.reach)
-    inertias = tuple(inertia_of(m, b) for b in ids[: len(moving)])
+    ids, pairs = _near_pairs(model, moving, _looked_at(m, segments, rollout), cfg.reach)
+    inertias = tuple(_inertia_of(m, b) for b in ids[: len(moving)])
     friction = np.concatenate([pairs.friction, model.geometry.friction])
-    strengths = [strength(m, model, b, body, rollout) / lightest for b, body in zip(ids, inertias, strict=False)]
+    strengths = [_strength(m, model, b, body, rollout) / lightest for b, body in zip(ids, inertias, strict=False)]
     gravity = m.opt.gravity.copy()
     physics = choose_physics(
         cfg, m.opt.timestep, inertias, strengths, float(friction.max()), float(np.linalg.norm(gravity))
     )
     pose = np.concatenate([rollout.body_position[:, :, ids], rollout.body_quaternion[:, :, ids][..., [1, 2, 3, 0]]], -1)
-    replayed, velocity = resampled(pose[:, :, len(moving) :], m.opt.timestep, physics.substeps)
+    replayed, velocity = _resampled(pose[:, :, len(moving) :], m.opt.timestep, physics.substeps)
     speed = np.zeros((len(segments), len(ids), 6))
     speed[:, len(moving) :] = velocity[0]
     for n, segment in enumerate(segments):
         for b, body in enumerate(inertias):
-            speed[n, b] = velocity_of(m, segment.qvel, ids[b], pose[n, 0, b], body)
-            if not touches(m, rollout, n, ids[b]):
+            speed[n, b] = _velocity_of(m, segment.qvel, ids[b], pose[n, 0, b], body)
+            if not _touches(m, rollout, n, ids[b]):
                 # Steps of dt fall by g dt t / 2 too far; so do these, with a shorter dt.
                 speed[n, b, :3] += gravity * (m.opt.timestep - physics.timestep) / 2
     names = tuple(m.body(b).name for b in ids)
@@ -140,7 +140,7 @@ def newton_scene(
     )
 
 
-def moving_bodies(model: Model, m: mujoco.MjModel) -> list[int]:
+def _moving_bodies(model: Model, m: mujoco.MjModel) -> list[int]:
     """Return the ids of the bodies to simulate: with contact geometry and a free joint."""
     assert model.geometry is not None
     movable = [m.body(name).id for name in model.geometry.bodies if m.body(name).weldid[0] != 0]
@@ -156,13 +156,13 @@ def moving_bodies(model: Model, m: mujoco.MjModel) -> list[int]:
     return movable
 
 
-def padded_commands(segments: Sequence[Segment]) -> np.ndarray:
+def _padded_commands(segments: Sequence[Segment]) -> np.ndarray:
     """Return the commands of all segments, padded by holding the last, shape (n, K, nu)."""
     steps = max(len(s.ctrl) for s in segments)
     return np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in segments])
 
 
-def looked_at(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout) -> np.ndarray:
+def _looked_at(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout) -> np.ndarray:
     """Return simulated and observed states in which pairs are looked for, shape (T, nq)."""
     every = slice(None, None, max(rollout.qpos.shape[1] // LOOKED_AT, 1))
     simulated = rollout.qpos[:, every]
@@ -170,7 +170,7 @@ def looked_at(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout) 
     return np.concatenate([simulated, np.stack(observed)]).reshape(-1, m.nq)
 
 
-def near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float) -> tuple[list[int], Pairs]:
+def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float) -> tuple[list[int], Pairs]:
     """Return the ids of all bodies that take part, simulated ones first, and the pairs that may collide.
 
     Args:
@@ -231,14 +231,14 @@ def near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float
     )
 
 
-def inertia_of(m: mujoco.MjModel, body: int) -> Inertia:
+def _inertia_of(m: mujoco.MjModel, body: int) -> Inertia:
     """Return the inertia of a body."""
     turn = Rotation.from_quat(m.body_iquat[body], scalar_first=True).as_matrix()
     inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
     return Inertia(m.body(body).name, float(m.body_mass[body]), inertia, m.body_ipos[body].copy())
 
 
-def strength(m: mujoco.MjModel, model: Model, body: int, inertia: Inertia, rollout: Rollout) -> float:
+def _strength(m: mujoco.MjModel, model: Model, body: int, inertia: Inertia, rollout: Rollout) -> float:
     """Return how strongly the contacts of a body act on it, at the worst step of a rollout with all contacts [1/kg]."""
     assert model.geometry is not None
     assert rollout.contacts is not None
@@ -256,7 +256,7 @@ def strength(m: mujoco.MjModel, model: Model, body: int, inertia: Inertia, rollo
     return worst
 
 
-def touches(m: mujoco.MjModel, rollout: Rollout, variant: int, body: int) -> bool:
+def _touches(m: mujoco.MjModel, rollout: Rollout, variant: int, body: int) -> bool:
     """Return whether a body is in contact at the start of a rollout with all contacts."""
     log = rollout.contacts
     assert log is not None
@@ -264,7 +264,7 @@ def touches(m: mujoco.MjModel, rollout: Rollout, variant: int, body: int) -> boo
     return bool((m.geom_bodyid[log.geom[first]] == body).any())
 
 
-def velocity_of(m: mujoco.MjModel, qvel: np.ndarray, body: int, pose: np.ndarray, inertia: Inertia) -> np.ndarray:
+def _velocity_of(m: mujoco.MjModel, qvel: np.ndarray, body: int, pose: np.ndarray, inertia: Inertia) -> np.ndarray:
     """Return the velocity of a free body's centre of mass and its turning, world frame, shape (6,)."""
     address = m.jnt_dofadr[m.body_jntadr[body]]
     turn = Rotation.from_quat(pose[3:])
@@ -272,7 +272,7 @@ def velocity_of(m: mujoco.MjModel, qvel: np.ndarray, body: int, pose: np.ndarray
     return np.concatenate([qvel[address : address + 3] + np.cross(turning, turn.apply(inertia.com)), turning])
 
 
-def resampled(pose: np.ndarray, timestep: float, substeps: int) -> tuple[np.ndarray, np.ndarray]:
+def _resampled(pose: np.ndarray, timestep: float, substeps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return poses and velocities at Newton's steps, of poses at MuJoCo's.
 
     Args:

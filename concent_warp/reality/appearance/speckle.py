@@ -31,16 +31,16 @@ def dress(spec: mujoco.MjSpec, bodies: tuple[str, ...]) -> mujoco.MjSpec:
     texture = spec.add_texture(
         name=TEXTURE, type=mujoco.mjtTexture.mjTEXTURE_2D, width=TEXELS, height=TEXELS, nchannel=3
     )
-    texture.data = speckle(np.random.default_rng(0)).tobytes()
+    texture.data = _speckle(np.random.default_rng(0)).tobytes()
     for body in bodies:
         for i, geom in enumerate(spec.body(body).geoms):
-            corners = hull_corners(spec, geom)
+            corners = _hull_corners(spec, geom)
             if corners is not None:
-                wrap(spec, geom, corners, f"{body}_{i}_dressed")
+                _wrap(spec, geom, corners, f"{body}_{i}_dressed")
     return spec
 
 
-def hull_corners(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> np.ndarray | None:
+def _hull_corners(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> np.ndarray | None:
     """Return the corners of a box or of a mesh given by its vertices [m], geom frame, shape (n, 3); None for others."""
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -52,10 +52,10 @@ def hull_corners(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> np.ndarray | None
     return None
 
 
-def wrap(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, corners: np.ndarray, name: str) -> None:
+def _wrap(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, corners: np.ndarray, name: str) -> None:
     """Turn a geom into the hull of its corners (n, 3) [m], with the pattern on it."""
     hull = ConvexHull(corners)
-    outward = np.einsum("fk,fk->f", triangle_normals(corners[hull.simplices]), hull.equations[:, :3]) > 0
+    outward = np.einsum("fk,fk->f", _triangle_normals(corners[hull.simplices]), hull.equations[:, :3]) > 0
     faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.array(geom.quat))
@@ -63,7 +63,7 @@ def wrap(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, corners: np.ndarray, name: s
     mesh = spec.add_mesh(name=name)
     mesh.uservert = corners.ravel()
     mesh.userface = faces.ravel()
-    mesh.usertexcoord = (unfold(in_body[faces]) / PERIOD).ravel()
+    mesh.usertexcoord = (_unfold(in_body[faces]) / PERIOD).ravel()
     mesh.userfacetexcoord = np.arange(faces.size)
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
     material = spec.add_material(name=name, rgba=geom.rgba, specular=0.1)
@@ -71,13 +71,13 @@ def wrap(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, corners: np.ndarray, name: s
     geom.type, geom.meshname, geom.material = mujoco.mjtGeom.mjGEOM_MESH, name, name
 
 
-def unfold(triangles: np.ndarray) -> np.ndarray:
+def _unfold(triangles: np.ndarray) -> np.ndarray:
     """Return places on the pattern [m], shape (f, 3, 2), of triangles in the body frame [m], shape (f, 3, 3).
 
     A face takes the two coordinates across the axis that it looks along most, moved by a step of its own for each of
     the six directions.
     """
-    normal = triangle_normals(triangles)
+    normal = _triangle_normals(triangles)
     axis = np.argmax(np.abs(normal), axis=1)
     row = np.arange(len(triangles))
     side = 2 * axis + (normal[row, axis] > 0)
@@ -86,12 +86,12 @@ def unfold(triangles: np.ndarray) -> np.ndarray:
     return flat + (side[:, None, None] * np.array([0.0137, 0.0229]))
 
 
-def triangle_normals(triangles: np.ndarray) -> np.ndarray:
+def _triangle_normals(triangles: np.ndarray) -> np.ndarray:
     """Return the normals, not of unit length, shape (f, 3), of triangles, shape (f, 3, 3)."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
-def speckle(rng: np.random.Generator) -> np.ndarray:
+def _speckle(rng: np.random.Generator) -> np.ndarray:
     """Return a grey pattern without seams, shape (TEXELS, TEXELS, 3), uint8."""
     layers = []
     for size in GRAIN:

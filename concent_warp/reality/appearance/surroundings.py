@@ -46,9 +46,9 @@ def furnish(world: mujoco.MjSpec, bodies: tuple[str, ...], *, there: bool = True
         geom.rgba[:3] = np.array(geom.rgba[:3]) * PAINT
     table = spec.geom(TABLE)
     if table is not None:
-        cover(spec, table, "wood", wood(rng), (3, 3))
+        _cover(spec, table, "wood", _wood(rng), (3, 3))
     light(spec)
-    add_room(spec, rng)
+    _add_room(spec, rng)
     return spec
 
 
@@ -61,22 +61,22 @@ def light(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.16, 0.17, 0.2], [0.12, 0.12, 0.12]
 
 
-def add_room(spec: mujoco.MjSpec, rng: np.random.Generator) -> None:
+def _add_room(spec: mujoco.MjSpec, rng: np.random.Generator) -> None:
     """Add a floor and two walls that nothing touches."""
     height, thin = 1.2, 0.01
     plates = {
-        "floor": ([0, 0, FLOOR], [2 * ROOM, 2 * ROOM, thin], tiles(rng), (6, 6)),
-        "back": ([-0.55 * ROOM, 0, FLOOR + height], [thin, 2 * ROOM, height], plaster(rng), (1, 1)),
-        "side": ([0, 0.6 * ROOM, FLOOR + height], [2 * ROOM, thin, height], plaster(rng), (2, 1)),
+        "floor": ([0, 0, FLOOR], [2 * ROOM, 2 * ROOM, thin], _tiles(rng), (6, 6)),
+        "back": ([-0.55 * ROOM, 0, FLOOR + height], [thin, 2 * ROOM, height], _plaster(rng), (1, 1)),
+        "side": ([0, 0.6 * ROOM, FLOOR + height], [2 * ROOM, thin, height], _plaster(rng), (2, 1)),
     }
     for name, (position, size, texture, repeat) in plates.items():
         geom = spec.worldbody.add_geom(
             name=f"room_{name}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size, contype=0, conaffinity=0
         )
-        cover(spec, geom, f"room_{name}", texture, repeat)
+        _cover(spec, geom, f"room_{name}", texture, repeat)
 
 
-def cover(
+def _cover(
     spec: mujoco.MjSpec, geom: mujoco.MjsGeom, name: str, texture: np.ndarray, repeat: tuple[float, float]
 ) -> None:
     """Lay a texture, shape (n, n, 3) uint8, on a geom."""
@@ -89,31 +89,31 @@ def cover(
     geom.rgba, geom.material = [1, 1, 1, 1], name
 
 
-def wood(rng: np.random.Generator) -> np.ndarray:
+def _wood(rng: np.random.Generator) -> np.ndarray:
     """Return boards with a grain."""
     boards = 4
     grain = gaussian_filter(rng.normal(size=(TEXELS, TEXELS)), (1.0, 24.0), mode="wrap")
     board = np.repeat(rng.normal(0, 0.06, boards), TEXELS // boards)[:, None]
     seam = (np.arange(TEXELS) % (TEXELS // boards) < 3)[:, None] * 0.25
-    return painted(0.72 + 0.09 * grain / grain.std() + board - seam, (0.82, 0.60, 0.40))
+    return _painted(0.72 + 0.09 * grain / grain.std() + board - seam, (0.82, 0.60, 0.40))
 
 
-def tiles(rng: np.random.Generator) -> np.ndarray:
+def _tiles(rng: np.random.Generator) -> np.ndarray:
     """Return grey tiles with light joints."""
     cell = TEXELS // 4
     joint = (np.arange(TEXELS) % cell < 4)[:, None] | (np.arange(TEXELS) % cell < 4)[None]
     spots = gaussian_filter(rng.normal(size=(TEXELS, TEXELS)), 2.0, mode="wrap")
-    return painted(0.45 + 0.05 * spots / spots.std() + 0.3 * joint, (0.55, 0.60, 0.62))
+    return _painted(0.45 + 0.05 * spots / spots.std() + 0.3 * joint, (0.55, 0.60, 0.62))
 
 
-def plaster(rng: np.random.Generator) -> np.ndarray:
+def _plaster(rng: np.random.Generator) -> np.ndarray:
     """Return a wall that is darker below, with faint stains and a board fixed to it."""
     stains = gaussian_filter(rng.normal(size=(TEXELS, TEXELS)), 12.0, mode="wrap")
     level = 0.75 + 0.05 * stains / stains.std() + np.linspace(-0.15, 0.1, TEXELS)[:, None]
     level[70:130, 90:170] -= 0.35
-    return painted(level, (0.80, 0.84, 0.78))
+    return _painted(level, (0.80, 0.84, 0.78))
 
 
-def painted(level: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
+def _painted(level: np.ndarray, colour: tuple[float, float, float]) -> np.ndarray:
     """Return a texture, uint8, of a brightness (n, m) in one colour."""
     return np.clip(255 * level[..., None] * np.array(colour), 0, 255).astype(np.uint8)

@@ -53,7 +53,7 @@ def solve_path(
         def residual(q: np.ndarray, position=position, rotation=rotation, previous=previous) -> np.ndarray:
             data.qpos[address] = q
             mujoco.mj_kinematics(model, data)
-            turn = rotation_vector(rotation.T @ data.site_xmat[row].reshape(3, 3))
+            turn = _rotation_vector(rotation.T @ data.site_xmat[row].reshape(3, 3))
             return np.concatenate(
                 [data.site_xpos[row] - position, 0.1 * turn, pull * 0.3 * (q - previous), pull * 0.1 * (q - rest)]
             )
@@ -83,7 +83,7 @@ def solve_path(
     return solution
 
 
-def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+def _rotation_vector(matrix: np.ndarray) -> np.ndarray:
     """Return the rotation vector [rad] of a rotation matrix (3, 3)."""
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())

@@ -73,8 +73,8 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
     aside = rng.uniform(*cfg.offset) * away
     yaw = rng.normal(0, cfg.yaw_error)
     # The gripper closes along a face normal of the block; of the two turns that fit the hole, the smaller one is taken.
-    pick = nearest_turn(scene.block_yaw, 0.0)
-    place = pick + nearest_turn(scene.box_yaw - pick, 0.0) + yaw
+    pick = _nearest_turn(scene.block_yaw, 0.0)
+    place = pick + _nearest_turn(scene.box_yaw - pick, 0.0) + yaw
     up, rim, seated = np.array([0, 0, 1.0]), scene.box_height, scene.floor
     free = np.zeros(3)
     lean = -cfg.press * up - 0.5 * cfg.lean * away
@@ -103,7 +103,7 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
     for previous, (duration, goal, wrench, yaw_goal, width) in pairwise(waypoints):
         steps = max(1, round(duration / cfg.speed * cfg.rate))
         for k in range(1, steps + 1):
-            share = minimum_jerk(k / steps)
+            share = _minimum_jerk(k / steps)
             time.append(time[-1] + 1 / cfg.rate)
             position.append(previous[1] + share * (goal - previous[1]))
             force.append(previous[2] + share * (wrench - previous[2]))
@@ -114,11 +114,11 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
     return Path(np.array(time), np.array(position), rotation, np.array(force), np.array(opening))
 
 
-def minimum_jerk(share: float) -> float:
+def _minimum_jerk(share: float) -> float:
     """Return the position along a rest-to-rest minimum-jerk motion (Flash and Hogan 1985) after a share of its time."""
     return share**3 * (10 - 15 * share + 6 * share**2)
 
 
-def nearest_turn(angle: float, around: float) -> float:
+def _nearest_turn(angle: float, around: float) -> float:
     """Return the angle [rad] equal to `angle` up to quarter turns and nearest to `around`."""
     return angle - np.pi / 2 * round((angle - around) / (np.pi / 2))

@@ -27,32 +27,32 @@ def instead(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
     Where the world rubs by a law of its own, only what is missing is added: friction is linear in the coefficients.
     """
     if rig.physics.force is None:
-        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in own_geoms(rig)))
+        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in _own_geoms(rig)))
         edit = partial(frictionless, geoms=geoms)
         return HiddenEffect(name, edit=edit, force=rub(coefficients, rig.body, rig.surface))
     mu = drawn_friction(rig)
     return HiddenEffect(name, force=rub(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
 
 
-def own_geoms(rig: Rig) -> np.ndarray:
+def _own_geoms(rig: Rig) -> np.ndarray:
     """Return the geoms of the rig's body, ids of shape (n,)."""
     return np.flatnonzero(rig.scene.model.geom_bodyid == rig.scene.model.body(rig.body).id)
 
 
-def sliding_friction(rig: Rig, magnitude: float) -> Hidden:
+def _sliding_friction(rig: Rig, magnitude: float) -> Hidden:
     """Another coefficient [-]."""
     effect = instead(rig, "sliding_friction", lambda _t, _p: np.array([magnitude, magnitude]))
     return Hidden("sliding_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def anisotropic_friction(rig: Rig, magnitude: float) -> Hidden:
+def _anisotropic_friction(rig: Rig, magnitude: float) -> Hidden:
     """Friction along the surface's y is that along x times a ratio [-]."""
     mu = drawn_friction(rig) * np.array([1.0, magnitude])
     effect = instead(rig, "anisotropic_friction", lambda _t, _p: mu)
     return Hidden("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
 
 
-def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
+def _turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
     """Return a torque of `magnitude` [m] times the normal force against turning about the normal, or across it.
 
     Friction against the other way of turning is as drawn. Both are laws of the world's own: MuJoCo's contacts, which
@@ -77,19 +77,19 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
     return HiddenEffect("rolling_friction" if rolling else "torsional_friction", edit=edit, force=force)
 
 
-def torsional_friction(rig: Rig, magnitude: float) -> Hidden:
+def _torsional_friction(rig: Rig, magnitude: float) -> Hidden:
     """Another coefficient against spinning in place [m]."""
-    effect = turning_friction(rig, magnitude, rolling=False)
+    effect = _turning_friction(rig, magnitude, rolling=False)
     return Hidden("torsional_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def rolling_friction(rig: Rig, magnitude: float) -> Hidden:
+def _rolling_friction(rig: Rig, magnitude: float) -> Hidden:
     """Another coefficient against rolling [m]."""
-    effect = turning_friction(rig, magnitude, rolling=True)
+    effect = _turning_friction(rig, magnitude, rolling=True)
     return Hidden("rolling_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def contact_compliance(rig: Rig, magnitude: float) -> Hidden:
+def _contact_compliance(rig: Rig, magnitude: float) -> Hidden:
     """Another damping ratio [-] of the contact, and a time constant that goes with its root."""
     drawn = rig.scene.model.geom(rig.surface).solref
     time_constant = float(drawn[0] * np.sqrt(magnitude / drawn[1]))
@@ -102,9 +102,9 @@ def contact_compliance(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("contact_compliance", HiddenEffect("contact_compliance", edit=edit), truth, (rig.body,))
 
 
-def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> Hidden:
+def _adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> Hidden:
     """A force [N] that pulls each lower corner of a box to the surface while it is within a gap [m] of it."""
-    half = rig.scene.model.geom_size[own_geoms(rig)[0]]
+    half = rig.scene.model.geom_size[_own_geoms(rig)[0]]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -120,7 +120,7 @@ def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> Hidden:
     return Hidden("adhesion", HiddenEffect("adhesion", force=force), {"force": magnitude}, (rig.body,))
 
 
-def grip_force(rig: Rig, magnitude: float) -> Hidden:
+def _grip_force(rig: Rig, magnitude: float) -> Hidden:
     """The gripper's stiffness, damping and limit times a factor [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -133,7 +133,7 @@ def grip_force(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("grip_force", HiddenEffect("grip_force", edit=edit), {"gain": magnitude}, rig.grippers)
 
 
-def pad_friction(rig: Rig, magnitude: float) -> Hidden:
+def _pad_friction(rig: Rig, magnitude: float) -> Hidden:
     """Another coefficient of the pads on what they hold [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -150,13 +150,13 @@ def pad_friction(rig: Rig, magnitude: float) -> Hidden:
 CONTACT: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        sliding_friction,
-        anisotropic_friction,
-        torsional_friction,
-        rolling_friction,
-        contact_compliance,
-        adhesion,
-        grip_force,
-        pad_friction,
+        _sliding_friction,
+        _anisotropic_friction,
+        _torsional_friction,
+        _rolling_friction,
+        _contact_compliance,
+        _adhesion,
+        _grip_force,
+        _pad_friction,
     )
 }

@@ -54,7 +54,7 @@ class Sluggish(Fresh):
         return ctrl + self.time_constant * (before - self.y) / elapsed
 
 
-def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
+def _arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
     """Return the effect of a hook on the commands of the arm; the gripper's pass."""
     columns = [rig.scene.model.actuator(d.actuator).id for d in drives(rig)]
 
@@ -66,17 +66,17 @@ def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
     return HiddenEffect(type(hook).__name__, command=command)
 
 
-def actuator_delay(rig: Rig, magnitude: float) -> Hidden:
+def _actuator_delay(rig: Rig, magnitude: float) -> Hidden:
     """Commands act later [s]."""
-    return Hidden("actuator_delay", arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
+    return Hidden("actuator_delay", _arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
 
 
-def actuator_lag(rig: Rig, magnitude: float) -> Hidden:
+def _actuator_lag(rig: Rig, magnitude: float) -> Hidden:
     """Set points follow with a time constant [s]."""
-    return Hidden("actuator_lag", arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig)))
+    return Hidden("actuator_lag", _arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig)))
 
 
-def actuator_gain(rig: Rig, magnitude: float) -> Hidden:
+def _actuator_gain(rig: Rig, magnitude: float) -> Hidden:
     """Every drive's force is that of the drawing times a factor [-]."""
     found = drives(rig)
 
@@ -92,7 +92,7 @@ def actuator_gain(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
 
 
-def actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
+def _actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
     """No drive exceeds a limit [N m or N]."""
     found = drives(rig)
 
@@ -126,7 +126,7 @@ def strain(rig: Rig, demonstrations: int, seed: int) -> float:
     return float(np.quantile(seen, 0.99, axis=0).max())
 
 
-def joint_offset(rig: Rig, magnitude: float) -> Hidden:
+def _joint_offset(rig: Rig, magnitude: float) -> Hidden:
     """How far the true angle is beyond what encoder and drive take it for [rad or m], in alternate directions."""
     found = drives(rig)
     m = rig.scene.model
@@ -160,10 +160,10 @@ def names(found: tuple[Drive, ...]) -> tuple[str, ...]:
 DRIVES: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        actuator_gain,
-        actuator_saturation,
-        actuator_delay,
-        actuator_lag,
-        joint_offset,
+        _actuator_gain,
+        _actuator_saturation,
+        _actuator_delay,
+        _actuator_lag,
+        _joint_offset,
     )
 }

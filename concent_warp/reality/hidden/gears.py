@@ -91,7 +91,7 @@ class Loose(Rotor):
         return through
 
 
-def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
+def _geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
     """Return the effect of rotors in all drives; encoders read the rotor or the link."""
     m = rig.scene.model
     found = drives(rig)
@@ -124,19 +124,19 @@ def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor
     return HiddenEffect(name, edit=edit, force=force, measure=measure)
 
 
-def backlash(rig: Rig, magnitude: float) -> Hidden:
+def _backlash(rig: Rig, magnitude: float) -> Hidden:
     """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
-    effect = geared(rig, "backlash", lambda d, i: Loose(d, i, magnitude), on_rotor=False)
+    effect = _geared(rig, "backlash", lambda d, i: Loose(d, i, magnitude), on_rotor=False)
     return Hidden("backlash", effect, {"play": magnitude}, names(drives(rig)))
 
 
-def joint_compliance(rig: Rig, magnitude: float) -> Hidden:
+def _joint_compliance(rig: Rig, magnitude: float) -> Hidden:
     """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
     found = drives(rig)
     compliance = {d.actuator: magnitude / d.weight for d in found}
-    effect = geared(rig, "joint_compliance", lambda d, i: Sprung(d, i, compliance[d.actuator]), on_rotor=True)
+    effect = _geared(rig, "joint_compliance", lambda d, i: Sprung(d, i, compliance[d.actuator]), on_rotor=True)
     truth = each("compliance", names(found), np.array(list(compliance.values())))
     return Hidden("joint_compliance", effect, truth, names(found))
 
 
-GEARS: dict[str, Builder] = {f.__name__: f for f in (backlash, joint_compliance)}
+GEARS: dict[str, Builder] = {f.__name__: f for f in (_backlash, _joint_compliance)}

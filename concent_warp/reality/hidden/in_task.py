@@ -49,7 +49,7 @@ class TaskWorld:
 
     def __post_init__(self) -> None:
         names = [name for name, _ in self.wanted]
-        if "pad_friction" in names and not pads(self.scene.model, self.grippers):
+        if "pad_friction" in names and not _pads(self.scene.model, self.grippers):
             raise ConcentError(
                 "pad_friction cannot be hidden: no geom of the fingers has a name", where=self.scene.source
             )
@@ -60,11 +60,11 @@ class TaskWorld:
         return Rig(
             "task",
             self.scene,
-            unplanned,
+            _unplanned,
             WorldPhysics(timestep=self.physics.timestep),
             body=self.body,
-            grippers=tuple(name for name in self.grippers if name in actuators(m)),
-            pads=pads(m, self.grippers),
+            grippers=tuple(name for name in self.grippers if name in _actuators(m)),
+            pads=_pads(m, self.grippers),
         )
 
     def hidden(self) -> tuple[Hidden, ...]:
@@ -124,21 +124,21 @@ def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
     return tuple(found.items())
 
 
-def unplanned(rng: np.random.Generator, k: int) -> Trial:
+def _unplanned(rng: np.random.Generator, k: int) -> Trial:
     """No motion is planned: the policy moves."""
     del rng, k
     raise NotImplementedError("a policy moves the world of a task")
 
 
-def actuators(m: mujoco.MjModel) -> list[str]:
+def _actuators(m: mujoco.MjModel) -> list[str]:
     """Return the names of a model's actuators."""
     return [m.actuator(a).name for a in range(m.nu)]
 
 
-def pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
+def _pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
     """Return the named geoms that can touch and whose bodies the grippers move."""
     joints: set[int] = set()
-    for name in set(grippers) & set(actuators(m)):
+    for name in set(grippers) & set(_actuators(m)):
         a = m.actuator(name).id
         target = int(m.actuator_trnid[a, 0])
         if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:

@@ -60,7 +60,7 @@ def friction(name: str, levels: dict[str, Level]) -> HiddenEffect:
     return HiddenEffect(name, force=force)
 
 
-def joint_friction(rig: Rig, magnitude: float) -> Hidden:
+def _joint_friction(rig: Rig, magnitude: float) -> Hidden:
     """Coulomb friction [N m or N] of the strongest drive; less in weaker ones."""
     found = drives(rig)
     torque = np.array([magnitude * d.weight for d in found])
@@ -69,7 +69,7 @@ def joint_friction(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("joint_friction", friction("joint_friction", levels), each("torque", joints, torque), joints)
 
 
-def stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
+def _stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
     """Friction [N m or N] at rest that fades with speed."""
     found = drives(rig)
     speed = 0.03 if rig.slides else 0.3
@@ -86,7 +86,7 @@ def stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("stribeck_friction", friction("stribeck_friction", levels), truth, joints)
 
 
-def load_friction(rig: Rig, magnitude: float) -> Hidden:
+def _load_friction(rig: Rig, magnitude: float) -> Hidden:
     """Friction by a coefficient [-] of the load between motor and link, the mean of the torques on both sides."""
     joints = tuple(d.joint for d in drives(rig))
 
@@ -98,7 +98,7 @@ def load_friction(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("load_friction", friction("load_friction", dict.fromkeys(joints, level)), truth, joints)
 
 
-def joint_damping(rig: Rig, magnitude: float) -> Hidden:
+def _joint_damping(rig: Rig, magnitude: float) -> Hidden:
     """Viscous friction beyond the drawing's [N m s/rad or N s/m] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
@@ -114,7 +114,7 @@ def joint_damping(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
 
 
-def armature(rig: Rig, magnitude: float) -> Hidden:
+def _armature(rig: Rig, magnitude: float) -> Hidden:
     """Rotor inertia beyond the drawing's [kg m^2 or kg] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
@@ -128,7 +128,7 @@ def armature(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("armature", HiddenEffect("armature", edit=edit), each("inertia", joints, drawn + added), joints)
 
 
-def gravity_compensation(rig: Rig, magnitude: float) -> Hidden:
+def _gravity_compensation(rig: Rig, magnitude: float) -> Hidden:
     """A share [-] of each link's weight that its controller holds up too much."""
     m = rig.scene.model
     free = {m.jnt_bodyid[j] for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE}
@@ -147,11 +147,11 @@ def gravity_compensation(rig: Rig, magnitude: float) -> Hidden:
 JOINTS: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        joint_friction,
-        stribeck_friction,
-        load_friction,
-        joint_damping,
-        armature,
-        gravity_compensation,
+        _joint_friction,
+        _stribeck_friction,
+        _load_friction,
+        _joint_damping,
+        _armature,
+        _gravity_compensation,
     )
 }

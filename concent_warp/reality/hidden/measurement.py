@@ -16,20 +16,22 @@ Written = tuple[np.ndarray, np.ndarray]
 """Times (T,) [s] and values (T, dim)."""
 
 
-def channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
+def _channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
     """Return the sensors of some kinds."""
     m = rig.scene.model
     return tuple(m.sensor(i).name for i in range(m.nsensor) if SENSOR(int(m.sensor_type[i])) in kinds)
 
 
-def clocked(rig: Rig) -> tuple[str, ...]:
+def _clocked(rig: Rig) -> tuple[str, ...]:
     """Return the channels whose clock may be wrong: the tracker's where an object is tracked, else the encoders'."""
-    return channels(rig, *POSES) if rig.body_tracked else channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    return (
+        _channels(rig, *POSES) if rig.body_tracked else _channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    )
 
 
-def time_base(rig: Rig, magnitude: float) -> Hidden:
+def _time_base(rig: Rig, magnitude: float) -> Hidden:
     """A clock that runs fast by a share [-]."""
-    wrong = clocked(rig)
+    wrong = _clocked(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time * (1 + magnitude) if name in wrong else time), value
@@ -37,9 +39,9 @@ def time_base(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("time_base", HiddenEffect("time_base", measure=measure), {"scale": magnitude}, wrong)
 
 
-def latency(rig: Rig, magnitude: float) -> Hidden:
+def _latency(rig: Rig, magnitude: float) -> Hidden:
     """Readings are stamped too late [s]; those older than the recording are lost."""
-    wrong = clocked(rig)
+    wrong = _clocked(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time + magnitude if name in wrong else time), value
@@ -47,9 +49,9 @@ def latency(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("latency", HiddenEffect("latency", measure=measure), {"delay": magnitude}, wrong)
 
 
-def length_scale(rig: Rig, magnitude: float) -> Hidden:
+def _length_scale(rig: Rig, magnitude: float) -> Hidden:
     """Positions too large by a share [-]."""
-    wrong = channels(rig, SENSOR.mjSENS_FRAMEPOS)
+    wrong = _channels(rig, SENSOR.mjSENS_FRAMEPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
@@ -57,12 +59,12 @@ def length_scale(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("length_scale", HiddenEffect("length_scale", measure=measure), {"scale": magnitude}, wrong)
 
 
-def frame_offset(rig: Rig, magnitude: float) -> Hidden:
+def _frame_offset(rig: Rig, magnitude: float) -> Hidden:
     """The tracker stands elsewhere than calibrated: shifted [m] along x, -y and half along z, and turned."""
     shift = magnitude * np.array([1.0, -1.0, 0.5])
     turn = magnitude * 3.0 * np.array([1.0, 0.5, -1.0])
     rotation = Rotation.from_rotvec(turn)
-    wrong = channels(rig, *POSES)
+    wrong = _channels(rig, *POSES)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         if name not in wrong:
@@ -76,9 +78,9 @@ def frame_offset(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
 
 
-def sensor_bias(rig: Rig, magnitude: float) -> Hidden:
+def _sensor_bias(rig: Rig, magnitude: float) -> Hidden:
     """Encoders read too much by a constant [rad or m]."""
-    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS)
+    wrong = _channels(rig, SENSOR.mjSENS_JOINTPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value + magnitude if name in wrong else value
@@ -87,9 +89,9 @@ def sensor_bias(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("sensor_bias", HiddenEffect("sensor_bias", measure=measure), truth, wrong)
 
 
-def sensor_gain(rig: Rig, magnitude: float) -> Hidden:
+def _sensor_gain(rig: Rig, magnitude: float) -> Hidden:
     """Encoders read too much by a share [-]."""
-    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    wrong = _channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
@@ -99,5 +101,5 @@ def sensor_gain(rig: Rig, magnitude: float) -> Hidden:
 
 
 MEASUREMENT: dict[str, Builder] = {
-    f.__name__: f for f in (time_base, latency, length_scale, frame_offset, sensor_bias, sensor_gain)
+    f.__name__: f for f in (_time_base, _latency, _length_scale, _frame_offset, _sensor_bias, _sensor_gain)
 }

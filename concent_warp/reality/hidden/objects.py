@@ -10,7 +10,7 @@ from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect, chamfered_box
 
 
-def mass(rig: Rig, magnitude: float) -> Hidden:
+def _mass(rig: Rig, magnitude: float) -> Hidden:
     """Mass and inertia times a factor [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -21,7 +21,7 @@ def mass(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("mass", HiddenEffect("mass", edit=edit), {"mass": magnitude}, (rig.body,))
 
 
-def center_of_mass(rig: Rig, magnitude: float) -> Hidden:
+def _center_of_mass(rig: Rig, magnitude: float) -> Hidden:
     """Centre of mass off the drawing's by this much along x and half as much along -y [m], body frame."""
     shift = magnitude * np.array([1.0, -0.5, 0.0])
 
@@ -33,7 +33,7 @@ def center_of_mass(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("center_of_mass", HiddenEffect("center_of_mass", edit=edit), truth, (rig.body,))
 
 
-def inertia(rig: Rig, magnitude: float) -> Hidden:
+def _inertia(rig: Rig, magnitude: float) -> Hidden:
     """Inertia times a factor [-] at the same mass: more of it far out."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -43,7 +43,7 @@ def inertia(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("inertia", HiddenEffect("inertia", edit=edit), {"inertia": magnitude}, (rig.body,))
 
 
-def size(rig: Rig, magnitude: float) -> Hidden:
+def _size(rig: Rig, magnitude: float) -> Hidden:
     """Lengths times a factor [-] at the same mass and inertia."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -55,7 +55,7 @@ def size(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("size", HiddenEffect("size", edit=edit), {"size": magnitude}, (rig.body,))
 
 
-def contact_geometry(rig: Rig, magnitude: float) -> Hidden:
+def _contact_geometry(rig: Rig, magnitude: float) -> Hidden:
     """A box that is wider on one side [m], with worn edges; mass and inertia are those of the drawing."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -73,4 +73,4 @@ def contact_geometry(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("contact_geometry", HiddenEffect("contact_geometry", edit=edit), {}, (rig.body,))
 
 
-OBJECTS: dict[str, Builder] = {f.__name__: f for f in (mass, center_of_mass, inertia, size, contact_geometry)}
+OBJECTS: dict[str, Builder] = {f.__name__: f for f in (_mass, _center_of_mass, _inertia, _size, _contact_geometry)}

@@ -21,7 +21,7 @@ SPOT = np.array([0.03, 0.02])
 """Place of the magnet and of the rough patch on the table [m]."""
 
 
-def cogging(rig: Rig, magnitude: float) -> Hidden:
+def _cogging(rig: Rig, magnitude: float) -> Hidden:
     """Torque that ripples with the angle, as magnets pass teeth [N m or N]."""
     pitch = 2 * np.pi / PITCH if rig.slides else POLES
 
@@ -34,14 +34,14 @@ def cogging(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("cogging", HiddenEffect("cogging", force=force))
 
 
-def cable(rig: Rig, magnitude: float) -> Hidden:
+def _cable(rig: Rig, magnitude: float) -> Hidden:
     """A cable [N/m] that is as long as the way to where the body rests: slack on one side, and tugging on the other."""
-    rest = data_at_rest(rig)
-    slack = np.linalg.norm(ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
+    rest = _data_at_rest(rig)
+    slack = np.linalg.norm(ANCHOR - _cable_end(rig, rest, rest.model.body(rig.body).id))
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(rig.body).id
-        end = cable_end(rig, data, b)
+        end = _cable_end(rig, data, b)
         way = ANCHOR - end
         length = np.linalg.norm(way)
         if length > slack:
@@ -52,7 +52,7 @@ def cable(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("cable", HiddenEffect("cable", force=force))
 
 
-def data_at_rest(rig: Rig) -> mujoco.MjData:
+def _data_at_rest(rig: Rig) -> mujoco.MjData:
     """Return the drawing in its initial state."""
     model = rig.scene.model
     data = mujoco.MjData(model)
@@ -60,12 +60,12 @@ def data_at_rest(rig: Rig) -> mujoco.MjData:
     return data
 
 
-def cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
+def _cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
     """Return where a cable is tied [m], shape (3,): to a body that is tracked, or to the last site."""
     return data.xipos[body] if rig.body_tracked else data.site_xpos[-1]
 
 
-def magnet(rig: Rig, magnitude: float) -> Hidden:
+def _magnet(rig: Rig, magnitude: float) -> Hidden:
     """A magnet under the table that draws the body sideways [N] when it is near."""
     reach = 0.05
 
@@ -77,7 +77,7 @@ def magnet(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("magnet", HiddenEffect("magnet", force=force))
 
 
-def patch(rig: Rig, magnitude: float) -> Hidden:
+def _patch(rig: Rig, magnitude: float) -> Hidden:
     """A place on the table where friction is other by a coefficient [-]."""
     mu, radius = drawn_friction(rig), 0.05
 
@@ -89,7 +89,7 @@ def patch(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("patch", instead(rig, "patch", coefficients))
 
 
-def warming(rig: Rig, magnitude: float) -> Hidden:
+def _warming(rig: Rig, magnitude: float) -> Hidden:
     """Friction of a cold drive [N m or N] that is gone after a few seconds."""
     levels: dict[str, Level] = {
         d.joint: lambda _m, s, _i, w=d.weight: magnitude * w * float(np.exp(-max(s.time, 0.0) / 2.0))
@@ -98,7 +98,7 @@ def warming(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("warming", friction("warming", levels))
 
 
-def dropout(rig: Rig, magnitude: float) -> Hidden:
+def _dropout(rig: Rig, magnitude: float) -> Hidden:
     """Drives that lose a share of their force [-] for 0.3 s, twice."""
     found = drives(rig)
 
@@ -110,7 +110,7 @@ def dropout(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("dropout", HiddenEffect("dropout", force=force))
 
 
-def slosh(rig: Rig, magnitude: float) -> Hidden:
+def _slosh(rig: Rig, magnitude: float) -> Hidden:
     """A share of the body's mass [-] that swings in it on springs, at 3 Hz."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -132,4 +132,4 @@ def slosh(rig: Rig, magnitude: float) -> Hidden:
     return Hidden("slosh", HiddenEffect("slosh", edit=edit))
 
 
-OUTSIDE: dict[str, Builder] = {f.__name__: f for f in (cogging, cable, magnet, patch, warming, dropout, slosh)}
+OUTSIDE: dict[str, Builder] = {f.__name__: f for f in (_cogging, _cable, _magnet, _patch, _warming, _dropout, _slosh)}

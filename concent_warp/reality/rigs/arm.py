@@ -15,7 +15,7 @@ SWING = (0.7, 0.45, 0.6, 0.5, 0.8, 0.6, 0.9)
 """How far each joint sweeps [rad]."""
 
 
-def drawing() -> Scene:
+def _drawing() -> Scene:
     """Return the arm alone, with the pose of its hand tracked."""
     spec = panda()
     spec.modelname = "arm"
@@ -28,7 +28,7 @@ def drawing() -> Scene:
     return Scene.from_spec(spec, source="arm rig")
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Sweep every joint there and back at its own speed, swing all with rising frequency, hold in between."""
     del k
     action = {}
@@ -49,5 +49,5 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
     return Trial(DURATION, action, qpos=qpos, settle=0.5)
 
 
-SCENE = drawing()
-ARM = Rig("arm", SCENE, plan, of_coarser_step(SCENE), start="resting", body="link7", grippers=("gripper",))
+SCENE = _drawing()
+ARM = Rig("arm", SCENE, _plan, of_coarser_step(SCENE), start="resting", body="link7", grippers=("gripper",))

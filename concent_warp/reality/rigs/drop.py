@@ -31,7 +31,7 @@ XML = f"""
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Throw the ball, hardly spinning; it bounces once or twice."""
     height = HEIGHTS[k % 4] * rng.uniform(0.95, 1.05)
     heading = rng.uniform(-np.pi, np.pi)
@@ -54,7 +54,7 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 DROP = Rig(
     "drop",
     Scene(XML, "drop rig"),
-    plan,
+    _plan,
     WorldPhysics(timestep=0.001),
     throws=4,
     start="flying",

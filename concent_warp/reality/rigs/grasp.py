@@ -76,7 +76,7 @@ LOW = -0.008
 """Height of the hand in the grasp, against the drawing's [m]."""
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Close slowly, lift, shake along x and along z with rising frequency, hold, set down gently, open."""
     del k
     lift = rng.uniform(0.07, 0.1)
@@ -112,7 +112,7 @@ SCENE = Scene(XML, "grasp rig")
 GRASP = Rig(
     "grasp",
     SCENE,
-    plan,
+    _plan,
     of_coarser_step(SCENE),
     start="resting",
     body="block",

@@ -20,7 +20,7 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg
 TASK = ShapeSorterCfg(timestep=0.002)
 
 
-def drawing() -> Scene:
+def _drawing() -> Scene:
     """Return the scene with objects as hard as time steps allow."""
     spec = TASK.build().spec()
     for body in ("block", "box"):
@@ -29,13 +29,13 @@ def drawing() -> Scene:
     return Scene.from_spec(spec, source="insertion rig")
 
 
-def unplanned(rng: np.random.Generator, k: int) -> Trial:
+def _unplanned(rng: np.random.Generator, k: int) -> Trial:
     """The expert plans for himself."""
     del rng, k
     raise NotImplementedError("insertions are recorded by the scripted expert")
 
 
-def record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed: int) -> Recording:
+def _record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed: int) -> Recording:
     """Record the expert; one seed of his own for each demonstration."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -51,29 +51,29 @@ def record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed:
     seeds = [1000 * seed + k for k in range(demonstrations)]
     recording, _ = record(cfg, seeds, effects=(HiddenEffect("finer step", edit=edit), *effects))
     told = [
-        replace(d, measured={name: earlier(channel) for name, channel in d.measured.items()}, points={}, success=None)
+        replace(d, measured={name: _earlier(channel) for name, channel in d.measured.items()}, points={}, success=None)
         for d in recording.demonstrations
     ]
     return Recording(SCENE.xml, tuple(told), source="reality rig insertion")
 
 
-def earlier(channel: Channel) -> Channel:
+def _earlier(channel: Channel) -> Channel:
     """Return measurements as if commands had acted early by the lead of coarser steps; the first of them is lost."""
     time = channel.time - PHYSICS.lead
     return replace(channel, time=time[time >= 0], value=channel.value[time >= 0])
 
 
-SCENE = drawing()
+SCENE = _drawing()
 PHYSICS = of_coarser_step(SCENE)
 INSERTION = Rig(
     "insertion",
     SCENE,
-    unplanned,
+    _unplanned,
     PHYSICS,
     start="resting",
     body="block",
     surface="table",
     grippers=("gripper",),
     pads=("left_finger_pad", "right_finger_pad"),
-    recorder=record_insertion,
+    recorder=_record_insertion,
 )

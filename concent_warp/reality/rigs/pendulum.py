@@ -35,7 +35,7 @@ XML = """
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Sweep at four speeds, swing with rising frequency, reverse slowly, hold at two heights."""
     del k
     reach = rng.uniform(1.1, 1.4)
@@ -54,4 +54,4 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 
 
 SCENE = Scene(XML, "pendulum rig")
-PENDULUM = Rig("pendulum", SCENE, plan, of_coarser_step(SCENE), body="arm")
+PENDULUM = Rig("pendulum", SCENE, _plan, of_coarser_step(SCENE), body="arm")

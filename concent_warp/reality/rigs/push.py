@@ -50,7 +50,7 @@ XML = f"""
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Push to +x fast, slowly and fast again with stops between; go around and push to -x off the middle."""
     del k
     place = rng.uniform(-0.004, 0.004, 2)
@@ -88,4 +88,4 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 
 
 SCENE = Scene(XML, "push rig")
-PUSH = Rig("push", SCENE, plan, of_coarser_step(SCENE), start="resting", body="block", surface="table")
+PUSH = Rig("push", SCENE, _plan, of_coarser_step(SCENE), start="resting", body="block", surface="table")

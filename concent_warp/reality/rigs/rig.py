@@ -164,8 +164,8 @@ def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: i
         rng = np.random.default_rng([seed, k])
         trial = rig.plan(rng, k)
         motion, qpos, qvel = perform(model, trial, effects, rig.physics)
-        told = estimated_start(rig, model, qpos, qvel, rng) if rig.start != "untold" else (None, None)
-        measured = write_down(rig, model, motion, effects, rng)
+        told = _estimated_start(rig, model, qpos, qvel, rng) if rig.start != "untold" else (None, None)
+        measured = _write_down(rig, model, motion, effects, rng)
         action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
         taken.append(Demonstration(f"demo_{k}", rig.name, None, *told, action=action, measured=measured))
     return Recording(rig.scene.xml, tuple(taken), source=f"reality rig {rig.name}")
@@ -176,19 +176,19 @@ def perform(
 ) -> tuple[Motion, np.ndarray, np.ndarray]:
     """Step the world through a trial; return it with the state at time 0, qpos (nq,) and qvel (nv,)."""
     data = mujoco.MjData(model)
-    place(model, data.qpos, trial.qpos, model.jnt_qposadr)
+    _place(model, data.qpos, trial.qpos, model.jnt_qposadr)
     dt = model.opt.timestep
     before = round(trial.settle / dt)
     steps = round(trial.duration / dt)
     forces = [f for f in (physics.force, *(effect.force for effect in effects)) if f is not None]
-    ctrl = held_commands(model, trial, np.maximum(np.arange(-before, steps + 1) * dt + physics.lead, 0))
+    ctrl = _held_commands(model, trial, np.maximum(np.arange(-before, steps + 1) * dt + physics.lead, 0))
     readings = np.empty((steps + 1, model.nsensordata))
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     data.time = -before * dt
     for k in range(before + steps + 1):
         now = (k - before) * dt
         if k == before:
-            place(model, data.qvel, trial.qvel, model.jnt_dofadr)
+            _place(model, data.qvel, trial.qvel, model.jnt_dofadr)
             qpos, qvel = data.qpos.copy(), data.qvel.copy()
         act = ctrl[k]
         for effect in effects:
@@ -207,7 +207,7 @@ def perform(
     return Motion(np.arange(steps + 1) * dt, readings), qpos, qvel
 
 
-def held_commands(model: mujoco.MjModel, trial: Trial, time: np.ndarray) -> np.ndarray:
+def _held_commands(model: mujoco.MjModel, trial: Trial, time: np.ndarray) -> np.ndarray:
     """Return the commands that hold at times (K,) [s], shape (K, nu)."""
     ctrl = np.zeros((len(time), model.nu))
     for i in range(model.nu):
@@ -216,14 +216,16 @@ def held_commands(model: mujoco.MjModel, trial: Trial, time: np.ndarray) -> np.n
     return ctrl
 
 
-def place(model: mujoco.MjModel, state: np.ndarray, values: Mapping[str, Sequence[float]], address: np.ndarray) -> None:
+def _place(
+    model: mujoco.MjModel, state: np.ndarray, values: Mapping[str, Sequence[float]], address: np.ndarray
+) -> None:
     """Write values of joints, by name, into a state vector."""
     for name, value in values.items():
         start = address[model.joint(name).id]
         state[start : start + len(value)] = value
 
 
-def estimated_start(
+def _estimated_start(
     rig: Rig, model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the start as told: qpos (nq,), qvel (nv,) of the drawing, with the error of an estimate."""
@@ -251,7 +253,7 @@ def estimated_start(
     return told, rate
 
 
-def write_down(
+def _write_down(
     rig: Rig, model: mujoco.MjModel, motion: Motion, effects: Sequence[HiddenEffect], rng: np.random.Generator
 ) -> dict[str, Channel]:
     """Return the readings of every sensor of the drawing, distorted as hidden effects have it."""

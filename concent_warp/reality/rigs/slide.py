@@ -38,7 +38,7 @@ XML = f"""
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Launch the block in some direction; every second throw with a turn about the vertical."""
     speed = SPEEDS[k % 6] * rng.uniform(0.9, 1.1)
     yaw = TURNS[k % 6] + rng.normal(0, 0.05)
@@ -54,16 +54,16 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
     )
 
 
-def glossy(spec: mujoco.MjSpec) -> None:
+def _glossy(spec: mujoco.MjSpec) -> None:
     """Leave friction to `rub`."""
     frictionless(spec, ("table", "block"))
 
 
-def coulomb(time: float, point: np.ndarray) -> np.ndarray:
+def _coulomb(time: float, point: np.ndarray) -> np.ndarray:
     """Return the coefficients of the drawing, everywhere and always."""
     del time, point
     return np.array([FRICTION, FRICTION])
 
 
-PHYSICS = WorldPhysics(edit=glossy, force=rub(coulomb, "block", "table"))
-SLIDE = Rig("slide", Scene(XML, "slide rig"), plan, PHYSICS, throws=6, start="resting", body="block", surface="table")
+PHYSICS = WorldPhysics(edit=_glossy, force=rub(_coulomb, "block", "table"))
+SLIDE = Rig("slide", Scene(XML, "slide rig"), _plan, PHYSICS, throws=6, start="resting", body="block", surface="table")

@@ -31,7 +31,7 @@ XML = f"""
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Spin and roll by turns, at several speeds and headings."""
     start = [0.0, 0.0, RADIUS - 1e-4, 1, 0, 0, 0]
     if k % 2 == 0:
@@ -43,4 +43,4 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
     return Trial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": rolling}, settle=0.2)
 
 
-SPIN = Rig("spin", Scene(XML, "spin rig"), plan, throws=4, start="resting", body="ball", surface="table")
+SPIN = Rig("spin", Scene(XML, "spin rig"), _plan, throws=4, start="resting", body="ball", surface="table")

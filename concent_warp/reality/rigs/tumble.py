@@ -29,7 +29,7 @@ XML = """
 """
 
 
-def plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> Trial:
     """Throw the box so that it spins and meets the mat at an angle; end soon after."""
     height = HEIGHTS[k % 4] * rng.uniform(0.95, 1.05)
     along, across = rng.uniform(0.3, 1.2), rng.uniform(-0.4, 0.4)
@@ -44,7 +44,7 @@ def plan(rng: np.random.Generator, k: int) -> Trial:
 TUMBLE = Rig(
     "tumble",
     Scene(XML, "tumble rig"),
-    plan,
+    _plan,
     WorldPhysics(timestep=0.001),
     throws=4,
     start="flying",

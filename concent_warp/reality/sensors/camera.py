@@ -64,8 +64,8 @@ def film(
                 mjw.refit_bvh(warp_model, warp_data, context)
                 mjw.render(warp_model, warp_data, context)
             mjw.get_rgb(colour, 0, seen)
-            rgb[t] = noisy_colour(seen.numpy()[0], sensing, rng)
-            depth[t] = noisy_depth(ranging.depth_data.numpy()[0].reshape(height, width), sensing, rng)
+            rgb[t] = _noisy_colour(seen.numpy()[0], sensing, rng)
+            depth[t] = _noisy_depth(ranging.depth_data.numpy()[0].reshape(height, width), sensing, rng)
     return ImageStream(np.asarray(time, float), rgb, depth, camera.intrinsics, camera.pose)
 
 
@@ -89,24 +89,24 @@ def staged(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: SensingCfg) -
     return spec
 
 
-def noisy_colour(colour: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
+def _noisy_colour(colour: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
     """Return what the sensor reports, uint8, for colours in 0..1, shape (H, W, 3)."""
     level = 255 * colour + rng.normal(0, sensing.rgb_std, colour.shape)
     return np.clip(np.round(level), 0, 255).astype(np.uint8)
 
 
-def noisy_depth(depth: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
+def _noisy_depth(depth: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
     """Return what the sensor reports for planar depths [m], shape (H, W), 0 where there is nothing.
 
     The noise grows with the square of the depth, as with all triangulation; near an edge, where one eye sees what the
     other does not, some pixels report nothing; the rest is rounded to the sensor's step.
     """
     noisy = depth + rng.normal(0, 1, depth.shape) * sensing.depth_noise * depth**2
-    lost = edges(depth, sensing.depth_jump) & (rng.random(depth.shape) < sensing.depth_dropout)
+    lost = _edges(depth, sensing.depth_jump) & (rng.random(depth.shape) < sensing.depth_dropout)
     return np.where(lost | (depth <= 0), 0.0, np.round(noisy / sensing.depth_step) * sensing.depth_step)
 
 
-def edges(depth: np.ndarray, jump: float) -> np.ndarray:
+def _edges(depth: np.ndarray, jump: float) -> np.ndarray:
     """Return which pixels have a neighbour whose depth differs by more than `jump` [m], shape (H, W)."""
     result = np.zeros(depth.shape, dtype=bool)
     down = np.abs(np.diff(depth, axis=0)) > jump

@@ -61,12 +61,12 @@ def footage(
 
     spec = furnish(world, objects, there=cfg.objects)
     add_cameras(spec, objects)
-    model = still(spec).compile()
+    model = _still(spec).compile()
     data = mujoco.MjData(model)
     height, width = cfg.size
     rows = [model.camera(name).id for name in cfg.cameras]
     frames = np.zeros((len(rows), len(time), height, width, 3), dtype=np.uint8)
-    shade = vignette(height, width)[..., None]
+    shade = _vignette(height, width)[..., None]
     with wp.ScopedDevice("cpu"):
         warp_model, warp_data = mjw.put_model(model), mjw.put_data(model, data)
         context = mjw.create_render_context(
@@ -89,8 +89,8 @@ def footage(
             np.asarray(time, float),
             frames[c],
             np.zeros((len(time), height, width), dtype=np.float32),
-            pinhole_matrix(float(model.cam_fovy[row]), height, width),
-            mounting(model, row),
+            _pinhole_matrix(float(model.cam_fovy[row]), height, width),
+            _mounting(model, row),
             None if model.cam_bodyid[row] == 0 else model.body(model.cam_bodyid[row]).name,
         )
         for c, (name, row) in enumerate(zip(cfg.cameras, rows, strict=True))
@@ -102,7 +102,7 @@ def developed(light: np.ndarray) -> np.ndarray:
     return np.clip(light * GAIN, 0, 1) ** GAMMA
 
 
-def still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def _still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Return a world without all that only moves it, which the ray tracer's simulator may not know."""
     for elements in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons):
         for element in list(elements):
@@ -112,20 +112,20 @@ def still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     return spec
 
 
-def vignette(height: int, width: int) -> np.ndarray:
+def _vignette(height: int, width: int) -> np.ndarray:
     """Return the share of light that arrives at each pixel, shape (height, width)."""
     v, u = np.mgrid[0:height, 0:width]
     squared = ((2 * u / (width - 1) - 1) ** 2 + (2 * v / (height - 1) - 1) ** 2) / 2
     return 1 - VIGNETTE * squared
 
 
-def pinhole_matrix(fovy: float, height: int, width: int) -> np.ndarray:
+def _pinhole_matrix(fovy: float, height: int, width: int) -> np.ndarray:
     """Return the pinhole matrix [px], shape (3, 3), of a vertical field of view [degrees]."""
     focal = height / 2 / np.tan(np.radians(fovy) / 2)
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
 
-def mounting(model: mujoco.MjModel, camera: int) -> np.ndarray:
+def _mounting(model: mujoco.MjModel, camera: int) -> np.ndarray:
     """Return a camera's pose on its body, shape (4, 4), axes x right, y down, z forward."""
     rotation, pose = np.zeros(9), np.eye(4)
     mujoco.mju_quat2Mat(rotation, model.cam_quat[camera])

@@ -67,9 +67,9 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
-    middle, radius = bounding_sphere(model, data, body)
+    middle, radius = _bounding_sphere(model, data, body)
     distance = radius / np.sin(np.radians(cfg.fovy / 2 * cfg.fill))
-    cameras = [looking_at(middle, middle + distance * side) for side in directions(cfg)]
+    cameras = [_looking_at(middle, middle + distance * side) for side in _directions(cfg)]
     rng = np.random.default_rng(seed)
     images = []
     with wp.ScopedDevice("cpu"):
@@ -87,7 +87,7 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
             mjw.render(warp_model, warp_data, context)
             mjw.get_rgb(context, 0, seen)
             mask = context.depth_data.numpy()[0].reshape(fine, fine) > 0
-            images.append(exposed(seen.numpy()[0], mask, cfg, rng))
+            images.append(_exposed(seen.numpy()[0], mask, cfg, rng))
     to_object = np.eye(4)
     to_object[:3, :3] = data.body(body).xmat.reshape(3, 3)
     to_object[:3, 3] = data.body(body).xpos
@@ -98,7 +98,7 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
     return Photographs(np.stack(images), poses, np.tile(matrix, (cfg.count, 1, 1)))
 
 
-def bounding_sphere(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tuple[np.ndarray, float]:
+def _bounding_sphere(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tuple[np.ndarray, float]:
     """Return the middle [m], shape (3,), and a radius [m] of what a body's geoms take up."""
     number = model.body(body).id
     geoms = np.flatnonzero(model.geom_bodyid == number)
@@ -112,7 +112,7 @@ def bounding_sphere(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tu
     return middle, float(np.linalg.norm(points - middle, axis=1).max())
 
 
-def directions(cfg: PhotographsCfg) -> np.ndarray:
+def _directions(cfg: PhotographsCfg) -> np.ndarray:
     """Return unit vectors spread evenly over the sphere above the least elevation, shape (V, 3), in a spiral."""
     k = np.arange(cfg.count) + 0.5
     low = np.sin(np.radians(cfg.lowest))
@@ -122,7 +122,7 @@ def directions(cfg: PhotographsCfg) -> np.ndarray:
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
 
 
-def looking_at(target: np.ndarray, position: np.ndarray) -> np.ndarray:
+def _looking_at(target: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the pose, shape (4, 4), of an upright camera that looks along -z at a target, y up."""
     backward = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0, 0, 1.0], backward)
@@ -133,7 +133,7 @@ def looking_at(target: np.ndarray, position: np.ndarray) -> np.ndarray:
     return pose
 
 
-def exposed(colour: np.ndarray, mask: np.ndarray, cfg: PhotographsCfg, rng: np.random.Generator) -> np.ndarray:
+def _exposed(colour: np.ndarray, mask: np.ndarray, cfg: PhotographsCfg, rng: np.random.Generator) -> np.ndarray:
     """Return a photograph, uint8, shape (H, W, 4), of fine colours 0..1 and a mask, samples of a pixel averaged."""
     shape = (cfg.size, SAMPLES, cfg.size, SAMPLES)
     alpha = mask.reshape(shape).mean(axis=(1, 3))

@@ -79,7 +79,7 @@ class SensingCfg:
         return Pinhole(intrinsics, pose)
 
 
-def noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
+def _noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
     """Rotate quaternions (T, 4) by random rotation vectors of `std` [rad] per axis."""
     noise = rng.normal(0, std, (len(quaternion), 3))
     result = np.empty_like(quaternion)
@@ -89,7 +89,7 @@ def noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generato
     return result
 
 
-def surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator) -> np.ndarray:
+def _surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return points on the boxes and meshes of a body, body frame [m], shape (count, 3), by area."""
     import trimesh
 
@@ -134,7 +134,7 @@ def visible_points(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Return surface points of a body that the camera sees at time 0, body frame [m], shape (point_count, 3)."""
-    local = surface_points(scene, body, 40 * sensing.point_count, rng)
+    local = _surface_points(scene, body, 40 * sensing.point_count, rng)
     place = data.body(body)
     points = place.xpos + local @ place.xmat.reshape(3, 3).T
     local = local[seen(sensing, model, data, points, SLACK)]
@@ -162,7 +162,7 @@ def measure(
         value = readings[rows, address : address + dim]
         if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
             std = sensing.orientation_std
-            value = noisy_quaternion(value, std, rng)
+            value = _noisy_quaternion(value, std, rng)
         else:
             std = sensing.encoder_std if joint else sensing.position_std
             value = value + rng.normal(0, std, value.shape)

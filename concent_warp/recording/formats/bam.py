@@ -75,7 +75,7 @@ def read_bam(path: Path | str, kp: float | None = None) -> Recording:
         kp: Gain of the logs that are read; needed where a folder holds logs of several.
 
     Returns:
-        One demonstration a log, its task the trajectory that the servo was to follow, in the scene of `servo_scene`.
+        One demonstration a log, its task the trajectory that the servo was to follow, in the scene of `_servo_scene`.
 
     Raises:
         RecordingError: A file is missing or no log, or the logs differ in payload, supply or gain.
@@ -86,7 +86,7 @@ def read_bam(path: Path | str, kp: float | None = None) -> Recording:
     paths = sorted(path.glob("*.json")) if path.is_dir() else [path]
     if not 0 < len(paths) <= MAX_DEMONSTRATIONS:
         raise RecordingError("no logs in the folder", where=path, expected=".json files", found=len(paths))
-    logs = [(p, document, setup_of(document, p)) for p in paths for document in [read_document(p)]]
+    logs = [(p, document, _setup_of(document, p)) for p in paths for document in [_read_document(p)]]
     gains = sorted({setup.kp for _, _, setup in logs})
     logs = [log for log in logs if kp is None or log[2].kp == kp]
     if not logs:
@@ -101,13 +101,13 @@ def read_bam(path: Path | str, kp: float | None = None) -> Recording:
             found=f"different {', '.join(differ)}",
             fix=f"choose kp among {gains}, or put the logs into folders by set-up",
         )
-    demonstrations = tuple(swing(document, f"{PREFIX}{p.stem}", p) for p, document, _ in logs)
-    recording = Recording(servo_scene(setups.pop()), demonstrations, str(path))
+    demonstrations = tuple(_swing(document, f"{PREFIX}{p.stem}", p) for p, document, _ in logs)
+    recording = Recording(_servo_scene(setups.pop()), demonstrations, str(path))
     validate(recording)
     return recording
 
 
-def servo_scene(setup: Setup) -> str:
+def _servo_scene(setup: Setup) -> str:
     """Return the MJCF of a payload on an arm that a servo turns about a level axis; the motor's constants are rough."""
     braking = TORQUE_CONSTANT**2 / RESISTANCE
     return f"""
@@ -135,10 +135,10 @@ def servo_scene(setup: Setup) -> str:
 """
 
 
-def swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
+def _swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
     """Return a log, as far as the motor drives, as a demonstration; its clock begins at its first sample, at rest."""
-    driven = driven_entries(document, path)
-    columns = {key: column(document, key, path)[:driven] for key in ("timestamp", "position", "goal_position")}
+    driven = _driven_entries(document, path)
+    columns = {key: _column(document, key, path)[:driven] for key in ("timestamp", "position", "goal_position")}
     time = columns["timestamp"] - columns["timestamp"][0]
     position = columns["position"]
     return Demonstration(
@@ -151,20 +151,20 @@ def swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
     )
 
 
-def driven_entries(document: dict[str, Any], path: Path) -> int:
+def _driven_entries(document: dict[str, Any], path: Path) -> int:
     """Return how many entries there are before the motor is let go."""
-    released = [row for row, entry in enumerate(document["entries"]) if isinstance(entry, dict) and not driving(entry)]
+    released = [row for row, entry in enumerate(document["entries"]) if isinstance(entry, dict) and not _driving(entry)]
     if released and released[0] < 2:
         raise RecordingError("the motor is off from the start", where=path, expected="torque_enable true")
     return released[0] if released else len(document["entries"])
 
 
-def driving(entry: dict[str, Any]) -> bool:
+def _driving(entry: dict[str, Any]) -> bool:
     """Return whether the motor drives; it does where nothing is said of it."""
     return bool(entry.get("torque_enable", True))
 
 
-def column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:
+def _column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:
     """Return the numbers of all entries under a key, shape (T,)."""
     entries = document["entries"]
     values = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
@@ -176,7 +176,7 @@ def column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def read_document(path: Path) -> dict[str, Any]:
+def _read_document(path: Path) -> dict[str, Any]:
     """Return the JSON document of a log, with its entries."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise RecordingError("the log is too large", where=path, expected=f"at most {MAX_FILE_BYTES} bytes")
@@ -191,7 +191,7 @@ def read_document(path: Path) -> dict[str, Any]:
     return document
 
 
-def setup_of(document: dict[str, Any], path: Path) -> Setup:
+def _setup_of(document: dict[str, Any], path: Path) -> Setup:
     """Return payload and controller of a log."""
     values = []
     for key in SETUP:

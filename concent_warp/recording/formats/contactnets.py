@@ -48,7 +48,7 @@ def read_contactnets(
         board_height: Height of the board's surface [m] in the frame of the measured positions.
 
     Returns:
-        One demonstration per toss, named ``demo_<number>``, in the scene of `toss_scene`.
+        One demonstration per toss, named ``demo_<number>``, in the scene of `_toss_scene`.
 
     Raises:
         RecordingError: A file is missing, is no plain tensor (a pickle is refused, never run) or has another shape.
@@ -63,13 +63,13 @@ def read_contactnets(
     paths = sorted(path.glob("*.pt"), key=lambda p: by_number(p.stem))[:limit] if path.is_dir() else [path]
     if not 0 < len(paths) <= MAX_DEMONSTRATIONS:
         raise RecordingError("no tosses in the folder", where=path, expected=".pt files", found=len(paths))
-    tosses = tuple(toss(read_rows(p), f"{PREFIX}{p.stem}", period) for p in paths)
-    recording = Recording(toss_scene(board_height), tosses, str(path))
+    tosses = tuple(_toss(_read_rows(p), f"{PREFIX}{p.stem}", period) for p in paths)
+    recording = Recording(_toss_scene(board_height), tosses, str(path))
     validate(recording)
     return recording
 
 
-def toss_scene(board_height: float = 0.0) -> str:
+def _toss_scene(board_height: float = 0.0) -> str:
     """Return the MJCF of a free cube above a board at `board_height` [m]; the gyro reads in the body frame."""
     half = EDGE / 2
     return f"""
@@ -98,7 +98,7 @@ def toss_scene(board_height: float = 0.0) -> str:
 """
 
 
-def toss(rows: np.ndarray, name: str, period: float) -> Demonstration:
+def _toss(rows: np.ndarray, name: str, period: float) -> Demonstration:
     """Return one toss, shape (T, 13), as a demonstration."""
     quaternion, position, angular, linear = np.split(rows, [4, 7, 10], axis=1)
     time = period * np.arange(len(rows))
@@ -117,7 +117,7 @@ def toss(rows: np.ndarray, name: str, period: float) -> Demonstration:
     )
 
 
-def read_rows(path: Path) -> np.ndarray:
+def _read_rows(path: Path) -> np.ndarray:
     """Return the tensor of one toss, shape (T, 13)."""
     if not path.is_file():
         raise RecordingError("no such toss", where=path, expected="a .pt file", fix="check the path")
@@ -125,7 +125,7 @@ def read_rows(path: Path) -> np.ndarray:
         raise RecordingError(
             "not a toss", where=path, expected=f"1 to {MAX_FILE_BYTES} bytes", found=path.stat().st_size
         )
-    tensor = load_tensor(path)
+    tensor = _load_tensor(path)
     import torch
 
     if not isinstance(tensor, torch.Tensor):
@@ -139,7 +139,7 @@ def read_rows(path: Path) -> np.ndarray:
     return tensor.detach().double().numpy()
 
 
-def load_tensor(path: Path) -> torch.Tensor:
+def _load_tensor(path: Path) -> torch.Tensor:
     """Load what a ``.pt`` file holds, as data: a pickle that names code is refused."""
     import pickle
     import warnings

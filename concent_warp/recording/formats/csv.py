@@ -58,14 +58,16 @@ def read_csv(folder: Path) -> Recording:
         scene = Scene.from_mjcf(folder / SCENE).xml
     except SceneError as error:
         raise RecordingError("the scene of the recording cannot be read", found=str(error).rstrip(".")) from None
-    check_size(folder)
-    demonstrations = tuple(read_demonstration(f, f.name) for f in nested) or (read_demonstration(folder, f"{PREFIX}0"),)
+    _check_size(folder)
+    demonstrations = tuple(_read_demonstration(f, f.name) for f in nested) or (
+        _read_demonstration(folder, f"{PREFIX}0"),
+    )
     recording = Recording(scene, demonstrations, str(folder))
     validate(recording)
     return recording
 
 
-def check_size(folder: Path) -> None:
+def _check_size(folder: Path) -> None:
     """Refuse files that are too large, one by one and together, before any is read."""
     total = 0
     for path in folder.rglob("*.csv"):
@@ -75,7 +77,7 @@ def check_size(folder: Path) -> None:
             raise RecordingError("the CSV files are too large", where=path, expected=f"{MAX_FILE_BYTES} bytes a file")
 
 
-def read_demonstration(folder: Path, name: str) -> Demonstration:
+def _read_demonstration(folder: Path, name: str) -> Demonstration:
     """Read the CSV files of one demonstration."""
     action: dict[str, Channel] = {}
     measured: dict[str, Channel] = {}
@@ -90,12 +92,12 @@ def read_demonstration(folder: Path, name: str) -> Demonstration:
     for path in paths:
         kind, _, channel = path.stem.partition("_")
         if path.name == INITIAL:
-            state = read_state(path)
+            state = _read_state(path)
         elif kind == "measured" and channel:
-            table = read_table(path)
+            table = _read_table(path)
             measured[name_of(channel)] = Channel(table[:, 0], table[:, 1:])
         elif kind == "action" and channel:
-            table = read_table(path)
+            table = _read_table(path)
             if table.shape[1] != 2:
                 raise RecordingError(
                     "wrong number of columns", where=path, expected="time and one value", found=table.shape[1]
@@ -111,9 +113,9 @@ def read_demonstration(folder: Path, name: str) -> Demonstration:
     return Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
 
 
-def read_table(path: Path) -> np.ndarray:
+def _read_table(path: Path) -> np.ndarray:
     """Return the numbers below the header of a channel's file, shape (T, columns); the first column is time [s]."""
-    rows = read_rows(path)
+    rows = _read_rows(path)
     header = [cell.strip().lower() for cell in next(rows, (1, []))[1]]
     if len(header) < 2 or header[0] != "time":
         raise RecordingError(
@@ -129,26 +131,26 @@ def read_table(path: Path) -> np.ndarray:
             raise RecordingError(
                 "a row has the wrong number of cells", where=where, expected=len(header), found=len(cells)
             )
-        table.extend(number(cell, path, line, column) for column, cell in zip(header, cells, strict=True))
+        table.extend(_number(cell, path, line, column) for column, cell in zip(header, cells, strict=True))
     if not table:
         raise RecordingError("the file has no rows below its header", where=path, expected="one row per sample")
     return np.array(table).reshape(-1, len(header))
 
 
-def read_state(path: Path) -> dict[str, np.ndarray]:
+def _read_state(path: Path) -> dict[str, np.ndarray]:
     """Read the state at time 0: rows that begin with ``qpos`` and ``qvel``."""
     state: dict[str, np.ndarray] = {}
-    for line, cells in read_rows(path):
+    for line, cells in _read_rows(path):
         key = cells[0].strip()
         if key not in ("qpos", "qvel") or key in state:
             raise RecordingError(
                 "unknown or repeated row", where=f"{path}, line {line}", expected="qpos and qvel, once", found=repr(key)
             )
-        state[key] = np.array([number(cell, path, line, key) for cell in cells[1:]])
+        state[key] = np.array([_number(cell, path, line, key) for cell in cells[1:]])
     return state
 
 
-def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, each with its line number."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -162,7 +164,7 @@ def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise RecordingError("not a CSV file", where=path, expected="UTF-8 text", found=error) from None
 
 
-def number(cell: str, path: Path, line: int, column: str) -> float:
+def _number(cell: str, path: Path, line: int, column: str) -> float:
     """Return the number in a cell; NaN where it is empty."""
     cell = cell.strip()
     if not cell:

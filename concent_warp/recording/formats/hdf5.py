@@ -76,7 +76,7 @@ def write_hdf5(recording: Recording, path: str | Path) -> None:
     partial = path.with_name(f".{path.name}.partial")
     try:
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
-            write_file(file, recording)
+            _write_file(file, recording)
         with partial.open("rb") as written:
             os.fsync(written.fileno())
         partial.replace(path)
@@ -88,14 +88,14 @@ def write_hdf5(recording: Recording, path: str | Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def write_file(file: h5py.File, recording: Recording) -> None:
+def _write_file(file: h5py.File, recording: Recording) -> None:
     """Fill an open file."""
-    file.attrs["format"], file.attrs["version"] = text(FORMAT), VERSION
-    file.create_dataset("scene", data=text(recording.scene))
+    file.attrs["format"], file.attrs["version"] = _text(FORMAT), VERSION
+    file.create_dataset("scene", data=_text(recording.scene))
     data = file.create_group("data")
     for demonstration in recording.demonstrations:
         group = data.create_group(demonstration.name)
-        group.attrs["task"] = text(demonstration.task)
+        group.attrs["task"] = _text(demonstration.task)
         if demonstration.success is not None:
             group.attrs["success"] = bool(demonstration.success)
         for name, value in (("qpos", demonstration.qpos), ("qvel", demonstration.qvel)):
@@ -103,37 +103,37 @@ def write_file(file: h5py.File, recording: Recording) -> None:
                 group.require_group("initial").create_dataset(name, data=np.asarray(value, dtype=float))
         for kind in ("action", "measured", "points", "image"):
             for name, stream in getattr(demonstration, kind).items():
-                write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
+                _write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
 
 
-def write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) -> None:
+def _write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) -> None:
     """Fill the group of one channel, point track or camera."""
-    store(group, "time", np.asarray(stream.time, dtype=float))
+    _store(group, "time", np.asarray(stream.time, dtype=float))
     if isinstance(stream, ImageStream):
-        store(group, "rgb", stream.rgb)
-        store(group, "depth", stream.depth)
+        _store(group, "rgb", stream.rgb)
+        _store(group, "depth", stream.depth)
         group.attrs["intrinsics"] = np.asarray(stream.intrinsics, dtype=float)
         group.attrs["pose"] = np.asarray(stream.pose, dtype=float)
         if stream.body is not None:
-            group.attrs["body"] = text(stream.body)
+            group.attrs["body"] = _text(stream.body)
         return
-    store(group, "value", np.asarray(stream.value, dtype=float))
+    _store(group, "value", np.asarray(stream.value, dtype=float))
     if isinstance(stream, PointTrack):
-        store(group, "visible", stream.visible)
+        _store(group, "visible", stream.visible)
     else:
         if stream.noise_std is not None:
             group.attrs["noise_std"] = float(stream.noise_std)
         if stream.frame is not None:
-            group.attrs["frame"] = text(stream.frame)
+            group.attrs["frame"] = _text(stream.frame)
 
 
-def text(value: str) -> np.ndarray:
+def _text(value: str) -> np.ndarray:
     """Return a string of fixed length: unlike one of variable length, it is covered by the file's checksums."""
     encoded = value.encode()
     return np.array(encoded, dtype=h5py.string_dtype("utf-8", max(1, len(encoded))))
 
 
-def store(group: h5py.Group, name: str, value: np.ndarray) -> None:
+def _store(group: h5py.Group, name: str, value: np.ndarray) -> None:
     """Write one array, compressed and with checksums; images frame by frame."""
     chunks = (1, *value.shape[1:]) if name in ("rgb", "depth") else True
     group.create_dataset(
@@ -253,6 +253,6 @@ class Reader(SafeFile):
         )
 
 
-def reason(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Return what an exception says, in one line."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -28,24 +28,24 @@ def check_heaps(path: Path) -> None:
         RecordingError: The file is not HDF5, has unusual field sizes, or a heap is damaged.
     """
     if path.stat().st_size < len(SIGNATURE):
-        raise not_hdf5(path)
+        raise _not_hdf5(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         start = 0
         while data[start : start + len(SIGNATURE)] != SIGNATURE:
             start = max(512, 2 * start)
             if start >= len(data):
-                raise not_hdf5(path)
+                raise _not_hdf5(path)
         version = data[start + 8 : start + 9]
         widths = data[start + 13 : start + 15] if version in (b"\0", b"\1") else data[start + 9 : start + 11]
         if widths != b"\x08\x08":
             raise RecordingError("the HDF5 file has addresses of an unusual size", where=path, expected="8 bytes each")
         heap = data.find(HEAP)
         while heap >= 0:
-            check_heap(data, heap, path)
+            _check_heap(data, heap, path)
             heap = data.find(HEAP, heap + 1)
 
 
-def check_heap(data: mmap.mmap, start: int, path: Path) -> None:
+def _check_heap(data: mmap.mmap, start: int, path: Path) -> None:
     """Check the collection that begins at `start`."""
     size = int.from_bytes(data[start + 8 : start + HEADER], "little")
     end, position = start + size, start + HEADER
@@ -64,7 +64,7 @@ def check_heap(data: mmap.mmap, start: int, path: Path) -> None:
         )
 
 
-def not_hdf5(path: Path) -> RecordingError:
+def _not_hdf5(path: Path) -> RecordingError:
     """Return the error about a file of another kind."""
     return RecordingError("not an HDF5 file", where=path, fix="check that the file was copied whole")
 

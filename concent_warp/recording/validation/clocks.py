@@ -47,12 +47,12 @@ def check_clocks(demonstration: Demonstration, place: Place) -> None:
     times = measured | commanded
     if not times:
         raise place.error("the demonstration is empty", expected="at least one channel with samples")
-    check_periods(measured, commanded, place)
-    check_start(times, place)
-    check_silence(times, place)
+    _check_periods(measured, commanded, place)
+    _check_start(times, place)
+    _check_silence(times, place)
 
 
-def check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndarray], place: Place) -> None:
+def _check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndarray], place: Place) -> None:
     """Refuse sampling periods that only another unit of time explains."""
     judged = {name: time for name, time in (measured | commanded).items() if len(time) >= JUDGED_SAMPLES}
     period = {name: float(np.median(np.diff(time))) for name, time in judged.items()}
@@ -76,7 +76,7 @@ def check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndarr
             )
 
 
-def check_start(times: dict[str, np.ndarray], place: Place) -> None:
+def _check_start(times: dict[str, np.ndarray], place: Place) -> None:
     """Refuse a clock that was not set to 0 where the demonstration begins, such as seconds since 1970."""
     name = min(times, key=lambda n: times[n][0])
     start, end = times[name][0], max(time[-1] for time in times.values())
@@ -90,7 +90,7 @@ def check_start(times: dict[str, np.ndarray], place: Place) -> None:
         )
 
 
-def check_silence(times: dict[str, np.ndarray], place: Place) -> None:
+def _check_silence(times: dict[str, np.ndarray], place: Place) -> None:
     """Refuse channels whose clocks lie apart."""
     judged = sorted((time[0], time[-1], name) for name, time in times.items() if len(time) >= JUDGED_SAMPLES)
     covered, gaps, end = 0.0, [], None

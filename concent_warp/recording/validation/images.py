@@ -35,26 +35,26 @@ def check_image(stream: ImageStream, model: mujoco.MjModel, place: Place) -> Non
                 "a depth is not a distance",
                 row=row,
                 expected="finite metres, 0 where there is none",
-                found=worst(frame),
+                found=_worst(frame),
             )
     middle = depth[count // 2].ravel()
     check_lengths(middle[middle > 0], model, place)
-    check_intrinsics(stream.intrinsics, shape[2], shape[1], place)
-    check_pose(stream.pose, model, place)
+    _check_intrinsics(stream.intrinsics, shape[2], shape[1], place)
+    _check_pose(stream.pose, model, place)
     names = [model.body(i).name for i in range(model.nbody)]
     if stream.body is not None and stream.body not in names:
         raise place.error("the camera is on a body that the scene lacks", expected=f"one of {names}", found=stream.body)
 
 
-def worst(frame: np.ndarray) -> float:
+def _worst(frame: np.ndarray) -> float:
     """Return a value of a depth frame that is not a distance."""
     return float(frame[~(np.isfinite(frame) & (frame >= 0))][0])
 
 
-def check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) -> None:
+def _check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) -> None:
     """Check a pinhole matrix [px], shape (3, 3), for images of `width` x `height`."""
     matrix = np.asarray(matrix)
-    if matrix.shape != (3, 3) or not usable(matrix):
+    if matrix.shape != (3, 3) or not _usable(matrix):
         raise place.error("intrinsics are not right", expected="(3, 3) finite numbers", found=f"{matrix.shape}")
     focal, centre = np.array([matrix[0, 0], matrix[1, 1]]), np.array([matrix[0, 2], matrix[1, 2]])
     size = np.array([width, height])
@@ -66,10 +66,10 @@ def check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) 
         raise place.error("the principal point is far outside the image", expected=f"px within {size}", found=centre)
 
 
-def check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
     """Check a camera-to-world transform, shape (4, 4)."""
     pose = np.asarray(pose)
-    if pose.shape != (4, 4) or not usable(pose):
+    if pose.shape != (4, 4) or not _usable(pose):
         raise place.error("the camera pose is not right", expected="(4, 4) finite numbers", found=f"{pose.shape}")
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise place.error(
@@ -90,6 +90,6 @@ def check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
     check_lengths(np.linalg.norm(pose[None, :3, 3], axis=1), model, place)
 
 
-def usable(matrix: np.ndarray) -> bool:
+def _usable(matrix: np.ndarray) -> bool:
     """Return whether a matrix holds finite numbers of a sane size."""
     return matrix.dtype.kind in "fiu" and bool((np.abs(matrix) <= MAX_MAGNITUDE).all())

@@ -41,7 +41,7 @@ SPEED_SENSORS = (
 )
 
 
-def far(model: mujoco.MjModel) -> float:
+def _far(model: mujoco.MjModel) -> float:
     """Return the distance [m] above which positions in this scene cannot be metres."""
     return max(FAR, FAR_EXTENTS * float(model.stat.extent))
 
@@ -49,10 +49,10 @@ def far(model: mujoco.MjModel) -> float:
 def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
     """Check distances from the origin, or between things, [m], shape (n,), NaN where missing."""
     length = length[np.isfinite(length)]
-    if len(length) and (quartile := float(np.quantile(length, 0.25))) > far(model):
+    if len(length) and (quartile := float(np.quantile(length, 0.25))) > _far(model):
         raise place.error(
             "its positions look like millimetres",
-            expected=f"metres, three quarters of them not beyond {far(model):.3g} m",
+            expected=f"metres, three quarters of them not beyond {_far(model):.3g} m",
             found=f"{quartile:.4g} m",
             fix="write metres",
         )
@@ -65,7 +65,7 @@ def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: Place) -> No
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             check_lengths(np.linalg.norm(qpos[None, start : start + 3], axis=1), model, place)
         else:
-            check_joint(qpos[start : start + 1], model, joint, place)
+            _check_joint(qpos[start : start + 1], model, joint, place)
 
 
 def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, place: Place) -> None:
@@ -76,9 +76,9 @@ def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, pla
     elif kind in DISTANCE_SENSORS:
         check_lengths(np.abs(value[:, 0]), model, place)
     elif kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
-        check_joint(value[:, 0], model, int(model.sensor_objid[sensor]), place)
+        _check_joint(value[:, 0], model, int(model.sensor_objid[sensor]), place)
     elif kind == mujoco.mjtSensor.mjSENS_TENDONPOS:
-        check_tendon(value[:, 0], model, int(model.sensor_objid[sensor]), place)
+        _check_tendon(value[:, 0], model, int(model.sensor_objid[sensor]), place)
     elif kind in SPEED_SENSORS:
         speed = np.linalg.norm(np.nan_to_num(value), axis=1)
         row = int(speed.argmax())
@@ -100,19 +100,19 @@ def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place
         return
     target = int(model.actuator_trnid[actuator, 0])
     if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-        check_joint(value, model, target, place)
+        _check_joint(value, model, target, place)
     elif model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON:
-        check_tendon(value, model, target, place)
+        _check_tendon(value, model, target, place)
 
 
-def check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: Place) -> None:
+def _check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: Place) -> None:
     """Check positions of a hinge [rad] or slide [m], shape (T,), against its range, where it has one."""
     if model.jnt_limited[joint]:
         low, high = (float(bound) for bound in model.jnt_range[joint])
-        check_range(value, low, high, int(model.jnt_type[joint]), f"joint {model.joint(joint).name!r}", place)
+        _check_range(value, low, high, int(model.jnt_type[joint]), f"joint {model.joint(joint).name!r}", place)
 
 
-def check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: Place) -> None:
+def _check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: Place) -> None:
     """Check lengths of a fixed tendon, shape (T,), against what the ranges of its joints allow.
 
     The joints must all be limited and of one type.
@@ -125,10 +125,10 @@ def check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: P
     if len(kinds) == 1 and model.jnt_limited[joints].all():
         ends = model.wrap_prm[rows, None] * model.jnt_range[joints]
         low, high = float(ends.min(axis=1).sum()), float(ends.max(axis=1).sum())
-        check_range(value, low, high, kinds.pop(), f"tendon {model.tendon(tendon).name!r}", place)
+        _check_range(value, low, high, kinds.pop(), f"tendon {model.tendon(tendon).name!r}", place)
 
 
-def check_range(value: np.ndarray, low: float, high: float, kind: int, name: str, place: Place) -> None:
+def _check_range(value: np.ndarray, low: float, high: float, kind: int, name: str, place: Place) -> None:
     """Check positions [rad or m], shape (T,), of a hinge or slide joint, or a tendon over some, of a given range."""
     if kind == mujoco.mjtJoint.mjJNT_HINGE:
         allowed, guess, unit, fix = TURN, "degrees", "rad", "write radians"

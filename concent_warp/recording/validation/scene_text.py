@@ -31,11 +31,11 @@ def check_scene_text(text: str, place: Place) -> None:
     stack = [(root, 1)]
     while stack:
         element, copies = stack.pop()
-        copies = check_element(element, copies, place)
+        copies = _check_element(element, copies, place)
         stack.extend((child, copies) for child in element)
 
 
-def check_element(element: ElementTree.Element, copies: int, place: Place) -> int:
+def _check_element(element: ElementTree.Element, copies: int, place: Place) -> int:
     """Check one element; `copies` counts how often those around it repeat it, the result how often it does in turn."""
     if element.tag == "include" or "file" in element.attrib:
         raise place.error(
@@ -53,12 +53,12 @@ def check_element(element: ElementTree.Element, copies: int, place: Place) -> in
                 f"<{element.tag}> asks for too many copies", expected=f"at most {MAX_SCENE_COPIES}", found=copies
             )
     for key, value in element.attrib.items():
-        if key not in FREE_TEXT and not_finite(value):
+        if key not in FREE_TEXT and _not_finite(value):
             raise place.error(f"<{element.tag} {key}> is not finite", expected="finite numbers", found=value)
     return copies
 
 
-def not_finite(text: str) -> bool:
+def _not_finite(text: str) -> bool:
     """Return whether a text is a list of numbers one of which is not finite."""
     try:
         return not all(math.isfinite(float(part)) for part in text.split())

@@ -42,7 +42,7 @@ def validate(recording: Recording) -> None:
         RecordingError: The first thing that is wrong, with file, demonstration, channel and row (counted from 0).
     """
     place = Place(recording.source)
-    model = compile_scene(recording)
+    model = _compile_scene(recording)
     if not recording.demonstrations:
         raise place.error("the recording holds no demonstration", expected="at least one")
     seen: set[str] = set()
@@ -55,10 +55,10 @@ def validate(recording: Recording) -> None:
         if name in seen:
             raise place.error("two demonstrations have the same name", found=repr(name))
         seen.add(name)
-        check_demonstration(demonstration, model, Place(recording.source, name))
+        _check_demonstration(demonstration, model, Place(recording.source, name))
 
 
-def compile_scene(recording: Recording) -> mujoco.MjModel:
+def _compile_scene(recording: Recording) -> mujoco.MjModel:
     """Return the compiled scene of a recording, or raise `RecordingError`."""
     place = Place(recording.source, channel="scene")
     check_scene_text(recording.scene, place)
@@ -69,30 +69,30 @@ def compile_scene(recording: Recording) -> mujoco.MjModel:
         raise place.error(reason, fix="mend the MJCF in the recording") from None
 
 
-def check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
     """Check one demonstration against the compiled scene."""
     if demonstration.success is not None and not isinstance(demonstration.success, bool | np.bool_):
         raise place.error("success is not a truth value", expected="True or False", found=demonstration.success)
-    check_initial(demonstration, model, place)
+    _check_initial(demonstration, model, place)
     for name, channel in demonstration.action.items():
-        check_action(channel, model, name, place.at(f"action/{name}"))
+        _check_action(channel, model, name, place.at(f"action/{name}"))
     for name, channel in demonstration.measured.items():
-        check_measured(channel, model, name, place.at(f"measured/{name}"))
+        _check_measured(channel, model, name, place.at(f"measured/{name}"))
     for name, track in demonstration.points.items():
-        check_points(track, model, name, place.at(f"points/{name}"))
+        _check_points(track, model, name, place.at(f"points/{name}"))
     for name, stream in demonstration.image.items():
-        check_time(stream.time, place.at(f"image/{name}"))
+        _check_time(stream.time, place.at(f"image/{name}"))
         check_image(stream, model, place.at(f"image/{name}"))
     check_clocks(demonstration, place)
 
 
-def check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
     """Check the state at time 0: sizes, finite values, unit quaternions, units."""
     for name, value, size in (("qpos", demonstration.qpos, model.nq), ("qvel", demonstration.qvel, model.nv)):
         if value is None:
             continue
-        check_shape(value, (size,), place.at(f"initial/{name}"), fix=f"write one number per {name} of the scene")
-        check_finite(value, place.at(f"initial/{name}"), missing_allowed=False)
+        _check_shape(value, (size,), place.at(f"initial/{name}"), fix=f"write one number per {name} of the scene")
+        _check_finite(value, place.at(f"initial/{name}"), missing_allowed=False)
     if demonstration.qpos is None:
         return
     qpos = np.asarray(demonstration.qpos, dtype=float)
@@ -113,53 +113,53 @@ def check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Pl
     check_positions(qpos, model, place.at("initial/qpos"))
 
 
-def check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
     """Check one commanded channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
     if row < 0:
         known = [model.actuator(i).name for i in range(model.nu)]
-        raise place.error("the scene has no such actuator", expected=one_of(known), found=repr(name))
-    check_time(channel.time, place)
-    check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
-    check_finite(channel.value, place, missing_allowed=False)
+        raise place.error("the scene has no such actuator", expected=_one_of(known), found=repr(name))
+    _check_time(channel.time, place)
+    _check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
+    _check_finite(channel.value, place, missing_allowed=False)
     check_command(np.asarray(channel.value), model, row, place)
 
 
-def check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
     """Check one measured channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
         known = [model.sensor(i).name for i in range(model.nsensor)]
-        raise place.error("the scene has no such sensor", expected=one_of(known), found=repr(name))
-    check_time(channel.time, place)
-    check_shape(
+        raise place.error("the scene has no such sensor", expected=_one_of(known), found=repr(name))
+    _check_time(channel.time, place)
+    _check_shape(
         channel.value,
         (len(channel.time), int(model.sensor_dim[row])),
         place,
         fix="write one row per time and one column per number of the sensor",
     )
-    check_finite(channel.value, place, missing_allowed=True)
+    _check_finite(channel.value, place, missing_allowed=True)
     value = np.asarray(channel.value)
     if channel.noise_std is not None and not 0 <= channel.noise_std <= MAX_MAGNITUDE:
         raise place.error("noise_std is not a standard deviation", expected=">= 0", found=channel.noise_std)
     if model.sensor_type[row] in QUATERNION_SENSORS:
-        check_quaternions(value, place)
+        _check_quaternions(value, place)
     check_measurement(value, model, row, place)
 
 
-def check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Place) -> None:
     """Check the tracked points of one body."""
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
         known = [model.body(i).name for i in range(1, model.nbody)]
-        raise place.error("the scene has no such body", expected=one_of(known), found=repr(name))
-    check_time(track.time, place)
+        raise place.error("the scene has no such body", expected=_one_of(known), found=repr(name))
+    _check_time(track.time, place)
     shape = np.shape(track.value)
     if len(shape) != 3 or shape[2] != 3 or shape[0] != len(track.time) or shape[1] == 0:
         raise place.error("wrong shape of the points", expected=f"({len(track.time)}, M, 3)", found=shape)
     if np.shape(track.visible) != shape[:2] or np.asarray(track.visible).dtype != bool:
         found = f"{np.shape(track.visible)} {np.asarray(track.visible).dtype}"
         raise place.error("visible does not fit the points", expected=f"{shape[:2]} bool", found=found)
-    check_finite(track.value, place, missing_allowed=True)
+    _check_finite(track.value, place, missing_allowed=True)
     seen = np.asarray(track.visible)
     if not seen.any():
         raise place.error("no point is visible in any frame", fix="leave the channel out")
@@ -170,18 +170,18 @@ def check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Pla
     check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place)
 
 
-def check_time(time: np.ndarray, place: Place) -> None:
+def _check_time(time: np.ndarray, place: Place) -> None:
     """Check clock readings [s], shape (T,): finite, not negative, strictly increasing."""
     time = np.asarray(time)
     if time.ndim != 1 or time.dtype.kind not in "fiu":
         raise place.error("wrong shape of time", expected="(T,) numbers", found=f"{time.shape} {time.dtype}")
     if not 0 < len(time) <= MAX_SAMPLES:
         raise place.error("wrong number of samples", expected=f"1 to {MAX_SAMPLES}", found=len(time))
-    if (bad := first(~(np.abs(time) <= MAX_MAGNITUDE))) is not None:
+    if (bad := _first(~(np.abs(time) <= MAX_MAGNITUDE))) is not None:
         raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
     if time[0] < 0:
         raise place.error("time is negative", row=0, expected=">= 0 s", found=f"{time[0]:g} s", fix="count from 0")
-    if (bad := first(time[1:] <= time[:-1])) is not None:
+    if (bad := _first(time[1:] <= time[:-1])) is not None:
         raise place.error(
             "time does not increase",
             row=bad + 1,
@@ -191,7 +191,7 @@ def check_time(time: np.ndarray, place: Place) -> None:
         )
 
 
-def check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: str) -> None:
+def _check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: str) -> None:
     """Check that values are numbers of a given shape."""
     found = np.asarray(value)
     if found.shape != shape or found.dtype.kind not in "fiu":
@@ -199,10 +199,10 @@ def check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: st
         raise place.error("wrong shape of the values", expected=shape, found=f"{found.shape}{kind}", fix=fix)
 
 
-def check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> None:
+def _check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> None:
     """Refuse infinities, a channel without any value and, unless `missing_allowed`, every NaN."""
     value = np.asarray(value, dtype=float)
-    if (bad := first(np.abs(value) > MAX_MAGNITUDE)) is not None:
+    if (bad := _first(np.abs(value) > MAX_MAGNITUDE)) is not None:
         found = value.reshape(len(value), -1)[bad]
         raise place.error(
             "a value is infinite" if np.isinf(found).any() else "a value is absurdly large",
@@ -213,7 +213,7 @@ def check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> N
     missing = np.isnan(value)
     if missing.all():
         raise place.error("every value is missing", expected="numbers", found="only NaN", fix="leave the channel out")
-    if not missing_allowed and (bad := first(missing)) is not None:
+    if not missing_allowed and (bad := _first(missing)) is not None:
         run = int(missing.reshape(len(value), -1).any(axis=1).sum())
         raise place.error(
             f"{run} of {len(value)} values are missing",
@@ -224,13 +224,13 @@ def check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> N
         )
 
 
-def check_quaternions(value: np.ndarray, place: Place) -> None:
+def _check_quaternions(value: np.ndarray, place: Place) -> None:
     """Check quaternions, shape (T, 4): whole or missing, and of unit length."""
     missing = np.count_nonzero(np.isnan(value), axis=1)
-    if (bad := first((missing > 0) & (missing < 4))) is not None:
+    if (bad := _first((missing > 0) & (missing < 4))) is not None:
         raise place.error("a quaternion is missing in part", row=bad, expected="four numbers or four NaN")
     norm = np.sqrt((value**2).sum(axis=1))
-    if (bad := first(np.asarray(np.abs(norm - 1) > QUATERNION_TOLERANCE))) is not None:
+    if (bad := _first(np.asarray(np.abs(norm - 1) > QUATERNION_TOLERANCE))) is not None:
         raise place.error(
             "a quaternion is not of unit length",
             row=bad,
@@ -240,13 +240,13 @@ def check_quaternions(value: np.ndarray, place: Place) -> None:
         )
 
 
-def first(wrong: np.ndarray) -> int | None:
+def _first(wrong: np.ndarray) -> int | None:
     """Return the first row of an array of any shape that holds a True, or None."""
     rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1)) if wrong.size else np.empty(0, int)
     return int(rows[0]) if len(rows) else None
 
 
-def one_of(names: list[str], limit: int = 12) -> str:
+def _one_of(names: list[str], limit: int = 12) -> str:
     """Return a list of known names for a message, cut at `limit`."""
     named = [name for name in names if name]
     if not named:

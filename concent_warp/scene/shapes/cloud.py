@@ -60,14 +60,14 @@ class PointCloud(Solid):
         if not np.isfinite(points).all():
             raise SceneError("the point cloud holds coordinates that are not finite", where=name)
         first = np.unique(points, axis=0, return_index=True)[1]
-        first = first[thinned(points[first], MOST)]
+        first = first[_thinned(points[first], MOST)]
         points = points[first]
         if len(points) < FEWEST:
             raise SceneError(
                 "too few different points for a surface", where=name, expected=f"at least {FEWEST}", found=len(points)
             )
         if normals is None:
-            return PointCloud(points, outward_normals(points))
+            return PointCloud(points, _outward_normals(points))
         normals = np.asarray(normals, dtype=float)[first]
         return PointCloud(points, unit(normals, np.linalg.norm(normals, axis=1)))
 
@@ -109,7 +109,7 @@ def nearest_points(tree: Any, points: np.ndarray, count: int) -> tuple[np.ndarra
     return tree.query(points, k=[*range(1, count + 1)])
 
 
-def outward_normals(points: np.ndarray) -> np.ndarray:
+def _outward_normals(points: np.ndarray) -> np.ndarray:
     """Estimate outward normals of surface points, shape (n, 3).
 
     Directions are those of least spread among the nearest points. Signs are voted for: seen from each of many places
@@ -125,7 +125,7 @@ def outward_normals(points: np.ndarray) -> np.ndarray:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     reach = float(np.linalg.norm(points - middle, axis=1).max())
     votes = np.zeros(len(points))
-    for direction in fibonacci_sphere(VIEWS):
+    for direction in _fibonacci_sphere(VIEWS):
         ray = (points - middle) / reach - 4 * direction
         length = np.linalg.norm(ray, axis=1, keepdims=True)
         ray /= length
@@ -143,7 +143,7 @@ def outward_normals(points: np.ndarray) -> np.ndarray:
     return normals * np.where(votes < 0, -1, 1)[:, None]
 
 
-def fibonacci_sphere(count: int) -> np.ndarray:
+def _fibonacci_sphere(count: int) -> np.ndarray:
     """Return unit vectors spread evenly over the sphere, shape (count, 3)."""
     step = np.arange(count) + 0.5
     height = 1 - 2 * step / count
@@ -152,7 +152,7 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
 
 
-def thinned(points: np.ndarray, most: int) -> np.ndarray:
+def _thinned(points: np.ndarray, most: int) -> np.ndarray:
     """Return the indices of at most `most` points (n, 3), one of each cell of a grid where there are more."""
     if len(points) <= most:
         return np.arange(len(points))

@@ -40,17 +40,17 @@ class MeshSolid(Solid):
     @property
     def area(self) -> float:
         """Area of the surface [m^2]."""
-        return float(areas(self.vertices[self.faces]).sum())
+        return float(_areas(self.vertices[self.faces]).sum())
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """See `Solid.sample`."""
         corners = self.vertices[self.faces]
-        weight = areas(corners)
+        weight = _areas(corners)
         face = rng.choice(len(corners), size=count, p=weight / weight.sum())
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
-        return a + u * (b - a) + v * (c - a), face_normals(corners)[face]
+        return a + u * (b - a) + v * (c - a), _face_normals(corners)[face]
 
     @cached_property
     def search(self) -> wp.Mesh:
@@ -89,11 +89,11 @@ class MeshSolid(Solid):
         wp.launch(nearest_face, len(scaled), inputs=inputs, device="cpu")
         corners = self.vertices[self.faces[face]]
         sign = side.astype(float)
-        away = points - nearest_on_triangles(points, corners)
+        away = points - _nearest_on_triangles(points, corners)
         length = np.linalg.norm(away, axis=1)
         touching = length < TOUCHING * self.extent
         gradient = unit(sign[:, None] * away, length)
-        return sign * length, np.where(touching[:, None], face_normals(corners), gradient)
+        return sign * length, np.where(touching[:, None], _face_normals(corners), gradient)
 
 
 def closed_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
@@ -130,19 +130,19 @@ def hull(points: np.ndarray, name: str) -> trimesh.Trimesh:
     raise SceneError("the points span no volume", where=name, expected="points that are not all in one plane")
 
 
-def areas(corners: np.ndarray) -> np.ndarray:
+def _areas(corners: np.ndarray) -> np.ndarray:
     """Return areas [m^2], shape (n,), of triangles (n, 3, 3)."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.linalg.norm(cross, axis=1) / 2
 
 
-def face_normals(corners: np.ndarray) -> np.ndarray:
+def _face_normals(corners: np.ndarray) -> np.ndarray:
     """Return unit normals, shape (n, 3), of triangles (n, 3, 3)."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return unit(cross, np.linalg.norm(cross, axis=1))
 
 
-def nearest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def _nearest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return the point of each triangle (n, 3, 3) that is nearest to each point (n, 3) [m], shape (n, 3).
 
     By the regions of the plane in which a corner, an edge or the inside is nearest (Ericson, "Real-Time Collision
@@ -150,9 +150,9 @@ def nearest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac = b - a, c - a
-    d1, d2 = dot(ab, points - a), dot(ac, points - a)
-    d3, d4 = dot(ab, points - b), dot(ac, points - b)
-    d5, d6 = dot(ab, points - c), dot(ac, points - c)
+    d1, d2 = _dot(ab, points - a), _dot(ac, points - a)
+    d3, d4 = _dot(ab, points - b), _dot(ac, points - b)
+    d5, d6 = _dot(ab, points - c), _dot(ac, points - c)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     whole = va + vb + vc
     whole = np.where(whole > 0, whole, 1.0)
@@ -174,6 +174,6 @@ def nearest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return a + v[:, None] * ab + w[:, None] * ac
 
 
-def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the dot products of rows, shape (n, 3) -> (n,)."""
     return np.einsum("nd,nd->n", first, second)

@@ -130,14 +130,14 @@ def load_object(
     points: np.ndarray | None = None
     if suffix in MESHES or (suffix == ".ply" and read_header(path).count("face")):
         mesh = read_mesh(path)
-        check_size(mesh.bounds * scale, path, scale)
+        _check_size(mesh.bounds * scale, path, scale)
         mesh.apply_scale(scale)
         mesh = closed_mesh(mesh, str(path))
     elif suffix == ".ply" or suffix in CLOUDS:
         points = read_points(path, opacity) * scale
         if len(points) < 4:
             raise SceneError("too few points for an object", where=path, expected="at least 4", found=len(points))
-        check_size(np.array([points.min(axis=0), points.max(axis=0)]), path, scale)
+        _check_size(np.array([points.min(axis=0), points.max(axis=0)]), path, scale)
         mesh = hull(points, str(path))
     else:
         raise SceneError(
@@ -198,7 +198,7 @@ def read_points(path: Path, opacity: float = 0.5) -> np.ndarray:
     return points[:, :3]
 
 
-def check_size(bounds: np.ndarray, path: Path, scale: float) -> None:
+def _check_size(bounds: np.ndarray, path: Path, scale: float) -> None:
     """Refuse an object whose size speaks of another unit; `bounds` [m] has shape (2, 3)."""
     extent = float(np.ptp(bounds, axis=0).max())
     if extent > LARGEST:

@@ -98,7 +98,7 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
             break
         if element.has_list and element.count:
             raise SceneError("the vertices follow lists of unknown length", where=path, expected="vertices first")
-        before += element.count * (1 if header.format == "ascii" else row_type(element, "<").itemsize)
+        before += element.count * (1 if header.format == "ascii" else _row_type(element, "<").itemsize)
     else:
         raise SceneError("the PLY file has no vertices", where=path, expected="'element vertex'")
     if not 0 < element.count <= MOST_VERTICES:
@@ -112,9 +112,9 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
     if len(set(names)) < len(names):
         raise SceneError("a vertex property occurs twice", where=path, found=names)
     if header.format == "ascii":
-        table = read_ascii(path, header, before, element)
+        table = _read_ascii(path, header, before, element)
         return {name: table[:, k] for k, name in enumerate(names)}
-    row = row_type(element, ORDERS[header.format])
+    row = _row_type(element, ORDERS[header.format])
     needed, found = header.size + before + element.count * row.itemsize, path.stat().st_size
     if found < needed:
         raise SceneError("the PLY file is cut short", where=path, expected=f"at least {needed} bytes", found=found)
@@ -122,7 +122,7 @@ def read_vertices(path: Path) -> dict[str, np.ndarray]:
     return {name: rows[name].astype(float) for name in names}
 
 
-def read_ascii(path: Path, header: PlyHeader, before: int, element: PlyElement) -> np.ndarray:
+def _read_ascii(path: Path, header: PlyHeader, before: int, element: PlyElement) -> np.ndarray:
     """Read the vertex rows of an ASCII file, shape (count, properties)."""
     with path.open("rb") as file:
         file.seek(header.size)
@@ -139,6 +139,6 @@ def read_ascii(path: Path, header: PlyHeader, before: int, element: PlyElement) 
     return table
 
 
-def row_type(element: PlyElement, order: str) -> np.dtype:
+def _row_type(element: PlyElement, order: str) -> np.dtype:
     """Return the NumPy type of one row of an element without lists."""
     return np.dtype([(name, order + kind) for name, kind in element.properties])

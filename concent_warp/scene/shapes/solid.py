@@ -122,11 +122,11 @@ class Capsule(Solid):
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """See `Solid.sample`."""
-        normals = directions(count, rng)
+        normals = _directions(count, rng)
         points = self.radius * normals
         points[:, 2] += np.where(normals[:, 2] < 0, -1, 1) * self.half_length
         side = rng.random(count) < self.half_length / (self.half_length + self.radius)
-        ring = circle(count, rng)
+        ring = _circle(count, rng)
         normals[side] = ring[side]
         points[side] = self.radius * ring[side]
         points[side, 2] = rng.uniform(-1, 1, count)[side] * self.half_length
@@ -166,7 +166,7 @@ class Cylinder(Solid):
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """See `Solid.sample`."""
-        normals = circle(count, rng)
+        normals = _circle(count, rng)
         points = self.radius * normals
         points[:, 2] = rng.uniform(-1, 1, count) * self.half_length
         end = rng.random(count) < self.radius / (self.radius + 2 * self.half_length)
@@ -232,7 +232,7 @@ class Ellipsoid(Solid):
         most = float(np.prod(self.half)) / self.half.min()
         kept: list[np.ndarray] = []
         while sum(map(len, kept)) < count:
-            direction = directions(2 * count, rng)
+            direction = _directions(2 * count, rng)
             kept.append(direction[rng.random(2 * count) * most < self.stretch(direction)])
         direction = np.concatenate(kept)[:count]
         normals = direction / self.half
@@ -247,13 +247,13 @@ def unit(vectors: np.ndarray, length: np.ndarray, fallback: tuple[float, float, 
     return divided
 
 
-def directions(count: int, rng: np.random.Generator) -> np.ndarray:
+def _directions(count: int, rng: np.random.Generator) -> np.ndarray:
     """Draw unit vectors uniformly from the sphere, shape (count, 3)."""
     vectors = rng.standard_normal((count, 3))
     return unit(vectors, np.linalg.norm(vectors, axis=1))
 
 
-def circle(count: int, rng: np.random.Generator) -> np.ndarray:
+def _circle(count: int, rng: np.random.Generator) -> np.ndarray:
     """Draw unit vectors uniformly from the circle in the xy plane, shape (count, 3)."""
     angle = rng.uniform(0, 2 * np.pi, count)
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)

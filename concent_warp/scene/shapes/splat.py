@@ -96,11 +96,11 @@ def read_splats(path: Path) -> GaussianSplats:
         scale=np.exp(log_scale),
         rotation=rotation / length[:, None],
         opacity=1 / (1 + np.exp(-np.clip(values["opacity"], -500, 500))),
-        harmonics=read_harmonics(values, path),
+        harmonics=_read_harmonics(values, path),
     )
 
 
-def read_harmonics(values: dict[str, np.ndarray], path: Path) -> np.ndarray:
+def _read_harmonics(values: dict[str, np.ndarray], path: Path) -> np.ndarray:
     """Return the harmonics among the properties of a file, shape (N, K, 3); zeros where it has no colour."""
     constant = [f"f_dc_{k}" for k in range(3)]
     count = sum(name.startswith("f_rest_") for name in values)

@@ -56,7 +56,7 @@ class Surface:
             raise SceneError(
                 f"body {body!r} has no geoms to sample a surface from", where=scene.source, fix="give it a geom"
             )
-        solids = tuple(geom_solid(scene, int(g)) for g in geoms)
+        solids = tuple(_geom_solid(scene, int(g)) for g in geoms)
         return Surface(solids, model.geom_friction[geoms, 0].copy(), body)
 
     @staticmethod
@@ -132,7 +132,7 @@ class Surface:
         return points, normals, outer
 
 
-def geom_solid(scene: Scene, geom: int) -> Solid:
+def _geom_solid(scene: Scene, geom: int) -> Solid:
     """Return the solid of one geom of the compiled scene, in the frame of its body."""
     model = scene.model
     size = model.geom_size[geom]

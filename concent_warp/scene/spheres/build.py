@@ -116,14 +116,14 @@ class ContactGeometryCfg:
                 found=left,
             )
         weight = np.array([surfaces[name].area if self.split == "area" else 1.0 for name in rest])
-        extra = apportion(left - len(rest), weight) if rest else []
+        extra = _apportion(left - len(rest), weight) if rest else []
         return {**self.counts, **{name: 1 + int(n) for name, n in zip(rest, extra, strict=True)}}
 
     def build_body(
         self, scene: Scene, name: str, surface: Surface, count: int, rng: np.random.Generator
     ) -> ContactGeometry:
         """Lay `count` spheres on one body."""
-        wanted = self.radius if self.radius != "auto" else spacing(surface.area, count) / 2
+        wanted = self.radius if self.radius != "auto" else _spacing(surface.area, count) / 2
         points, _ = surface.sample(max(self.candidates, count), rng)
         radius = np.full(len(points), wanted)
         if self.placement == "inset":
@@ -154,12 +154,12 @@ class ContactGeometryCfg:
         return ContactGeometry((name,), np.zeros(count, dtype=int), points, radius, split.mass, friction)
 
 
-def spacing(area: float, count: int) -> float:
+def _spacing(area: float, count: int) -> float:
     """Return the spacing [m] of `count` points in a hexagonal lattice over an area [m^2]."""
     return float(np.sqrt(2 * area / (np.sqrt(3) * count)))
 
 
-def apportion(total: int, weight: np.ndarray) -> np.ndarray:
+def _apportion(total: int, weight: np.ndarray) -> np.ndarray:
     """Split `total` into whole numbers in proportion to weights (n,), the largest remainders rounded up, shape (n,)."""
     ideal = total * weight / weight.sum()
     parts = np.floor(ideal).astype(int)

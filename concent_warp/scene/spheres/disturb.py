@@ -35,7 +35,7 @@ def disturb(
     """
     noise = position_std * rng.standard_normal(geometry.position.shape)
     if bodies is not None:
-        noise[~np.isin(geometry.body, [body_index(geometry, name) for name in bodies])] = 0
+        noise[~np.isin(geometry.body, [_body_index(geometry, name) for name in bodies])] = 0
     return geometry.with_position(geometry.position + noise)
 
 
@@ -68,7 +68,7 @@ def offset_normal(
     from scipy.spatial import KDTree
 
     surface = surface or Surface.of_body(scene, body)
-    mine = np.flatnonzero(geometry.body == body_index(geometry, body))
+    mine = np.flatnonzero(geometry.body == _body_index(geometry, body))
     points, normals = surface.sample(PROBES, np.random.default_rng(0))
     meant = select(points, normals)
     points, normals = points[meant], normals[meant]
@@ -107,7 +107,7 @@ def toward_axis(
     return select
 
 
-def body_index(geometry: ContactGeometry, name: str) -> int:
+def _body_index(geometry: ContactGeometry, name: str) -> int:
     """Return the index of a body of the geometry."""
     if name not in geometry.bodies:
         raise ModelError(f"the contact geometry has no body {name!r}", expected=f"one of {list(geometry.bodies)}")

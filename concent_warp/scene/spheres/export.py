@@ -39,7 +39,7 @@ class Exportable(Protocol):
         ...
 
 
-def export_mjcf(model: Exportable) -> str:
+def _export_mjcf(model: Exportable) -> str:
     """Return self-contained MJCF of a model: the scene's text, with its spheres added.
 
     It simulates as the model does. The spheres have the names of `ContactGeometry.names` and weigh nothing; each body
@@ -60,52 +60,52 @@ def export_mjcf(model: Exportable) -> str:
         if body not in elements:
             raise ModelError(f"body {body!r} is not in the scene's text", where=model.scene.source)
         element = elements[body]
-        for geom in geoms_of(element):
+        for geom in _geoms_of(element):
             geom.set("contype", "0")
             geom.set("conaffinity", "0")
-        write_inertial(element, compiled, body)
+        _write_inertial(element, compiled, body)
         for i in geometry.of(body):
-            element.append(sphere(compiled, names[i]))
+            element.append(_sphere(compiled, names[i]))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def save_mjcf(model: Exportable, path: Path) -> None:
-    """Write `export_mjcf` to a file, in one piece or not at all."""
-    text = export_mjcf(model)
+    """Write `_export_mjcf` to a file, in one piece or not at all."""
+    text = _export_mjcf(model)
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text)
     partial.replace(path)
 
 
-def geoms_of(body: ET.Element) -> Iterator[ET.Element]:
+def _geoms_of(body: ET.Element) -> Iterator[ET.Element]:
     """Yield the geoms of a body and not those of its children."""
     for child in body:
         if child.tag == "geom":
             yield child
         elif child.tag in ("frame", "replicate"):
-            yield from geoms_of(child)
+            yield from _geoms_of(child)
 
 
-def write_inertial(element: ET.Element, compiled: mujoco.MjModel, body: str) -> None:
+def _write_inertial(element: ET.Element, compiled: mujoco.MjModel, body: str) -> None:
     """Replace the inertia of a body by the compiled one."""
     for old in element.findall("inertial"):
         element.remove(old)
     row = compiled.body(body)
     if row.mass[0] > 0:
         values = {"pos": row.ipos, "quat": row.iquat, "mass": row.mass, "diaginertia": row.inertia}
-        element.insert(0, ET.Element("inertial", {name: numbers(value) for name, value in values.items()}))
+        element.insert(0, ET.Element("inertial", {name: _numbers(value) for name, value in values.items()}))
 
 
-def sphere(compiled: mujoco.MjModel, name: str) -> ET.Element:
+def _sphere(compiled: mujoco.MjModel, name: str) -> ET.Element:
     """Return the element of one sphere."""
     geom = compiled.geom(name)
-    element = ET.Element("geom", {"name": name, "type": "sphere", "size": numbers(geom.size[:1]), "mass": "0"})
+    element = ET.Element("geom", {"name": name, "type": "sphere", "size": _numbers(geom.size[:1]), "mass": "0"})
     for field in FIELDS:
-        element.set(field, numbers(np.atleast_1d(getattr(geom, field))))
+        element.set(field, _numbers(np.atleast_1d(getattr(geom, field))))
     return element
 
 
-def numbers(values: Iterable[float]) -> str:
+def _numbers(values: Iterable[float]) -> str:
     """Return numbers as text that reads back to the same numbers."""
     return " ".join(str(int(v)) if isinstance(v, np.integer) else repr(float(v)) for v in values)

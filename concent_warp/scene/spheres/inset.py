@@ -39,7 +39,7 @@ def inset(surface: Surface, points: np.ndarray, radius: float) -> tuple[np.ndarr
     open_above = np.full(len(centres), radius)
     rising = np.arange(len(centres))
     for stage in radius * np.arange(1, STAGES + 1) / STAGES:
-        moved, arrived = push(surface, centres[rising], np.full(len(rising), stage))
+        moved, arrived = _push(surface, centres[rising], np.full(len(rising), stage))
         open_above[rising[~arrived]] = stage
         rising = rising[arrived]
         centres[rising], fits[rising] = moved[arrived], stage
@@ -47,14 +47,14 @@ def inset(surface: Surface, points: np.ndarray, radius: float) -> tuple[np.ndarr
     fits[rising] = radius
     for _ in range(HALVINGS if len(stuck) else 0):
         trial = (fits[stuck] + open_above[stuck]) / 2
-        moved, arrived = push(surface, centres[stuck], trial)
+        moved, arrived = _push(surface, centres[stuck], trial)
         open_above[stuck[~arrived]] = trial[~arrived]
         centres[stuck[arrived]], fits[stuck[arrived]] = moved[arrived], trial[arrived]
     fits[stuck] = np.minimum(-surface.signed_distance(centres[stuck]), radius)
     return centres, fits
 
 
-def push(surface: Surface, centres: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _push(surface: Surface, centres: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Move centres (n, 3) inward until they lie `depth` [m], shape (n,), deep; return them and which arrived."""
     centres = centres.copy()
     left = np.arange(len(centres))

@@ -57,13 +57,13 @@ def split_mass(
         return MassSplit(np.zeros(count), 0.0, 0.0)
     away = positions - com
     length = float(np.sqrt(np.mean(np.sum(away**2, axis=1) + radii**2)))
-    second = inertia_rows(away / length, radii / length)
-    target = tensor_entries(inertia) / (mass * length**2)
+    second = _inertia_rows(away / length, radii / length)
+    target = _tensor_entries(inertia) / (mass * length**2)
     rows = np.vstack([np.ones(count), away.T / length, second])
     right = np.concatenate([[1.0, 0, 0, 0], target])
     share = np.full(count, 1 / count)
     for exact in (10, 4, 1):
-        weights = nearest_weights(rows, right, share, exact)
+        weights = _nearest_weights(rows, right, share, exact)
         if weights is not None:
             break
     else:
@@ -79,19 +79,19 @@ FULL = np.diag(np.sqrt([1.0, 1, 1, 2, 2, 2]))
 """Weights under which the norm of the six entries of a symmetric tensor is its Frobenius norm."""
 
 
-def tensor_entries(tensor: np.ndarray) -> np.ndarray:
+def _tensor_entries(tensor: np.ndarray) -> np.ndarray:
     """Return xx, yy, zz, xy, xz, yz of symmetric tensors, shape (..., 3, 3) -> (..., 6)."""
     return tensor[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
-def inertia_rows(away: np.ndarray, radii: np.ndarray) -> np.ndarray:
+def _inertia_rows(away: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Return the inertia of spheres of unit mass about the origin, shape (6, n), from centres (n, 3) and radii (n,)."""
     own = 0.4 * radii**2 + np.sum(away**2, axis=1)
     tensors = own[:, None, None] * np.eye(3) - away[:, :, None] * away[:, None, :]
-    return tensor_entries(tensors).T
+    return _tensor_entries(tensors).T
 
 
-def nearest_weights(rows: np.ndarray, right: np.ndarray, share: np.ndarray, exact: int) -> np.ndarray | None:
+def _nearest_weights(rows: np.ndarray, right: np.ndarray, share: np.ndarray, exact: int) -> np.ndarray | None:
     """Minimise ``|w - share|^2 n / 2`` over ``w >= 0`` with the first `exact` equations kept and the rest near.
 
     The rest enter as a heavy quadratic penalty. Semi-smooth Newton on the dual: ``w = max(0, share + A^T y / n)``.

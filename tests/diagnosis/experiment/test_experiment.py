@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.experiment.motions import Bench, Motion
-from concent_warp.diagnosis.experiment.suggest import imagined, separations, start_effects, suggest
+from concent_warp.diagnosis.experiment.suggest import _imagined, _separations, _start_effects, suggest
 from concent_warp.effects.library.contact import SlidingFriction, TorsionalFriction
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.effects.library.measurement import SensorBias
@@ -86,9 +86,9 @@ def test_frictions_alike_at_one_speed_are_told_apart_by_another():
     bench = Bench(Model(Scene(CART)), recording, channel_noises(Model(Scene(CART)), recording))
     d = recording.demonstrations[0]
     same = Motion("same", "do it again", 4.0, np.zeros(1), np.zeros(1), d.action)
-    window = imagined(bench, same, same.duration)
+    window = _imagined(bench, same, same.duration)
     assert window is not None
-    again = separations(frictions(), same, window, "mujoco")
+    again = _separations(frictions(), same, window, "mujoco")
     assert again is not None
     assert found.separation > 2 * again[found.pair][0]
 
@@ -140,14 +140,14 @@ def test_what_an_error_of_the_start_explains_does_not_count():
     at_rest = Demonstration("rest", qpos=np.zeros(1), qvel=np.zeros(1), measured={"rail_position": channel})
     bench = Bench(plain, Recording(plain.scene.xml, (at_rest,)), {"rail_position": NOISE})
     motion = Motion("coast", "let it coast", 1.0, np.zeros(1), np.array([0.1]))
-    window = imagined(bench, motion, 1.0)
+    window = _imagined(bench, motion, 1.0)
     assert window is not None
     models = {"plain": plain, "biased": biased}
-    raw = separations(models, motion, window, "mujoco")
-    starts = start_effects(plain, window, "mujoco")
+    raw = _separations(models, motion, window, "mujoco")
+    starts = _start_effects(plain, window, "mujoco")
     assert raw is not None
     assert raw["plain", "biased"][0] == pytest.approx(2.0, rel=1e-6)
-    left = separations(models, motion, window, "mujoco", starts)
+    left = _separations(models, motion, window, "mujoco", starts)
     assert left is not None
     assert left["plain", "biased"][0] < 0.05
 
@@ -157,6 +157,6 @@ def test_motion_in_which_a_model_diverges_is_left_out():
     recording = one_speed()
     bench = Bench(plain, recording, {"rail_position": NOISE})
     motion = Motion("burst", "burst", 0.5, np.zeros(1), np.array([1e12]), recording.demonstrations[0].action)
-    window = imagined(bench, motion, 0.5)
+    window = _imagined(bench, motion, 0.5)
     assert window is not None
-    assert separations({"a": plain, "b": plain}, motion, window, "mujoco") is None
+    assert _separations({"a": plain, "b": plain}, motion, window, "mujoco") is None

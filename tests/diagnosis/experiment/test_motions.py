@@ -3,7 +3,7 @@ import pytest
 
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
 from concent_warp.diagnosis.experiment.motions import EXTRA, Bench, heavier, slope_turned
-from concent_warp.diagnosis.experiment.object_motions import Toy, body_motions, roll
+from concent_warp.diagnosis.experiment.object_motions import Toy, _roll, body_motions
 from concent_warp.effects.library.world import AirDrag, GravityTilt
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -142,7 +142,7 @@ def test_spin_is_about_the_vertical_however_the_object_lies():
 )
 def test_round_objects_roll_across_their_axis(shape, direction):
     known = bench(shape)
-    rolling = roll(Toy(known, known.m.body("block").id, "mujoco"), known.starts[0][0])
+    rolling = _roll(Toy(known, known.m.body("block").id, "mujoco"), known.starts[0][0])
     if direction is None:
         assert rolling is None
     else:

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from concent_warp.comparison.phases import FREE, REST, SLIDE
-from concent_warp.diagnosis.forces.body_forces import body_parts
-from concent_warp.diagnosis.forces.contact_state import free_motions, lasting_share
-from concent_warp.diagnosis.forces.describe import direction_words
-from concent_warp.diagnosis.forces.point_of_action import face_words, lever
+from concent_warp.diagnosis.forces.body_forces import _body_parts
+from concent_warp.diagnosis.forces.contact_state import _free_motions, _lasting_share
+from concent_warp.diagnosis.forces.describe import _direction_words
+from concent_warp.diagnosis.forces.point_of_action import _face_words, _lever
 from concent_warp.diagnosis.forces.window_forces import WindowCfg, window_forces
 from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
@@ -20,7 +20,7 @@ def parts(recording):
     motions = [measured_motion(model, d, engine) for d in recording.demonstrations]
     pairs = zip(recording.demonstrations, motions, strict=True)
     windows = [window_forces(d.name, engine, motion, WindowCfg(draws=0)) for d, motion in pairs]
-    return body_parts("block", motions, windows)
+    return _body_parts("block", motions, windows)
 
 
 def test_a_thrown_block_slides_and_then_rests_on_the_table():
@@ -52,18 +52,18 @@ def test_a_flying_block_is_free():
 
 def test_contacts_hide_motions_that_they_see():
     push = np.array([[0, 0, 1.0, 0, 0, 0]])
-    assert np.diag(free_motions(push, 1)) == pytest.approx([1, 1, 0, 1, 1, 1])
+    assert np.diag(_free_motions(push, 1)) == pytest.approx([1, 1, 0, 1, 1, 1])
 
 
 def test_short_interruptions_count_as_contact():
-    assert lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=3) == 1
-    assert lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=2) == pytest.approx(0.7)
+    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=3) == 1
+    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=2) == pytest.approx(0.7)
 
 
 def test_a_force_turns_about_the_origin_by_its_lever():
     rng = np.random.default_rng(0)
     force, point = rng.standard_normal(3), rng.standard_normal(3)
-    assert lever(force, np.eye(3)) @ point == pytest.approx(np.cross(point, force))
+    assert _lever(force, np.eye(3)) @ point == pytest.approx(np.cross(point, force))
 
 
 @pytest.mark.parametrize(
@@ -76,10 +76,10 @@ def test_a_force_turns_about_the_origin_by_its_lever():
     ],
 )
 def test_places_on_faces_are_named(place, normal, hidden, words):
-    assert face_words(np.array(place, float), np.array(normal, float), hidden) == words
+    assert _face_words(np.array(place, float), np.array(normal, float), hidden) == words
 
 
 def test_directions_are_named_by_their_axes():
-    assert direction_words(np.array([-2.0, 0.1, 0]), "world") == "along -x"
-    assert direction_words(np.array([0.5, 0, -1.0]), "block") == "along -z +x of block"
-    assert direction_words(np.array([-1.0, 0, 0]), "sliding") == "against its sliding"
+    assert _direction_words(np.array([-2.0, 0.1, 0]), "world") == "along -x"
+    assert _direction_words(np.array([0.5, 0, -1.0]), "block") == "along -z +x of block"
+    assert _direction_words(np.array([-1.0, 0, 0]), "sliding") == "against its sliding"

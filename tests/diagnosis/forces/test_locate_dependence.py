@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.forces.dependence import blocks_of, dependences, flips, max_p, without
+from concent_warp.diagnosis.forces.dependence import _max_p, _without, blocks_of, dependences, flips
 
 K = 160
 
@@ -99,10 +99,10 @@ def test_windows_that_tell_nothing_are_left_out():
 def test_projecting_out_leaves_what_is_at_right_angles():
     rng = np.random.default_rng(7)
     chosen, y = rng.standard_normal((2, 30)), rng.standard_normal(30)
-    assert chosen @ without(y, chosen) == pytest.approx(np.zeros(2), abs=1e-12)
+    assert chosen @ _without(y, chosen) == pytest.approx(np.zeros(2), abs=1e-12)
 
 
 def test_p_of_a_certain_correlation_is_the_smallest_possible():
     block = np.repeat(np.arange(8), 3)
     x = np.ones((1, 24))
-    assert max_p(np.ones(24), x, block, flips(8, np.random.default_rng(0))) == pytest.approx([1 / 128])
+    assert _max_p(np.ones(24), x, block, flips(8, np.random.default_rng(0))) == pytest.approx([1 / 128])

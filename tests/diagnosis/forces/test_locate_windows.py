@@ -4,8 +4,8 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.forces.features import DIRECTION, joint_features
 from concent_warp.diagnosis.forces.window_forces import WindowCfg, window_forces
-from concent_warp.diagnosis.forces.window_solver import misfit, response
-from concent_warp.estimation.measured_motion import measured_motion, turning
+from concent_warp.diagnosis.forces.window_solver import _misfit, _response
+from concent_warp.estimation.measured_motion import _turning, measured_motion
 from concent_warp.estimation.smoothing_spline import smooth
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
@@ -69,12 +69,12 @@ def test_angular_velocity_follows_from_the_quaternion_and_its_rate():
     start = Rotation.from_euler("xyz", [0.4, 0.2, -1.0])
     ends = [start * Rotation.from_rotvec(s * omega) for s in (-step, step)]
     rate = (ends[1].as_quat(scalar_first=True) - ends[0].as_quat(scalar_first=True)) / (2 * step)
-    assert turning(start.as_quat(scalar_first=True), rate) == pytest.approx(omega, abs=1e-6)
+    assert _turning(start.as_quat(scalar_first=True), rate) == pytest.approx(omega, abs=1e-6)
 
 
 def test_departures_of_a_spring_swing_and_settle_about_its_sag():
     omega, length = 30.0, 0.1
-    law = response(np.array([[-(omega**2)]]), np.zeros((1, 1)), length)
+    law = _response(np.array([[-(omega**2)]]), np.zeros((1, 1)), length)
     s = np.linspace(0, length, len(law))
     assert law[:, 0, 0] == pytest.approx(np.cos(omega * s), abs=1e-9)
     assert law[:, 0, 1] == pytest.approx(np.sin(omega * s) / omega, abs=1e-9)
@@ -82,10 +82,10 @@ def test_departures_of_a_spring_swing_and_settle_about_its_sag():
 
 
 def test_variance_grows_only_where_misfit_is_no_chance():
-    assert misfit(30.0, 30) == 1
-    assert misfit(40.0, 30) == 1
-    assert misfit(90.0, 30) == 3
-    assert misfit(5.0, 0) == 1
+    assert _misfit(30.0, 30) == 1
+    assert _misfit(40.0, 30) == 1
+    assert _misfit(90.0, 30) == 3
+    assert _misfit(5.0, 0) == 1
 
 
 def test_a_constant_torque_on_a_driven_joint_is_found_without_bias_and_with_its_error():

@@ -9,7 +9,7 @@ import pytest
 from concent_warp.diagnosis.cfg import DiagnosisCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.procedure import Procedure, silent
-from concent_warp.diagnosis.search.gradient_start import GradientStarts, factor_of, moved
+from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _moved
 from concent_warp.diagnosis.search.steps import fit_candidate, screen
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
 from concent_warp.effects.library.objects import Inertia, Mass
@@ -103,7 +103,7 @@ def test_factors_are_turned_into_the_values_of_effects():
         (Mass("arm"), [1.0], [1.0]),
     )
     for effect, null, value in cases:
-        np.testing.assert_allclose(moved(effect, np.array(null), factor_of(effect, found)), value)
+        np.testing.assert_allclose(_moved(effect, np.array(null), _factor_of(effect, found)), value)
 
 
 def test_what_gradients_cannot_do_is_said_before_anything_is_fitted(slid):

@@ -10,7 +10,7 @@ from concent_warp.diagnosis.cfg import DiagnosisCfg
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, screen
-from concent_warp.diagnosis.search.unknown_force import LEAST, best_force, forces, unknown_force
+from concent_warp.diagnosis.search.unknown_force import LEAST, _best_force, _forces, unknown_force
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -108,7 +108,7 @@ def test_the_verdict_then_is_none_of_these_and_says_so(partly):
 def test_a_force_that_beats_the_effect_which_was_added_is_seen(partly):
     (_, friction) = partly
     damping = fit_candidate(friction, screen(friction, effect_class("joint_damping")("rail")))
-    found = best_force(friction, extended(friction, damping), 1.0, CFG, one_by_one)
+    found = _best_force(friction, extended(friction, damping), 1.0, CFG, one_by_one)
     assert found is not None
     assert found.instead is not None
     assert found.gain > found.instead + LEAST
@@ -143,7 +143,7 @@ def test_a_model_that_explains_nothing_needs_no_such_test():
 
 
 def test_bumps_lie_where_the_joint_was():
-    laws = [force.law(mujoco.MjModel.from_xml_string(rail())) for force in forces(nodes_of(ridden())[0])]
+    laws = [force.law(mujoco.MjModel.from_xml_string(rail())) for force in _forces(nodes_of(ridden())[0])]
     position, velocity = laws
     assert isinstance(position, UnknownJointForce)
     assert isinstance(velocity, UnknownJointForce)

@@ -3,7 +3,7 @@ import pytest
 
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects import fading
-from concent_warp.fit.effects.fading import AFTER, FADED, Known, has_faded, is_long, residuals_near
+from concent_warp.fit.effects.fading import AFTER, FADED, Known, _has_faded, is_long, residuals_near
 from concent_warp.fit.effects.initial_states import StartSearch
 from concent_warp.fit.effects.prediction import Prediction, Trial
 from concent_warp.model import Model
@@ -64,7 +64,7 @@ def test_a_simulation_that_diverged_has_not_faded(windows):
     (course,) = prediction.courses([Trial(0, np.zeros(0))], AFTER)
     course.qvel[-1] = np.nan
     trial = Trial(0, np.zeros(0), windows[0].spread)
-    assert not has_faded(prediction, trial, Trial(0, np.zeros(0)), course, course)
+    assert not _has_faded(prediction, trial, Trial(0, np.zeros(0)), course, course)
 
 
 def test_short_windows_are_simulated_to_their_end():

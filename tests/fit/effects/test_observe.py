@@ -6,7 +6,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observation import RATE_TIME, START_NOISE, Source, start_spread
-from concent_warp.fit.effects.observe import calmest, channel_noises, keeps_close, observe
+from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -75,7 +75,7 @@ def test_a_window_ends_late_but_before_an_impact():
         def roughness(self, times):
             return np.where(times > 0.8, 10.0, 1.0)
 
-    found = calmest(Rough(), 0.0, 1.0)  # pyright: ignore[reportArgumentType]
+    found = _calmest(Rough(), 0.0, 1.0)  # pyright: ignore[reportArgumentType]
     assert 0.75 < found <= 0.8
 
 

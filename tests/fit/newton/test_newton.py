@@ -11,7 +11,7 @@ from concent_warp.estimation.object_tracks import whole
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.newton.descent import GradientCfg
-from concent_warp.fit.newton.horizon import HorizonCfg, gradient_segments, tilt
+from concent_warp.fit.newton.horizon import HorizonCfg, _tilt, gradient_segments
 from concent_warp.fit.newton.loss import NewtonLoss, recording_gradient
 from concent_warp.fit.newton.physics import DAMPER, SPRING, Inertia, NewtonCfg, choose_physics, coupling
 from concent_warp.fit.newton.scene import newton_scene
@@ -166,7 +166,7 @@ def test_a_fixture_alone_has_nothing_to_differentiate(drop):
 
 def test_tumbling_is_cut_into_windows_and_pushing_is_not(pushed, thick):
     calm = [whole(thick.scene, pushed[0], ("block",))]
-    assert tilt(calm[0].targets[0]) < 0.05
+    assert _tilt(calm[0].targets[0]) < 0.05
     (kept,) = gradient_segments(thick, calm, [pushed[0]], HorizonCfg())
     assert kept.name == calm[0].name
     assert len(kept.ctrl) == len(calm[0].ctrl)
@@ -174,7 +174,7 @@ def test_tumbling_is_cut_into_windows_and_pushing_is_not(pushed, thick):
     scene = Scene(toss_scene(0.06))
     spheres = ContactGeometry(("cube",), np.zeros(1, int), np.zeros((1, 3)), *(np.full(1, v) for v in (0.03, 0.2, 0.3)))
     segment = whole(scene, thrown[0], ("cube",))
-    assert tilt(segment.targets[0]) > 0.35
+    assert _tilt(segment.targets[0]) > 0.35
     cut = gradient_segments(Model(scene, spheres), [segment], [thrown[0]], HorizonCfg(), held_out=0.2)
     length = max(float(t.time[-1]) for s in cut for t in s.targets)
     assert length <= 0.25 + 1e-9
