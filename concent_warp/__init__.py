@@ -13,7 +13,7 @@ from inspect import Signature, signature
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from concent_warp.version import __version__
 
 _HOMES = {
     "comparison.compare": ("CompareCfg", "compare"),

@@ -15,9 +15,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import concent_warp
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
+from concent_warp.version import __version__
 
 SETTINGS = "settings.toml"
 """File of the resolved settings; a folder that holds one is a run folder."""
@@ -157,7 +157,7 @@ def _resuming(command: Sequence[str]) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the packages that results depend on."""
-    found = {"concent-warp": concent_warp.__version__, "python": sys.version.split()[0]}
+    found = {"concent-warp": __version__, "python": sys.version.split()[0]}
     for name in PACKAGES:
         try:
             found[name] = version(name)

@@ -17,7 +17,7 @@ import warp as wp
 
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import carrier_pose
-from concent_warp.render.raw import RawCamera, Stage, body_id
+from concent_warp.render.raw import PosedWorlds, RawCamera, body_id
 from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
 from concent_warp.render.splats.rasterise import Rasteriser
 
@@ -94,7 +94,7 @@ class HybridCamera:
         Raises:
             RenderError: A camera or a body is not there, or a size is not right.
         """
-        self.stage = Stage(model, worlds, device=device)
+        self.stage = PosedWorlds(model, worlds, device=device)
         self.cameras, self.size, self.painter = tuple(cameras), size, painter
         given, where = dict(splats or {}), self.stage.device
         torch_device = str(wp.device_to_torch(where))

@@ -16,7 +16,7 @@ KEPT = 8
 """Frames that are kept to choose from."""
 
 
-class Album:
+class FrameSelection:
     """Some frames of an episode, spread over it, however long it becomes."""
 
     def __init__(self, shares: Sequence[float] = (0.3, 0.8)) -> None:

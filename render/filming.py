@@ -11,14 +11,14 @@ import torch
 from concent_warp.render.composite import HybridCamera
 from concent_warp.render.dataset.layout import DatasetWriter, EpisodeWriter
 from concent_warp.render.dataset.video import VideoWriter
-from concent_warp.render.figure import Album
+from concent_warp.render.figure import FrameSelection
 from concent_warp.render.networks.pairs import to_bytes
 
 FILMS = "films"
 """Folder of the videos to look at, in that of the data set."""
 
 
-class Filming:
+class DatasetFilming:
     """What W worlds do, as images in a data set."""
 
     def __init__(
@@ -42,7 +42,7 @@ class Filming:
             rate: Frames a second.
         """
         self.camera, self.writer, self.task = camera, writer, task
-        self.album = Album()
+        self.album = FrameSelection()
         """Frames of the first episode that is kept or dropped."""
         self._films, self._first, self._rate = films, first_films, rate
         self._open: dict[int, tuple[int, EpisodeWriter, VideoWriter | None]] = {}

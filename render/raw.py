@@ -36,7 +36,7 @@ class RawImages:
     """MuJoCo's geom id, -1 where nothing is, shape (W, C, H, W') int32."""
 
 
-class Stage:
+class PosedWorlds:
     """Worlds of a model, posed for cameras: MuJoCo-Warp's model and data without a simulation."""
 
     def __init__(self, model: mujoco.MjModel, worlds: int, *, device: str = "cpu") -> None:
@@ -102,7 +102,7 @@ class RawCamera:
 
     def __init__(
         self,
-        stage: Stage,
+        stage: PosedWorlds,
         cameras: Sequence[str],
         size: tuple[int, int],
         *,

@@ -16,8 +16,8 @@ from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import SETTINGS, TrainCfg, plain
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import Ranks
-from concent_warp.train.learning.ppo import CHECKPOINT, Report, Round, Trainer
-from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
+from concent_warp.train.resets.sample import ResetStates, draw_states
 from concent_warp.train.task.task import Task
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
@@ -26,7 +26,7 @@ FREE = ("iterations", "checkpoint", "target", "capture", "fuse")
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """What a training is made from."""
 
     model: Model
@@ -39,13 +39,13 @@ class Run:
     def new(
         model: Model, recording: Recording, cfg: TrainCfg, *, demonstration: str | None = None,
         events: ContactEventSequence | None = None,
-    ) -> Run:  # fmt: skip
+    ) -> TrainingRun:  # fmt: skip
         """Make a run of one demonstration of a recording, the first by default; its events are extracted if need be."""
         name = recording[0].name if demonstration is None else demonstration
         one = recording.only([name])
         if events is None:
             events = extract(model, one[0], MujocoEngine(model, threads=1))
-        return Run(model, one, events, cfg)
+        return TrainingRun(model, one, events, cfg)
 
     def save(self, folder: Path) -> None:
         """Write all of it to a folder."""
@@ -56,7 +56,7 @@ class Run:
         self.cfg.save(folder / SETTINGS)
 
     @staticmethod
-    def load(folder: Path) -> Run:
+    def load(folder: Path) -> TrainingRun:
         """Read what `save` wrote.
 
         Raises:
@@ -64,7 +64,7 @@ class Run:
         """
         if not (folder / SETTINGS).is_file():
             raise TrainError("the folder holds no training", where=folder, expected=f"a {SETTINGS}")
-        return Run(
+        return TrainingRun(
             Model.load(folder / MODEL),
             load_recording(folder / DEMONSTRATION),
             ContactEventSequence.load(folder / EVENTS),
@@ -75,7 +75,7 @@ class Run:
         """Return the task."""
         return Task.build(self.model, self.recording[0], self.cfg.environment, self.events)
 
-    def evaluation_states(self, task: Task, count: int, seed: int) -> InitialStates:
+    def evaluation_states(self, task: Task, count: int, seed: int) -> ResetStates:
         """Return initial states to judge a policy by, none of which training has seen.
 
         They are displaced ones alone, held as demonstrated; where stages are chained, starts of the whole alone.
@@ -85,7 +85,7 @@ class Run:
 
 
 def train_run(
-    run: Run,
+    run: TrainingRun,
     folder: Path | None,
     *,
     device: str | None = None,
@@ -94,7 +94,7 @@ def train_run(
     seconds: float | None = None,
     ranks: Ranks | None = None,
     begin_with: Path | None = None,
-) -> tuple[Trainer, Round | None]:
+) -> tuple[Trainer, Iteration | None]:
     """Train, and return the trainer and its last round.
 
     Args:

@@ -12,9 +12,9 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.distributed import Ranks
-from concent_warp.train.learning.ppo import CHECKPOINT, Round
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 
 def train(
@@ -30,7 +30,7 @@ def train(
     out: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[Round], None] | None = None,
+    progress: Callable[[Iteration], None] | None = None,
 ) -> Policy:
     """Train a policy by PPO to bring about the contact events of a demonstration.
 
@@ -74,7 +74,7 @@ def train(
     with ranks.joined(ranks.device(device)), claimed:
         if folder is not None and ranks.first:
             write_settings(folder, {"demonstration": name, **plain(cfg)})
-        run = Run.new(model, recording, cfg, demonstration=name, events=sequence)
+        run = TrainingRun.new(model, recording, cfg, demonstration=name, events=sequence)
         trainer, _ = train_run(
             run,
             folder,

@@ -15,7 +15,7 @@ from scipy import stats
 
 from concent_warp.estimation.windows import calm_starts
 from concent_warp.fit.effects.least_squares import Solver
-from concent_warp.fit.effects.observation import Source, Window
+from concent_warp.fit.effects.observation import ObservedRecording, Window
 from concent_warp.fit.effects.observe import channel_noises, observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
@@ -45,7 +45,7 @@ def cut_spans(model: Model, recording: Recording, length: float | None, head: fl
     Windows in which no channel moves by more than `moving` (in the channel's unit) are left out: rest is no test.
     Without a length, each demonstration is one window.
     """
-    source = Source(model, recording, channel_noises(model, recording))
+    source = ObservedRecording(model, recording, channel_noises(model, recording))
     whole: list[Window] = []
     heads: list[Window] = []
     for number, d in enumerate(recording.demonstrations):
@@ -129,7 +129,7 @@ def rms(values: np.ndarray) -> np.ndarray:
 def spans_of(model: Model, recording: Recording, share: float) -> Spans:
     """Cut a recording into the windows that a fit would see, the first `share` of each as its head."""
     noise = channel_noises(model, recording)
-    source = Source(model, recording, noise)
+    source = ObservedRecording(model, recording, noise)
     whole: list[Window] = []
     heads: list[Window] = []
     for window in observe(model, recording, noise=noise):

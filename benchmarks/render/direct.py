@@ -29,9 +29,9 @@ from concent_warp.recording.recording import Recording
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
 from concent_warp.render.networks.flow import draw
 from concent_warp.render.networks.flow_network import FlowNetwork
-from concent_warp.render.networks.pairs import Pairs, drawn_scene, pairs_of, to_signed
+from concent_warp.render.networks.pairs import ImagePairs, drawn_scene, pairs_of, to_signed
 from concent_warp.render.networks.train import ENLARGE, NetworkTraining, RenderTraining, network_of
-from concent_warp.render.raw import RawCamera, Stage
+from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.scene.scene import Scene
 
 SMALL, WHOLE = "64 and enlarged", "256 at once"
@@ -45,7 +45,7 @@ Draw = Callable[[torch.Tensor, torch.Tensor, torch.Tensor | None, int], tuple[to
 class WholeTraining(RenderTraining):
     """The flow of one camera at the size of its images, with nothing to enlarge."""
 
-    def __init__(self, pairs: Pairs, cfg: RenderTrainCfg, device: str) -> None:
+    def __init__(self, pairs: ImagePairs, cfg: RenderTrainCfg, device: str) -> None:
         """Make the network."""
         self.cfg, self.folder, self.device = cfg, None, torch.device(device)
         torch.manual_seed(cfg.seed)
@@ -100,7 +100,12 @@ def painting(training: RenderTraining, camera: str) -> Draw:
 
 
 def judged(
-    paint: Draw, held: Pairs, reference: torch.Tensor, there: torch.Tensor, steps: int, features: FeatureDistance | None
+    paint: Draw,
+    held: ImagePairs,
+    reference: torch.Tensor,
+    there: torch.Tensor,
+    steps: int,
+    features: FeatureDistance | None,
 ) -> dict[str, float]:
     """Return PSNR [dB], SSIM and distance of features of frames that are painted one after the other.
 
@@ -130,7 +135,7 @@ def judged(
     return found if features is None else {**found, "features": apart}
 
 
-def seconds_of(paint: Draw, held: Pairs, reference: torch.Tensor, steps: int, batch: int) -> float:
+def seconds_of(paint: Draw, held: ImagePairs, reference: torch.Tensor, steps: int, batch: int) -> float:
     """Return the time of one of a batch of images [s], the least of five."""
     rows = torch.arange(batch, device=held.real.device) % len(held)
     seen = to_signed(held.simulated[rows])
@@ -145,7 +150,7 @@ def seconds_of(paint: Draw, held: Pairs, reference: torch.Tensor, steps: int, ba
     return min(times[1:]) / batch
 
 
-def objects_seen(held: Pairs, recording: Recording, device: str) -> torch.Tensor:
+def objects_seen(held: ImagePairs, recording: Recording, device: str) -> torch.Tensor:
     """Return where the simulation sees objects, and a few pixels around, shape (N, H, W) bool."""
     from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
@@ -153,7 +158,7 @@ def objects_seen(held: Pairs, recording: Recording, device: str) -> torch.Tensor
 
     scene = Scene(recording.scene)
     model = drawn_scene(scene, [held.camera])
-    stage = Stage(model, 1, device=device)
+    stage = PosedWorlds(model, 1, device=device)
     eye = RawCamera(stage, [held.camera.name], (held.real.shape[2], held.real.shape[3]))
     bodies = [model.body(name).id for name in scene.objects()]
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]

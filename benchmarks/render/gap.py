@@ -32,7 +32,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg, SuperResolutionCfg
 
 if TYPE_CHECKING:
-    from concent_warp.render.networks.pairs import Pairs
+    from concent_warp.render.networks.pairs import ImagePairs
 
 QUICK = NetworkTrainCfg(steps=900, batch=8, learning_rate=1.5e-3, warm_up=20, ema=0.99)
 SMALL = RenderTrainCfg(
@@ -97,7 +97,7 @@ def trained(folder: Path, networks: Path, arguments: argparse.Namespace) -> None
     (networks / "done").write_text(json.dumps(spent))
 
 
-def steps_within(seconds: float, cfg: RenderTrainCfg, pairs: Sequence[Pairs], device: str) -> tuple[int, int]:
+def steps_within(seconds: float, cfg: RenderTrainCfg, pairs: Sequence[ImagePairs], device: str) -> tuple[int, int]:
     """Return the steps of flow and super-resolution that a time [s] allows, at most those of the settings."""
     import torch
 
@@ -132,7 +132,7 @@ def compared(
     from kornia.metrics import ssim
 
     from concent_warp.render.composite import HybridCamera
-    from concent_warp.render.figure import Album, decomposition
+    from concent_warp.render.figure import FrameSelection, decomposition
     from concent_warp.render.shadow_cfg import ShadowCfg
 
     where = str(wp.device_to_torch(wp.get_device(arguments.device)))
@@ -147,7 +147,7 @@ def compared(
     )  # fmt: skip
     body = [made["model"].body(name).id for name in objects]
     geoms = torch.tensor([g for g in range(made["model"].ngeom) if made["model"].geom_bodyid[g] in body])
-    spent, frames, album = 0.0, 0, Album()
+    spent, frames, album = 0.0, 0, FrameSelection()
     for demonstration, states in zip(held.demonstrations, made["states"], strict=True):
         camera.begin()
         for t, state in enumerate(states):

@@ -31,7 +31,7 @@ from concent_warp.render.networks.flow import draw
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.super_resolution import SuperResolution
-from concent_warp.render.raw import RawCamera, Stage
+from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.render.splats.splats import Splats
 from concent_warp.scene.cameras import with_cameras
@@ -93,7 +93,7 @@ def layers(worlds: int, arguments: argparse.Namespace) -> Iterator[tuple[str, fl
     scene = with_cameras(ShapeSorterCfg().build(), CAMERAS)
     model = scene.model
     qpos = torch.tensor(np.tile(home(model), (worlds, 1)), dtype=torch.float32, device=where)
-    stage = Stage(model, worlds, device=device)
+    stage = PosedWorlds(model, worlds, device=device)
     stage.place(qpos)
     raw = RawCamera(stage, CAMERAS, (256, 256))
     yield "raw", timed(raw.render, device, arguments.least)

@@ -33,7 +33,7 @@ from benchmarks.train.cases import CASES, Case, material
 from concent_warp.files import write_text
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.metrics import CURVE
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 RESULT, POLICY, LOG = "result.json", "policy", "log.txt"
 PACKED = 14 * 2**20
@@ -87,18 +87,18 @@ def train_one(args: Args, name: str, seed: int) -> None:
     begun = time.monotonic()
     from concent_warp.cli.terminal import quiet_warp
     from concent_warp.simulate.warp_engine import preferred_device
-    from concent_warp.train.learning.ppo import CHECKPOINT, Round, load_checkpoint
+    from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, load_checkpoint
     from concent_warp.train.policy.load import Policy
     from concent_warp.train.policy.ship import ship
 
     quiet_warp()
     case, folder, device = CASES[name], folder_of(args, name, seed), args.device or preferred_device()
     model, recording = material(args.out, case, seed)
-    run = with_stage(Run.new(model, recording, settings(args, case, seed)), args.stage)
+    run = with_stage(TrainingRun.new(model, recording, settings(args, case, seed)), args.stage)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / CHECKPOINT
 
-    def note(this: Round) -> None:
+    def note(this: Iteration) -> None:
         if this.iteration % 10 == 1:
             print(f"{folder.name}: {this.seconds:.0f} s, {this.log['success']:.1%}", flush=True)
 
@@ -151,7 +151,7 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def with_stage(run: Run, stage: str) -> Run:
+def with_stage(run: TrainingRun, stage: str) -> TrainingRun:
     """Return a run of a stage, or of the last one that the model shows where it does not get there.
 
     Episodes of that one begin shortly before it, not with the stage before, as those of the insertion begin about the
@@ -167,7 +167,7 @@ def with_stage(run: Run, stage: str) -> Run:
     return replace(run, cfg=replace(run.cfg, environment=replace(environment, stage=last.name, reset=reset)))
 
 
-def simulated(run: Run, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
+def simulated(run: TrainingRun, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
     """Return what the policy without exploration does in simulation, from states that training has not seen."""
     from concent_warp.train.environment.worlds import make_environment
     from concent_warp.train.policy.evaluate import run_episodes

@@ -30,8 +30,8 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.evaluate import PolicyFunction
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.resets.sample import InitialStates
-from concent_warp.train.run import Run
+from concent_warp.train.resets.sample import ResetStates
+from concent_warp.train.run import TrainingRun
 
 NAME = "train_stuck"
 LOST = 0.05
@@ -67,7 +67,7 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
         torch.manual_seed(args.seed)
         return loaded.act_in(environment)
 
-    def succeeded(cfg: EnvironmentCfg, starts: InitialStates) -> np.ndarray:
+    def succeeded(cfg: EnvironmentCfg, starts: ResetStates) -> np.ndarray:
         environment = make_environment(task, cfg, starts, device="cpu")
         return outcomes(environment, policy(environment))[0]
 
@@ -86,7 +86,7 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
         "episodes": args.episodes,
         "reality": int(success.sum()),
         "stuck": int(stuck.sum()),
-        "settings": changed(json.loads(json.dumps(asdict(Run.load(folder).cfg)))),
+        "settings": changed(json.loads(json.dumps(asdict(TrainingRun.load(folder).cfg)))),
         "machine": machine(),
     }
     for name, cfg in (("training", trained), ("own", own)):

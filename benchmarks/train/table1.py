@@ -30,7 +30,7 @@ from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.run import Run
+from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
 
 NAME = "train_table1"
@@ -141,7 +141,7 @@ def trial(args: Args, name: str, seed: int) -> Row:
     case, folder = CASES[name], policy_folder(args, name, seed)
     policy = Policy.load(folder).scaled(setpoint_lead_scale=args.setpoint_lead_scale)
     run = policy.run
-    judge = Run.load(policy_folder(args, reference(case), seed))
+    judge = TrainingRun.load(policy_folder(args, reference(case), seed))
     task, shown = run.task(), judge.task()
     states = judge.evaluation_states(shown, args.episodes, seed)
     # A model in which the demonstration does not get as far has fewer stages.

@@ -46,8 +46,8 @@ from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import buffers, make_environment
 from concent_warp.train.learning.ppo import Trainer
-from concent_warp.train.resets.sample import InitialStates, draw_states
-from concent_warp.train.run import Run
+from concent_warp.train.resets.sample import ResetStates, draw_states
+from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
 
 T = TypeVar("T")
@@ -149,11 +149,11 @@ PPO_ALTERNATIVES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 }
 
 
-def make_run(spheres: int) -> Run:
+def make_run(spheres: int) -> TrainingRun:
     """Return the training of the shape sorter's insertion."""
     recording, _ = record(RealityCfg(), [0])
     scene = Scene(recording.scene)
-    return Run.new(Model(scene, ContactGeometryCfg(count=spheres).build(scene)), recording, TrainCfg())
+    return TrainingRun.new(Model(scene, ContactGeometryCfg(count=spheres).build(scene)), recording, TrainCfg())
 
 
 @dataclass
@@ -161,14 +161,14 @@ class Bench:
     """What the measurements share."""
 
     args: Args
-    run: Run
-    tasks: dict[str, tuple[Task, InitialStates]] = field(default_factory=dict)
+    run: TrainingRun
+    tasks: dict[str, tuple[Task, ResetStates]] = field(default_factory=dict)
     base: int | None = None
     """Memory in use before anything large is made [byte]."""
     room: tuple[int, int] | None = None
     """Contacts and rows a world that were found to fit all spheres so far."""
 
-    def task(self, collision: str) -> tuple[Task, InitialStates]:
+    def task(self, collision: str) -> tuple[Task, ResetStates]:
         """Return the task with a set of spheres, and its initial states."""
         if collision not in self.tasks:
             cfg = replace(self.args.cfg, collision=collision)
@@ -189,7 +189,7 @@ class Bench:
             self.base = memory_used(self.args.device)
         return self.base
 
-    def rate(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+    def rate(self, cfg: EnvironmentCfg, task: Task, states: ResetStates) -> Row:
         """Return rates, profile, contacts dropped and memory of an environment."""
         args = self.args
         before = self.base_memory()
@@ -224,7 +224,7 @@ class Bench:
             "memory_gib": used / 2**30,
         }
 
-    def fitting(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+    def fitting(self, cfg: EnvironmentCfg, task: Task, states: ResetStates) -> Row:
         """Return the rate with buffers that nothing overflows, found by doubling those that did."""
         tried = []
         while True:
@@ -238,7 +238,7 @@ class Bench:
             print(f"  {contacts} contacts, {rows} rows a world: {' and '.join(dropping)} too small", flush=True)
         return {**self.rate(cfg, task, states), "tried": tried}
 
-    def dropping(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> list[str]:
+    def dropping(self, cfg: EnvironmentCfg, task: Task, states: ResetStates) -> list[str]:
         """Return the buffers that are too small in some step."""
         environment = make_environment(task, cfg, states, device=self.args.device)
         with torch.inference_mode():
@@ -248,7 +248,7 @@ class Bench:
         release()
         return found
 
-    def ppo(self, cfg: EnvironmentCfg, task: Task, states: InitialStates, ppo: PpoCfg) -> Row:
+    def ppo(self, cfg: EnvironmentCfg, task: Task, states: ResetStates, ppo: PpoCfg) -> Row:
         """Return times of rounds of PPO."""
         environment = make_environment(task, cfg, states, device=self.args.device)
         settings = TrainCfg(environment=cfg, ppo=replace(ppo, iterations=2 + self.args.repeats))
@@ -265,7 +265,7 @@ class Bench:
             "diverged": sum(this.log["diverged worlds"] for this in rounds),
         }
 
-    def kernels(self, cfg: EnvironmentCfg, task: Task, states: InitialStates) -> Row:
+    def kernels(self, cfg: EnvironmentCfg, task: Task, states: ResetStates) -> Row:
         """Return the kernels that take most time."""
         environment = make_environment(task, cfg, states, device=self.args.device)
         with torch.inference_mode():

@@ -8,9 +8,9 @@ import time
 from collections.abc import Sequence
 from importlib import import_module
 
-import concent_warp
 from concent_warp.errors import ConcentError
 from concent_warp.run_folder import processes
+from concent_warp.version import __version__
 
 COMMANDS = {
     "demo": "the main job on a simulated stand-in of the real world, from recording to report",
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_usage())
         return 0
     if arguments[0] == "--version":
-        print(f"concent {concent_warp.__version__}")
+        print(f"concent {__version__}")
         return 0
     if arguments[0] not in COMMANDS:
         print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
@@ -117,18 +117,18 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
         return INTERRUPTED
     except SystemExit as end:  # tyro ends the process after a wrong option or --help
-        _let_the_first_speak()
+        _wait_for_rank_zero()
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0
 
 
 def _complain(sentence: str) -> None:
     """Write to standard error; of several processes, which one error stops all, the first that comes to it."""
-    _let_the_first_speak()
+    _wait_for_rank_zero()
     print(sentence, file=sys.stderr)
 
 
-def _let_the_first_speak() -> None:
+def _wait_for_rank_zero() -> None:
     """Wait for the first of several processes, which says what is wrong with all and ends them by leaving."""
     if processes()[0] > 0:
         time.sleep(PATIENCE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from concent_warp.comparison.contact_names import Partners
+from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import Phase, StageLike, phases_by_body, stage_phases, tell_a_task
 from concent_warp.comparison.residuals import instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
@@ -151,7 +151,7 @@ def compare_replays(
                 bad = ~np.isfinite(rollout.qpos[0]).all(axis=1)
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
             if name == last:
-                partners[d.name] = Partners.of_replay(model, compiled, rollout)
+                partners[d.name] = ContactPartners.of_replay(model, compiled, rollout)
                 moving[d.name] = phases_by_body(model, compiled, rollout)
             if progress is not None:
                 progress(len(found) / (len(models) * len(chosen)))

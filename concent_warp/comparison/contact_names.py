@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.events.roles import Roles
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -28,7 +28,7 @@ ORDER = {"object": 0, "robot": 1, "world": 2}
 
 
 @dataclass(frozen=True)
-class Touching:
+class ContactPartner:
     """What a body touches over a span of time."""
 
     names: tuple[str, ...]
@@ -38,18 +38,18 @@ class Touching:
 
 
 @dataclass(frozen=True)
-class Partners:
+class ContactPartners:
     """Who touches whom in a replay."""
 
     compiled: mujoco.MjModel
     roles: Roles
-    motion: Motion
-    touches: Touches
+    motion: BodyPoses
+    touches: ReplayContacts
     spheres: frozenset[str]
     """Names of the geoms that are spheres of a contact geometry: a place on the body says more than their numbers."""
 
     @staticmethod
-    def of_replay(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> Partners | None:
+    def of_replay(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> ContactPartners | None:
         """Read a replay; None where it did not stay finite or recorded no contacts.
 
         Args:
@@ -61,11 +61,11 @@ class Partners:
         if rollout.diverged[0] or rollout.contacts is None or steps < 1:
             return None
         roles = Roles.of(compiled, model)
-        motion = Motion.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
+        motion = BodyPoses.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
         spheres = frozenset(() if model.geometry is None else model.geometry.names())
-        return Partners(compiled, roles, motion, Touches.of(rollout.contacts, roles), spheres)
+        return ContactPartners(compiled, roles, motion, ReplayContacts.of(rollout.contacts, roles), spheres)
 
-    def of(self, body: str, start: float, end: float) -> Touching | None:
+    def of(self, body: str, start: float, end: float) -> ContactPartner | None:
         """Return what a body, or what it carries along, touches from `start` to `end` [s]; None where nothing."""
         if body not in self.roles.bodies:
             return None
@@ -102,7 +102,7 @@ class Partners:
         first = found[strong[0]]
         local = self.motion.into(row, rows.step[first], rows.point[first])
         point = np.average(local, axis=0, weights=force[first])
-        return Touching(tuple(names), (float(point[0]), float(point[1]), float(point[2])))
+        return ContactPartner(tuple(names), (float(point[0]), float(point[1]), float(point[2])))
 
     def name(self, entity: int) -> str:
         """Return what to call an entity: its geom's name where it has one of its own, else its body's."""
@@ -114,7 +114,7 @@ class Partners:
             )
         return "the surroundings" if found.body == "world" else found.body
 
-    def spot(self, body: int, rows: Touches, force: np.ndarray) -> str:
+    def spot(self, body: int, rows: ReplayContacts, force: np.ndarray) -> str:
         """Return the side, edge or corner of a body that contacts are at, empty where they are within it."""
         if body == 0:
             return ""

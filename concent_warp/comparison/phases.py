@@ -25,7 +25,7 @@ from concent_warp.events.filter import drop_blips, runs, steps_of, windowed
 from concent_warp.events.grasp import opposed
 from concent_warp.events.roles import Roles
 from concent_warp.events.staging import ROBOT
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 from concent_warp.simulate.replay import replay
 
 if TYPE_CHECKING:
@@ -125,8 +125,8 @@ def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> 
     if rollout.diverged[0] or rollout.contacts is None or steps < 1:
         return {None: (Phase(FREE, -np.inf, np.inf),)}
     roles = Roles.of(compiled, model)
-    motion = Motion.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
-    touches = Touches.of(rollout.contacts, roles)
+    motion = BodyPoses.of(rollout, roles.bodies, float(rollout.time[1] - rollout.time[0]), steps)
+    touches = ReplayContacts.of(rollout.contacts, roles)
     movable = np.flatnonzero(compiled.body_weldid != 0)
     watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
     speeds = Speeds.of(motion, compiled)
@@ -147,7 +147,7 @@ class Speeds:
     """Distance of the farthest point of each body from its frame's origin [m], shape (nbody,)."""
 
     @staticmethod
-    def of(motion: Motion, compiled: mujoco.MjModel) -> Speeds:
+    def of(motion: BodyPoses, compiled: mujoco.MjModel) -> Speeds:
         """Differentiate the poses; the last step repeats the one before it."""
         linear = np.diff(motion.position, axis=0) / motion.timestep
         turn = np.einsum("kbij,kblj->kbil", motion.rotation[1:], motion.rotation[:-1])
@@ -195,7 +195,7 @@ def _reaches(compiled: mujoco.MjModel) -> np.ndarray:
     return reach
 
 
-def _body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, roles: Roles) -> np.ndarray:
+def _body_state(body: int, touches: ReplayContacts, motion: BodyPoses, speeds: Speeds, roles: Roles) -> np.ndarray:
     """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
     dt, steps = motion.timestep, motion.steps
     rows = touches[np.asarray((touches.body == body).any(axis=1))]
@@ -218,7 +218,7 @@ def _body_state(body: int, touches: Touches, motion: Motion, speeds: Speeds, rol
     return state
 
 
-def _slip(rows: Touches, motion: Motion, speeds: Speeds) -> np.ndarray:
+def _slip(rows: ReplayContacts, motion: BodyPoses, speeds: Speeds) -> np.ndarray:
     """Return the mean tangential speed of contacts [m/s], weighted by force, over windows of `HOLD`, shape (K,)."""
     total = np.zeros((motion.steps, 2))
     if len(rows.step):

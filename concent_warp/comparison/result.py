@@ -12,7 +12,7 @@ import numpy as np
 from concent_warp.comparison.bootstrap import LEVEL, RULE, effective_count, mean_interval
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.worst_spans import Place
+from concent_warp.comparison.worst_spans import WorstSpan
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.estimation.noise import Source
 from concent_warp.events.sequence import ContactEventSequence
@@ -100,7 +100,7 @@ class Comparison:
     """Time [s] at which a replay stopped being finite, by model and demonstration; absent where it stayed so."""
     seed: int = 0
     """Seed of the bootstrap."""
-    places: tuple[Place, ...] = ()
+    places: tuple[WorstSpan, ...] = ()
     """Where the last model fails worst, the worst first."""
     staged: bool = True
     """Whether the phases are contact stages; else they are ways of moving."""

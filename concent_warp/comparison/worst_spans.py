@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from concent_warp.comparison.contact_names import Partners
+from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.units import shown, times, unit_shown, words
@@ -40,7 +40,7 @@ AXES = "xyz"
 
 
 @dataclass(frozen=True)
-class Place:
+class WorstSpan:
     """A span of time in which a channel of one body, or several of them, is far off."""
 
     demonstration: str
@@ -103,9 +103,9 @@ class Place:
 def worst_places(
     residuals: Sequence[Residual],
     phases: Mapping[str | None, Sequence[Phase]],
-    partners: Partners | None,
+    partners: ContactPartners | None,
     demonstration: str,
-) -> list[Place]:
+) -> list[WorstSpan]:
     """Return the places of one demonstration, the worst first.
 
     Args:
@@ -122,7 +122,7 @@ def worst_places(
     return _merged(sorted(found, key=_severity, reverse=True))
 
 
-def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
+def ranked(places: Sequence[WorstSpan], most: int = MOST) -> tuple[WorstSpan, ...]:
     """Return the worst of the places of all demonstrations, the worst first, each with how often it recurs.
 
     Of places that are alike in many demonstrations the worst few are kept, so that there is room for others.
@@ -130,7 +130,7 @@ def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
     seen: dict[tuple, set[str]] = {}
     for place in places:
         seen.setdefault(alike(place), set()).add(place.demonstration)
-    kept: list[Place] = []
+    kept: list[WorstSpan] = []
     count: dict[tuple, int] = {}
     for place in sorted(places, key=_severity, reverse=True):
         count[alike(place)] = count.get(alike(place), 0) + 1
@@ -139,19 +139,19 @@ def ranked(places: Sequence[Place], most: int = MOST) -> tuple[Place, ...]:
     return tuple(kept)
 
 
-def alike(place: Place) -> tuple:
+def alike(place: WorstSpan) -> tuple:
     """Return what two places that are the same in different demonstrations have in common."""
     return place.channels[0], place.phase, place.against[:1]
 
 
-def _severity(place: Place) -> tuple[float, float]:
+def _severity(place: WorstSpan) -> tuple[float, float]:
     """Return a key that is larger for worse places; known noise counts before unknown."""
     return (np.inf if not np.isfinite(place.error) else -1.0 if place.ratio is None else place.ratio), place.error
 
 
 def _channel_places(
-    residual: Residual, phases: Sequence[Phase], partners: Partners | None, demonstration: str
-) -> Iterator[Place]:
+    residual: Residual, phases: Sequence[Phase], partners: ContactPartners | None, demonstration: str
+) -> Iterator[WorstSpan]:
     """Yield the places of one channel."""
     floor = residual.noise or QUIET * residual.extent
     if not floor or not len(residual.time):
@@ -221,17 +221,17 @@ def _described(
     peak: float,
     onset: float,
     phases: Sequence[Phase],
-    partners: Partners | None,
+    partners: ContactPartners | None,
     demonstration: str,
     end: float | None = None,
-) -> Place:
+) -> WorstSpan:
     """Return the place at some rows of a residual."""
     start, end = float(residual.time[rows[0]]), float(residual.time[rows[-1]]) if end is None else end
     error = residual.error[rows]
     rms = float(np.sqrt(np.nanmean(error**2)))
     text, vector = _direction(residual, rows)
     touching = None if partners is None or residual.body is None else partners.of(residual.body, start, end)
-    return Place(
+    return WorstSpan(
         demonstration=demonstration,
         channels=(residual.channel,),
         body=residual.body,
@@ -287,9 +287,9 @@ def _named_axes(vector: np.ndarray, *, signed: bool) -> str:
     return " and ".join(names)
 
 
-def _merged(places: Sequence[Place]) -> list[Place]:
+def _merged(places: Sequence[WorstSpan]) -> list[WorstSpan]:
     """Return `places`, the worst first, with those of one body that overlap by half of the shorter made one."""
-    kept: list[Place] = []
+    kept: list[WorstSpan] = []
     for place in places:
         for i, other in enumerate(kept):
             shared = min(place.end, other.end) - max(place.start, other.start)

@@ -17,7 +17,7 @@ from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.evaluate import Evaluation, run_episodes
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.resets.reset_states import InitialStates
+from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.task.task import Task
 
 
@@ -107,7 +107,7 @@ class EpisodeStates:
 
 
 def _write_videos(
-    files: list[Path], episodes: EpisodeStates, world: TaskWorld, task: Task, starts: InitialStates, period: float
+    files: list[Path], episodes: EpisodeStates, world: TaskWorld, task: Task, starts: ResetStates, period: float
 ) -> None:
     """Film episodes that began with `starts` and whose states are a period apart [s]."""
     bodies = tuple(task.compiled.body(i).name for i in task.objects)

@@ -17,7 +17,7 @@ from concent_warp.reality.hidden.in_task import wanted
 from concent_warp.report.live import LiveView
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.policy.play import Moment, Player
+from concent_warp.train.policy.play import PlayedState, Player
 
 
 def play(
@@ -133,7 +133,7 @@ def _wait_until(due: float, view: LiveView) -> None:
             return
 
 
-def _show(player: Player, view: LiveView, moment: Moment) -> None:
+def _show(player: Player, view: LiveView, moment: PlayedState) -> None:
     """Draw a moment and say what it is."""
     view.show(moment.position, moment.quaternion, moment.touching, moment.pairs)
     touching = int(moment.touching.sum())

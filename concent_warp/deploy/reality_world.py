@@ -12,7 +12,7 @@ from concent_warp.reality.hidden.in_task import TaskWorld, wanted
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import Actor, MujocoPhysics
-from concent_warp.train.resets.reset_states import InitialStates
+from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.task.task import Task
 
 
@@ -28,7 +28,7 @@ def reality_world(task: Task, cfg: EnvironmentCfg, world: RealityWorldCfg) -> Ta
 
 
 def reality_environment(
-    task: Task, cfg: EnvironmentCfg, states: InitialStates, world: RealityWorldCfg | None = None
+    task: Task, cfg: EnvironmentCfg, states: ResetStates, world: RealityWorldCfg | None = None
 ) -> Environment:
     """Return an environment whose physics is Reality's; success is the block at rest in the hole.
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Recording
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
-    from concent_warp.render.filming import Filming
+    from concent_warp.render.filming import DatasetFilming
     from concent_warp.train.policy.load import Policy
 
 FREE = ("out", "resume", "overwrite", "source", "episodes", "worlds", "films", "figure", "device")
@@ -140,7 +140,7 @@ def _check_replaced(folder: Path, *, overwrite: bool) -> None:
         raise RenderError("the folder holds a run, but no data set", where=folder, fix="choose another folder")
 
 
-def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], None]) -> Filming:
+def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], None]) -> DatasetFilming:
     """Render the episodes of a policy."""
     import torch
 
@@ -185,7 +185,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     return filming
 
 
-def _film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> Filming:
+def _film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> DatasetFilming:
     """Render the measured motion of the demonstrations of a recording, each an episode."""
     from concent_warp.estimation.measured_motion import measured_motion
     from concent_warp.model import Model
@@ -218,7 +218,7 @@ def _film_recording(recording: Recording, to: Destination, progress: Callable[[f
 
 
 @contextmanager
-def _leaving(filming: Filming) -> Iterator[None]:
+def _leaving(filming: DatasetFilming) -> Iterator[None]:
     """Discard the episodes that have not ended when something goes wrong."""
     try:
         yield
@@ -301,15 +301,15 @@ def _dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
     return LeRobotWriter(to.out, layout, codec=to.cfg.codec)
 
 
-def _new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> Filming:
+def _new_filming(to: Destination, camera: HybridCamera, writer: DatasetWriter, task: str, rate: int) -> DatasetFilming:
     """Return what takes the frames to the data set."""
-    from concent_warp.render.filming import FILMS, Filming
+    from concent_warp.render.filming import FILMS, DatasetFilming
 
     films = to.out / FILMS if to.cfg.films else None
-    return Filming(camera, writer, task, films=films, first_films=to.cfg.films, rate=rate)
+    return DatasetFilming(camera, writer, task, films=films, first_films=to.cfg.films, rate=rate)
 
 
-def _draw_figure(cfg: RenderCfg, filming: Filming) -> Path | None:
+def _draw_figure(cfg: RenderCfg, filming: DatasetFilming) -> Path | None:
     """Write the figure that is asked for, and return its path; None where no frame was rendered in this call."""
     if cfg.figure is None or not len(filming.album):
         return None

@@ -19,8 +19,8 @@ import numpy as np
 
 from concent_warp.diagnosis.cfg import DiagnosisCfg
 from concent_warp.diagnosis.procedure import Procedure, Progress
-from concent_warp.diagnosis.search.profile_likelihood import Look
-from concent_warp.diagnosis.search.steps import Candidate, Node, Screened
+from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint
+from concent_warp.diagnosis.search.steps import Candidate, FittedModel, Screened
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import Sums
@@ -31,7 +31,7 @@ from concent_warp.run_folder import make_folder, versions
 from concent_warp.simulate.select import EngineName
 
 T = TypeVar("T")
-KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums, Look)}
+KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums, ProfilePoint)}
 """What results are made of, besides effects and models."""
 
 
@@ -103,7 +103,7 @@ def _fingerprint(model: Model, recording: Recording, cfg: DiagnosisCfg, versions
 
 def _add(digest: Any, item: Any) -> None:
     """Add a value to a hash; of a node, the model's effects and the initial states."""
-    if isinstance(item, Node):
+    if isinstance(item, FittedModel):
         _add(digest, [item.model, item.fit.values, list(item.fit.offsets), item.limit, item.errors])
     elif isinstance(item, Model):
         _add(digest, [[a.effect, list(a.values)] for a in item.effects])

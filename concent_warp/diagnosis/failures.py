@@ -13,10 +13,10 @@ import numpy as np
 
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
-from concent_warp.comparison.worst_spans import Place, alike
+from concent_warp.comparison.worst_spans import WorstSpan, alike
 from concent_warp.diagnosis.forces.describe import body_sentence, joint_sentence
 from concent_warp.diagnosis.forces.locate import locate_forces
-from concent_warp.diagnosis.forces.result import Location
+from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.errors import ConcentError
 from concent_warp.simulate.select import EngineName
 
@@ -59,7 +59,7 @@ def where(
         found = compare_replays({"model": model}, started, engine).places
     except ConcentError:
         found = ()
-    kept: dict[tuple, Place] = {}
+    kept: dict[tuple, WorstSpan] = {}
     for place in found:
         kept.setdefault(alike(place), place)
     several = len(recording.demonstrations) > 1
@@ -88,7 +88,7 @@ def _with_starts(
     return replace(recording, demonstrations=tuple(moved))
 
 
-def _place_entry(place: Place, several: bool) -> dict[str, Any]:
+def _place_entry(place: WorstSpan, several: bool) -> dict[str, Any]:
     """Return a place of the error; the sentence names the demonstration where there are `several`."""
     return {
         "demonstration": place.demonstration,
@@ -103,7 +103,7 @@ def _place_entry(place: Place, several: bool) -> dict[str, Any]:
     }
 
 
-def _located(model: Model, recording: Recording, engine: EngineName, seconds: float) -> Location | None:
+def _located(model: Model, recording: Recording, engine: EngineName, seconds: float) -> UnexplainedForces | None:
     """Return where forces are missing, None where that cannot be told or takes longer than `seconds`.
 
     In a process of its own, so that it can be stopped.
@@ -119,7 +119,7 @@ def _located(model: Model, recording: Recording, engine: EngineName, seconds: fl
         pool.shutdown(wait=False, kill_workers=True)
 
 
-def _force_entries(location: Location) -> list[dict[str, Any]]:
+def _force_entries(location: UnexplainedForces) -> list[dict[str, Any]]:
     """Return the forces that stand out, those farthest above noise first."""
     blank = dict.fromkeys(("demonstration", "channel", "phase", "start", "end", "body", "direction"))
     found = []

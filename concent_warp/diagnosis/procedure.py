@@ -22,10 +22,10 @@ from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, Verdic
 from concent_warp.diagnosis.search.candidates import candidates, label
 from concent_warp.diagnosis.search.evidence import SAME, alike, detectable_size, fitted_parameters, removed
 from concent_warp.diagnosis.search.gradient_start import GradientStarts
-from concent_warp.diagnosis.search.profile_likelihood import Look, settled
+from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint, settled
 from concent_warp.diagnosis.search.steps import (
     Candidate,
-    Node,
+    FittedModel,
     Screened,
     chance,
     extended,
@@ -102,7 +102,7 @@ class Procedure:
         self.progress(1.0, "done")
         return self.conclude(nodes, detectable, issues)
 
-    def baseline(self) -> Node:
+    def baseline(self) -> FittedModel:
         """Return the model as it is, with its own parameters and the initial states fitted.
 
         Noise that is estimated and not stated is taken for larger where even the blocks that the model explains best
@@ -117,7 +117,7 @@ class Procedure:
         larger = {c: r for c, r in seen.items() if c not in told and r > UNDERESTIMATE}
         return self.fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
 
-    def fitted_baseline(self, noise: Mapping[str, float], *, rough: bool = False) -> Node:
+    def fitted_baseline(self, noise: Mapping[str, float], *, rough: bool = False) -> FittedModel:
         """Return the model as it is, fitted to readings of some noise."""
         cfg = self.cfg
         self.noise = dict(noise)
@@ -126,7 +126,7 @@ class Procedure:
         check_finite(Prediction(self.model, (), windows, engine=self.engine), self.model.scene.source)
         return node(self.model, windows, cut_blocks(windows), self.engine, rough=rough)
 
-    def addition(self, base: Node, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
+    def addition(self, base: FittedModel, step: int) -> tuple[Candidate | None, tuple[Detectable, ...]]:
         """Look for one effect that the node's model lacks; return it, and what could have been seen."""
         chosen = candidates(base.model, self.channels, self.cfg.effects)
         span = 0.85 / self.cfg.additions
@@ -158,7 +158,7 @@ class Procedure:
         return group[0][0], smallest
 
     def told_apart(
-        self, base: Node, good: Sequence[tuple[Candidate, Finding]], judge: Callable[[Candidate], Finding]
+        self, base: FittedModel, good: Sequence[tuple[Candidate, Finding]], judge: Callable[[Candidate], Finding]
     ) -> list[tuple[Candidate, Finding]]:
         """Return the accepted candidates that the data cannot tell apart, the likeliest first, its values polished.
 
@@ -178,7 +178,7 @@ class Procedure:
         group[0] = anew(settled(base, polished, self.settling))
         return group
 
-    def pruned(self, nodes: list[Node]) -> list[Node]:
+    def pruned(self, nodes: list[FittedModel]) -> list[FittedModel]:
         """Return the nodes, with one more for each effect that those added after it have made superfluous."""
         steps = list(range(len(nodes) - 1))
         while len(steps) > 1:
@@ -203,7 +203,7 @@ class Procedure:
         self.groups = [group for group in self.groups if group]
         return nodes
 
-    def fitted(self, base: Node, screened: Sequence[Screened], critical: float) -> list[Candidate]:
+    def fitted(self, base: FittedModel, screened: Sequence[Screened], critical: float) -> list[Candidate]:
         """Fit the promising candidates, the most promising first; once one leaves only noise, no distant others."""
         promising = sorted((s for s in screened if s.promise > 0.5 * critical), key=lambda s: -s.promise)
         left, found = promising[: self.cfg.survivors], []
@@ -236,7 +236,7 @@ class Procedure:
         self.level(base, found, hoped)
         return self.pieced(base, found) if _leader(base, found).ratio > self.cfg.adequate else found
 
-    def level(self, base: Node, found: list[Candidate], hoped: np.ndarray) -> None:
+    def level(self, base: FittedModel, found: list[Candidate], hoped: np.ndarray) -> None:
         """Take up the best fit, and those of candidates that may be its equals, as long as that betters one; in place.
 
         Where contacts make the cost rough, luck with the initial states would decide between them: so each is tried
@@ -263,7 +263,7 @@ class Procedure:
                 break
             hoped = np.array([c.share(base) for c in found])
 
-    def pieced(self, base: Node, found: list[Candidate]) -> list[Candidate]:
+    def pieced(self, base: FittedModel, found: list[Candidate]) -> list[Candidate]:
         """Return fitted candidates, those that explain most fitted anew by way of short windows, where there are."""
         if max(w.end - w.start for w in base.windows) < 2 * PIECE:
             return found
@@ -278,7 +278,7 @@ class Procedure:
             found[k] = c
         return found
 
-    def finding(self, base: Node, c: Candidate, null: np.ndarray, step: int, among: Sequence[Any]) -> Finding:
+    def finding(self, base: FittedModel, c: Candidate, null: np.ndarray, step: int, among: Sequence[Any]) -> Finding:
         """Return a fitted candidate with its evidence."""
         rng = np.random.default_rng(self.cfg.seed)
         share, gain = c.share(base), c.gain(base)
@@ -323,7 +323,7 @@ class Procedure:
         self._done += span
         return results
 
-    def settling(self, work: Callable[..., Look], tasks: Sequence[tuple[Any, ...]]) -> list[Look]:
+    def settling(self, work: Callable[..., ProfilePoint], tasks: Sequence[tuple[Any, ...]]) -> list[ProfilePoint]:
         """Do the looks around a fit, see `settled`."""
         return self.parallel(work, tasks, "looking around", 0.0)
 
@@ -331,7 +331,9 @@ class Procedure:
         """Yield the results of independent pieces of work in the tasks' order."""
         return _run_all(work, tasks, self.cfg.jobs)
 
-    def conclude(self, nodes: Sequence[Node], detectable: tuple[Detectable, ...], issues: Sequence[str]) -> Diagnosis:
+    def conclude(
+        self, nodes: Sequence[FittedModel], detectable: tuple[Detectable, ...], issues: Sequence[str]
+    ) -> Diagnosis:
         """Return the verdict."""
         first, last = nodes[0].ratio, nodes[-1].ratio
         beyond = max(first**2 - 1.0, 1e-9)
@@ -365,7 +367,7 @@ class Procedure:
         found = suggest(open_ones[0], self.recording, self.engine, self.cfg.seed)
         return None if found is None else found.sentence
 
-    def places(self, given: Node) -> tuple[dict[str, Any], ...]:
+    def places(self, given: FittedModel) -> tuple[dict[str, Any], ...]:
         """Return where the model as given fails; forces are looked for no longer than the diagnosis has taken."""
         if not self.cfg.explain:
             return ()
@@ -436,12 +438,12 @@ def _limited(threads: int, work: Callable[..., T], *task: Any) -> T:
         return work(*task)
 
 
-def _leader(base: Node, found: Sequence[Candidate]) -> Candidate:
+def _leader(base: FittedModel, found: Sequence[Candidate]) -> Candidate:
     """Return the fit that takes away most of a node's error."""
     return max(found, key=lambda c: c.share(base))
 
 
-def _quiet_ratios(base: Node) -> dict[str, float]:
+def _quiet_ratios(base: FittedModel) -> dict[str, float]:
     """Return the root mean square of the residuals over the noise of each channel, in the quietest blocks it has."""
     blocks: dict[str, list[float]] = {}
     for window, piece, rows in zip(base.windows, base.pieces, base.blocks.of_row, strict=True):

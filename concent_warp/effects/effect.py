@@ -24,7 +24,7 @@ import numpy as np
 from concent_warp.errors import ModelError
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 Family = Literal["joints", "objects", "contact", "world", "measurement"]
 Kind = Literal["joint", "actuator", "body", "geom", "sensor", "none"]
@@ -137,7 +137,7 @@ class Effect:
         """Return the names of the fields of `mujoco.MjModel` that `write` sets; ``opt.<name>`` for options."""
         return ()
 
-    def law(self, m: mujoco.MjModel) -> Law | None:  # noqa: ARG002
+    def law(self, m: mujoco.MjModel) -> ForceModel | None:  # noqa: ARG002
         """Return the force that is recomputed before each step; its parameters are those of the effect."""
         return None
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import warp as wp
 
 
-class Law:
+class ForceModel:
     """A force law with P parameters; what it acts on is fixed when it is made.
 
     Two laws are equal where they are of one class and act on the same, so that what was captured for one serves both.

@@ -14,13 +14,13 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.force_model import Law
+from concent_warp.effects.force_model import ForceModel
 
 SMALLEST = 1e-12
 """Sizes below this count as none."""
 
 
-class UnknownJointForce(Law):
+class UnknownJointForce(ForceModel):
     """On each of some joints a force that depends on the joint's own position, or velocity.
 
     Parameters are the sizes of the bumps over their scale, joint by joint, shape (n K,).
@@ -44,7 +44,7 @@ class UnknownJointForce(Law):
         return self.centre.size
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         del m
         of, applied = d.qvel if self.moving else d.qpos, d.qfrc_applied
         width = self.centre[:, 1] - self.centre[:, 0]
@@ -62,7 +62,7 @@ class UnknownJointForce(Law):
         return act
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
 
@@ -73,7 +73,7 @@ STILL = 2e-3
 """Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out."""
 
 
-class UnknownBodyForce(Law):
+class UnknownBodyForce(ForceModel):
     """On a free body a force that depends on where it is, or a resistance that depends on that or on its speed.
 
     Parameters are the sizes of the bumps over their scale, shape (K,), or (3 K,) along x, y and z of each bump.
@@ -102,7 +102,7 @@ class UnknownBodyForce(Law):
         return len(self.centre) * (3 if self.way == "field" else 1)
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         del m
         position, velocity = d.qpos[self.place : self.place + 3], d.qvel[self.dof : self.dof + 3]
         rate, torque = d.qvel[self.dof + 3 : self.dof + 6], d.qfrc_applied[self.dof + 3 : self.dof + 6]
@@ -127,7 +127,7 @@ class UnknownBodyForce(Law):
         return act
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
 

@@ -32,7 +32,7 @@ LEAST_NOISE = 1e-5
 
 
 @dataclass(frozen=True)
-class Signal:
+class SmoothedSignal:
     """Readings of one thing and what they smooth to."""
 
     time: np.ndarray
@@ -45,7 +45,7 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class JointMotion:
+class SmoothedJointMotion:
     """A hinge or slide whose position was measured."""
 
     name: str
@@ -53,31 +53,31 @@ class JointMotion:
     """"rad" or "m"."""
     qpos: int
     dof: int
-    position: Signal
-    velocity: Signal | None
+    position: SmoothedSignal
+    velocity: SmoothedSignal | None
     """Readings of the velocity, where there are any."""
 
 
 @dataclass(frozen=True)
-class BodyMotion:
+class SmoothedBodyMotion:
     """A free body whose position was measured, and its orientation as a rule."""
 
     name: str
     body: int
     qpos: int
     dof: int
-    position: Signal
+    position: SmoothedSignal
     """Of the body frame's origin [m], world frame."""
-    orientation: Signal | None
+    orientation: SmoothedSignal | None
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeasuredMotion:
     """What was measured of a demonstration, as motion of a model."""
 
     compiled: mujoco.MjModel
-    joints: tuple[JointMotion, ...]
-    bodies: tuple[BodyMotion, ...]
+    joints: tuple[SmoothedJointMotion, ...]
+    bodies: tuple[SmoothedBodyMotion, ...]
     base_time: np.ndarray
     """Times of the model's replay [s], shape (R,)."""
     base_qpos: np.ndarray
@@ -98,7 +98,7 @@ class Motion:
         """Time between readings of the slowest signal [s]."""
         return max(float(np.median(np.diff(s.time))) for s in self.signals())
 
-    def signals(self) -> list[Signal]:
+    def signals(self) -> list[SmoothedSignal]:
         """Return all signals."""
         found = [j.position for j in self.joints] + [b.position for b in self.bodies]
         return found + [b.orientation for b in self.bodies if b.orientation is not None]
@@ -171,7 +171,7 @@ def _turning(quaternion: np.ndarray, rate: np.ndarray) -> np.ndarray:
     return 2 * vector / (quaternion**2).sum(axis=-1, keepdims=True)
 
 
-def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) -> Motion:
+def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) -> MeasuredMotion:
     """Return the motion that was measured.
 
     Raises:
@@ -197,10 +197,10 @@ def measured_motion(model: Model, demonstration: Demonstration, engine: Engine) 
         rollout = replay(model, demonstration, engine, bodies=()).numpy()
         if np.isfinite(rollout.qpos).all() and np.isfinite(rollout.qvel).all():
             base = rollout.time, np.asarray(rollout.qpos[0], float), np.asarray(rollout.qvel[0], float)
-    return Motion(m, joints, bodies, *base, ctrl)
+    return MeasuredMotion(m, joints, bodies, *base, ctrl)
 
 
-def _joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[JointMotion, ...]:
+def _joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[SmoothedJointMotion, ...]:
     """Return the measured hinges and slides."""
     found = []
     channels = _sensed(m, demonstration)
@@ -216,13 +216,15 @@ def _joint_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[Joi
         if position is not None:
             unit = "rad" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else "m"
             name = m.joint(j).name or f"joint{j}"
-            found.append(JointMotion(name, unit, int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), position, velocity))
+            found.append(
+                SmoothedJointMotion(name, unit, int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), position, velocity)
+            )
     return tuple(found)
 
 
-def _body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[BodyMotion, ...]:
+def _body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[SmoothedBodyMotion, ...]:
     """Return the measured free bodies; a frame sensor may sit on the body, its inertial frame, a site or a geom."""
-    found: dict[int, BodyMotion] = {}
+    found: dict[int, SmoothedBodyMotion] = {}
     posed: dict[int, dict[int, tuple[Channel, np.ndarray, Rotation]]] = {}
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
@@ -250,7 +252,7 @@ def _body_motions(m: mujoco.MjModel, demonstration: Demonstration) -> tuple[Body
         if position is not None:
             name = m.body(body).name or f"body{body}"
             addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
-            found[body] = BodyMotion(name, body, *addresses, position, orientation)
+            found[body] = SmoothedBodyMotion(name, body, *addresses, position, orientation)
     return tuple(found[body] for body in sorted(found))
 
 
@@ -270,7 +272,7 @@ def _frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotati
     return body, np.array(offset), Rotation.from_quat(turn, scalar_first=True)
 
 
-def _orientation_signal(channel: Channel, turn: Rotation) -> Signal | None:
+def _orientation_signal(channel: Channel, turn: Rotation) -> SmoothedSignal | None:
     """Return readings of a frame that is turned by `turn` against its body, as orientations of the body."""
     std = _noise_of(channel, "orientation")
     valid = np.isfinite(channel.value).all(axis=1)
@@ -286,13 +288,13 @@ def _signal(
     value: np.ndarray,
     std: float,
     component_std: float,
-    velocity: Signal | None = None,
-) -> Signal | None:
+    velocity: SmoothedSignal | None = None,
+) -> SmoothedSignal | None:
     """Return readings with their smoothed form; None where there are too few."""
     valid = np.isfinite(value).all(axis=1)
     rate = None if velocity is None else (velocity.time, velocity.value, velocity.std)
     smoothed = smooth(time, value, component_std, rate)
-    return None if smoothed is None else Signal(np.asarray(time[valid], float), value[valid], std, smoothed)
+    return None if smoothed is None else SmoothedSignal(np.asarray(time[valid], float), value[valid], std, smoothed)
 
 
 def _noise_of(channel: Channel, kind: Kind) -> float:

@@ -13,7 +13,7 @@ from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEventSequence, ContactInterval
 from concent_warp.events.staging import find_stages
 from concent_warp.events.target import direction, number, vector
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 from concent_warp.simulate.replay import replay, step_count
 
 if TYPE_CHECKING:
@@ -46,14 +46,14 @@ def extract(
         )
     roles = Roles.of(engine.compiled, model)
     steps = step_count(demonstration, engine.timestep)
-    motion = Motion.of(rollout, roles.bodies, engine.timestep, steps)
+    motion = BodyPoses.of(rollout, roles.bodies, engine.timestep, steps)
     return _from_log(rollout.contacts, roles, motion, model.geometry, name=demonstration.name, cfg=cfg)
 
 
 def _from_log(
     log: ContactLog,
     roles: Roles,
-    motion: Motion,
+    motion: BodyPoses,
     geometry: ContactGeometry | None = None,
     *,
     name: str = "",
@@ -72,7 +72,7 @@ def _from_log(
         variant: Which variant of the log.
     """
     cfg = cfg or StagingCfg()
-    everything = Touches.of(log, roles, variant)
+    everything = ReplayContacts.of(log, roles, variant)
     settled = everything.settled_pairs(motion.steps, motion.timestep, cfg)
     touches = everything.within(settled)
     used = sorted({int(i) for i in touches.entity.ravel()}, key=lambda i: roles.entities[i].name)
@@ -89,7 +89,7 @@ def _from_log(
 
 
 def _body_intervals(
-    touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles
+    touches: ReplayContacts, settled: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of bodies."""
     found = []
@@ -100,7 +100,7 @@ def _body_intervals(
 
 
 def _entity_intervals(
-    touches: Touches, settled: dict[tuple[int, int], np.ndarray], motion: Motion, roles: Roles, gap: int
+    touches: ReplayContacts, settled: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles, gap: int
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of entities: breaks closed, within the contacts of their bodies."""
     found = []
@@ -116,7 +116,9 @@ def _entity_intervals(
     return _in_order(found)
 
 
-def _intervals(rows: Touches, touching: np.ndarray, motion: Motion, names: tuple[str, str]) -> list[ContactInterval]:
+def _intervals(
+    rows: ReplayContacts, touching: np.ndarray, motion: BodyPoses, names: tuple[str, str]
+) -> list[ContactInterval]:
     """Return an interval for each run of `touching` (K,) with the means of the contacts `rows` within it."""
     found = []
     for start, end in runs(touching):

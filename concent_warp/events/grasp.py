@@ -8,11 +8,11 @@ from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.filter import runs, settle, steps_of, windowed
 from concent_warp.events.onset import Onset
 from concent_warp.events.roles import Roles
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 
 
 def robot_onsets(
-    touches: Touches, motion: Motion, roles: Roles, cfg: StagingCfg
+    touches: ReplayContacts, motion: BodyPoses, roles: Roles, cfg: StagingCfg
 ) -> tuple[list[Onset], dict[int, np.ndarray]]:
     """Return what the robot begins to do with objects, and when it holds each, shape (K,) bool by body id.
 
@@ -47,7 +47,7 @@ def robot_onsets(
     return onsets, held
 
 
-def opposed(rows: Touches, steps: int, width: int, share: float) -> np.ndarray:
+def opposed(rows: ReplayContacts, steps: int, width: int, share: float) -> np.ndarray:
     """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,)."""
     total = np.zeros((steps, 4))
     np.add.at(total, rows.step, np.concatenate([rows.force[:, None] * rows.normal, rows.force[:, None]], axis=1))

@@ -22,7 +22,7 @@ import numpy as np
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.filter import runs, settle, steps_of, windowed
 from concent_warp.events.onset import Onset
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 
 ACROSS = float(np.cos(np.pi / 4))
 """A normal is across an axis if it is more than 45 degrees from it."""
@@ -78,7 +78,7 @@ class PairContact:
     """Where b is [m]: its sphere centres, or if it has none the places where a touches it, shape (n, 3)."""
 
     @staticmethod
-    def of(rows: Touches, motion: Motion, pair: tuple[int, int], spheres: np.ndarray) -> PairContact:
+    def of(rows: ReplayContacts, motion: BodyPoses, pair: tuple[int, int], spheres: np.ndarray) -> PairContact:
         """Bring contacts of a pair of bodies into the frame of the second."""
         a, b = pair
         point = motion.into(b, rows.step, rows.point)
@@ -113,10 +113,10 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def object_onsets(
-    touches: Touches,
+    touches: ReplayContacts,
     settled: np.ndarray,
     pair: tuple[int, int],
-    motion: Motion,
+    motion: BodyPoses,
     held: np.ndarray,
     spheres: np.ndarray,
     cfg: StagingCfg,

@@ -25,7 +25,7 @@ from concent_warp.events.onset import Kind, Onset
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import Stage
 from concent_warp.events.target import target_event
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 KINDS = get_args(Kind)
@@ -34,9 +34,9 @@ ROBOT = "robot"
 
 
 def find_stages(
-    touches: Touches,
+    touches: ReplayContacts,
     settled: dict[tuple[int, int], np.ndarray],
-    motion: Motion,
+    motion: BodyPoses,
     roles: Roles,
     geometry: ContactGeometry | None,
     cfg: StagingCfg,

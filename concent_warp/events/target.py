@@ -8,14 +8,14 @@ from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.filter import runs, steps_of
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEvent, ContactPair, Vector
-from concent_warp.events.touches import Motion, Touches
+from concent_warp.events.touches import BodyPoses, ReplayContacts
 
 DIGITS = 6
 """Decimals kept of every number of a sequence: micrometres, microseconds, micronewtons."""
 
 
 def target_event(
-    touches: Touches, motion: Motion, roles: Roles, start: int, end: int, steady: np.ndarray, cfg: StagingCfg
+    touches: ReplayContacts, motion: BodyPoses, roles: Roles, start: int, end: int, steady: np.ndarray, cfg: StagingCfg
 ) -> ContactEvent:
     """Return the target event of a stage.
 
@@ -72,7 +72,7 @@ def _event_window(start: int, end: int, steady: np.ndarray, width: int, target: 
     return int(max(low, high - width)), int(high)
 
 
-def _contact_pair(rows: Touches, motion: Motion, roles: Roles, steps: int) -> ContactPair:
+def _contact_pair(rows: ReplayContacts, motion: BodyPoses, roles: Roles, steps: int) -> ContactPair:
     """Return the pair of entities that `rows` are contacts of, with means over a window of `steps`."""
     a, b = rows.body[0]
     weight = rows.force + 1e-9

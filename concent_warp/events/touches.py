@@ -17,7 +17,7 @@ ORDER = {"robot": 0, "object": 1, "world": 2}
 
 
 @dataclass(frozen=True)
-class Motion:
+class BodyPoses:
     """Poses of all bodies at every step."""
 
     timestep: float
@@ -28,7 +28,7 @@ class Motion:
     """Body-to-world rotations, shape (K, nbody, 3, 3)."""
 
     @staticmethod
-    def of(rollout: Rollout, bodies: Sequence[str], timestep: float, steps: int, variant: int = 0) -> Motion:
+    def of(rollout: Rollout, bodies: Sequence[str], timestep: float, steps: int, variant: int = 0) -> BodyPoses:
         """Read the motion off a NumPy rollout that records steps 0..K-1 and the poses of all `bodies`."""
         if len(rollout.step) < steps or not np.array_equal(rollout.step[:steps], np.arange(steps)):
             raise EventsError("the rollout does not record every step", expected=f"steps 0..{steps - 1}")
@@ -37,7 +37,7 @@ class Motion:
         rows = [rollout.bodies.index(name) for name in bodies]
         position = np.asarray(rollout.body_position[variant][:steps, rows], dtype=float)
         quaternion = np.asarray(rollout.body_quaternion[variant][:steps, rows], dtype=float)
-        return Motion(timestep, position, _rotation_matrix(quaternion))
+        return BodyPoses(timestep, position, _rotation_matrix(quaternion))
 
     @property
     def steps(self) -> int:
@@ -59,7 +59,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Touches:
+class ReplayContacts:
     """C contacts between a pair (a, b) each, `a` before `b` in the order that `ContactInterval` says."""
 
     step: np.ndarray
@@ -75,11 +75,11 @@ class Touches:
     force: np.ndarray
     """Normal force [N], shape (C,)."""
 
-    def __getitem__(self, rows: np.ndarray) -> Touches:
-        return Touches(**{name: value[rows] for name, value in vars(self).items()})
+    def __getitem__(self, rows: np.ndarray) -> ReplayContacts:
+        return ReplayContacts(**{name: value[rows] for name, value in vars(self).items()})
 
     @staticmethod
-    def of(log: ContactLog, roles: Roles, variant: int = 0) -> Touches:
+    def of(log: ContactLog, roles: Roles, variant: int = 0) -> ReplayContacts:
         """Order the contacts of one variant; contacts within the robot are left out."""
         kept = log.variant == variant
         geom, normal = log.geom[kept], np.asarray(log.normal[kept], dtype=float)
@@ -96,7 +96,7 @@ class Touches:
         rank = _body_rank(roles, step, body, role)
         swap = rank[body[:, 0]] > rank[body[:, 1]]
         columns = np.where(swap[:, None], [[1, 0]], [[0, 1]])
-        touches = Touches(
+        touches = ReplayContacts(
             step=step,
             body=np.take_along_axis(body, columns, axis=1),
             entity=np.take_along_axis(roles.geom_entity[geom], columns, axis=1),
@@ -106,7 +106,7 @@ class Touches:
         )
         return touches[(role != ORDER["robot"]).any(axis=1) & (body[:, 0] != body[:, 1])]
 
-    def between(self, a: int, b: int) -> Touches:
+    def between(self, a: int, b: int) -> ReplayContacts:
         """Return the contacts of two bodies."""
         return self[(self.body == (a, b)).all(axis=1)]
 
@@ -121,7 +121,7 @@ class Touches:
         settled = {pair: settle(self.between(*pair).frames(steps), gap, blip) for pair in sorted(pairs)}
         return {pair: touching for pair, touching in settled.items() if touching.any()}
 
-    def within(self, settled: dict[tuple[int, int], np.ndarray]) -> Touches:
+    def within(self, settled: dict[tuple[int, int], np.ndarray]) -> ReplayContacts:
         """Return the contacts that fall in the settled contacts of their pair of bodies."""
         kept = np.zeros(len(self.step), dtype=bool)
         for pair, touching in settled.items():

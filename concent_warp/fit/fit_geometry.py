@@ -14,7 +14,7 @@ from concent_warp.files import write_json
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.search import FitResult, Progress, Search, SearchCfg
 from concent_warp.fit.newton.descent import GradientCfg
-from concent_warp.fit.newton.warm_start import Warming
+from concent_warp.fit.newton.warm_start import GradientWarmStart
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.run_folder import CHECKPOINT, make_folder
@@ -158,7 +158,7 @@ def warm_start(
             progress(Progress(iteration, count, lowest, lowest, left, search.simulations, "gradient step"))
 
     flat = search.evolution.mean.copy()
-    warming = Warming(search, demonstrations, cfg)
+    warming = GradientWarmStart(search, demonstrations, cfg)
     file = None if checkpoint is None else checkpoint.with_suffix(".descent.npz")
     search.gradients = found = warming.run(file, resume, show)
     search.evolution.mean = found.mean if found.helped else flat

@@ -11,7 +11,7 @@ import numpy as np
 from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
-from concent_warp.reality.run import Log, settle, simulate
+from concent_warp.reality.run import WorldLog, settle, simulate
 from concent_warp.reality.sensors.camera import CAMERA, film
 from concent_warp.reality.sensors.footage import FootageCfg, footage
 from concent_warp.reality.sensors.sensing import SensingCfg, measure, sampled
@@ -153,7 +153,7 @@ def _perform(
     return demonstration, truth
 
 
-def _judge(model: mujoco.MjModel, log: Log, task: ShapeSorterCfg) -> Truth:
+def _judge(model: mujoco.MjModel, log: WorldLog, task: ShapeSorterCfg) -> Truth:
     """Return what truly happened."""
     address = model.sensor_adr[model.sensor("block_position").id]
     position = np.array(log.sensordata)[:, address : address + 3]

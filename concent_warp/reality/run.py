@@ -14,7 +14,7 @@ from concent_warp.scene.scene import Scene
 
 
 @dataclass
-class Log:
+class WorldLog:
     """Raw readings, one list entry per step or per frame."""
 
     time: list[float] = field(default_factory=list)
@@ -56,9 +56,9 @@ def simulate(
     effects: tuple[HiddenEffect, ...],
     rng: np.random.Generator,
     progress: Callable[[float], None] | None,
-) -> Log:
+) -> WorldLog:
     """Step the world along the commands and log every step and every camera frame."""
-    log = Log()
+    log = WorldLog()
     track = {body: visible_points(scene, model, data, body, sensing, rng) for body in scene.objects()}
     log.points, log.visible = {body: [] for body in track}, {body: [] for body in track}
     steps = round(time[-1] / model.opt.timestep)

@@ -39,7 +39,7 @@ SPEEDS = (0.1, 4.0)
 
 
 @dataclass
-class Wishes:
+class ViewerControls:
     """What whoever watches has asked for; written by the page, read and taken back by what shows."""
 
     running: bool = True
@@ -80,7 +80,7 @@ class LiveView:
 
         if not SPEEDS[0] <= speed <= SPEEDS[1]:
             raise ConcentError("the speed is not right", expected=f"{SPEEDS[0]:g} to {SPEEDS[1]:g}", found=speed)
-        self.wishes, self.changed = Wishes(speed=speed), threading.Event()
+        self.wishes, self.changed = ViewerControls(speed=speed), threading.Event()
         self._geometry, self._kept = geometry, np.asarray(kept, dtype=bool)
         try:
             socket.create_server((host, 0)).close()  # viser would wait for ever

@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.units import SHOWN, unit_shown, words
-from concent_warp.comparison.worst_spans import Place
+from concent_warp.comparison.worst_spans import WorstSpan
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.motion_data import motion_data
@@ -67,7 +67,7 @@ def page_data(
     }
 
 
-def _place_data(comparison: Comparison, number: int, place: Place) -> dict[str, Any]:
+def _place_data(comparison: Comparison, number: int, place: WorstSpan) -> dict[str, Any]:
     """Return what the page shows of a place: where it is in time and on which body, and which way it points."""
     found = [comparison.residual(comparison.after, place.demonstration, channel) for channel in place.channels]
     shift = next((r for r in found if r is not None and r.kind in ("position", "points")), None)

@@ -10,10 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import concent_warp
 from concent_warp.comparison.bootstrap import RULE
 from concent_warp.comparison.result import Comparison, finite
-from concent_warp.diagnosis.forces.result import Location
+from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_text
@@ -22,6 +21,7 @@ from concent_warp.report.headline import cards, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
 from concent_warp.report.where import noise_words, place_list, shown_demonstrations
+from concent_warp.version import __version__
 
 if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import FitResult
@@ -44,7 +44,7 @@ def write_report(
     overlap: Mapping[str, Mapping[str, float]] | None = None,
     settings: Mapping[str, Any] | None = None,
     diagnosis: Diagnosis | Mapping[str, Any] | None = None,
-    location: Location | Mapping[str, Any] | None = None,
+    location: UnexplainedForces | Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report, in one piece or not at all.
 
@@ -68,7 +68,7 @@ def write_report(
     """
     path, events, overlap = Path(path), events or comparison.events, overlap or {}
     diagnosis = diagnosis.to_json() if isinstance(diagnosis, Diagnosis) else diagnosis
-    location = location.to_json() if isinstance(location, Location) else location
+    location = location.to_json() if isinstance(location, UnexplainedForces) else location
     shown_models = {name: comparison.models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
     chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
     data = page_data(shown_models, chosen, comparison, events, fit)
@@ -109,7 +109,7 @@ def write_report(
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),
-        "footer": escape(f"Written by concent {concent_warp.__version__}. {_left_out(comparison)}"),
+        "footer": escape(f"Written by concent {__version__}. {_left_out(comparison)}"),
         "data": _script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
         "style": _page_file("style.css"),
         "script": "\n".join(_page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),

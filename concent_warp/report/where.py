@@ -7,14 +7,14 @@ from html import escape
 
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.units import words
-from concent_warp.comparison.worst_spans import LEAST, Place, alike
+from concent_warp.comparison.worst_spans import LEAST, WorstSpan, alike
 from concent_warp.estimation.noise import WORDS
 
 MOST_PLACES = 6
 """Places in the list."""
 
 
-def numbered(comparison: Comparison) -> list[tuple[int, Place]]:
+def numbered(comparison: Comparison) -> list[tuple[int, WorstSpan]]:
     """Return the places that the page names, numbered from 1: the worst of each kind."""
     found, seen = [], set()
     for place in comparison.places:

@@ -16,7 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
     from concent_warp.model import Model
 
 Contacts = Literal["none", "touched", "all"]
@@ -40,7 +40,7 @@ class Variants:
     """Initial generalised positions, shape (N, nq)."""
     qvel: Any = None
     """Initial generalised velocities, shape (N, nv)."""
-    laws: Sequence[tuple[Law, Any]] | None = None
+    laws: Sequence[tuple[ForceModel, Any]] | None = None
     """Force laws that act, each with its parameters, shape (N, P); None: those of the model's effects, as it has
     them."""
 

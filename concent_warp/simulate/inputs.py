@@ -33,7 +33,7 @@ FIXED = {
 
 
 @dataclass(frozen=True)
-class Run:
+class SimulationRun:
     """What an engine is asked to simulate, checked and with defaults filled in."""
 
     variants: Variants
@@ -87,7 +87,7 @@ def check_run(
     record: Sequence[int] | np.ndarray | None,
     bodies: Sequence[str] | None,
     contacts: Contacts,
-) -> Run:
+) -> SimulationRun:
     """Check the arguments of `Engine.run` against the compiled model.
 
     Raises:
@@ -108,7 +108,9 @@ def check_run(
     if not np.isfinite(values).all():
         raise EngineError("the commands hold values that are not finite", fix="fill or cut the gaps first")
     steps = values.shape[1]
-    return Run(variants, values, steps, _check_record(record, steps), *_check_bodies(compiled, bodies), contacts)
+    return SimulationRun(
+        variants, values, steps, _check_record(record, steps), *_check_bodies(compiled, bodies), contacts
+    )
 
 
 def _check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Variants) -> None:

@@ -17,12 +17,19 @@ from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import collect
 from concent_warp.simulate.engine import Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
-from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, host_variants, with_laws
+from concent_warp.simulate.inputs import (
+    SPHERE_FIELDS,
+    SimulationRun,
+    check_run,
+    compile_model,
+    host_variants,
+    with_laws,
+)
 from concent_warp.simulate.processes import FEWEST, WORTH, in_processes
 from concent_warp.simulate.threads import simulations_at_a_time
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
     from concent_warp.model import Model
 
 WARNING = mujoco.mjtWarning
@@ -100,7 +107,7 @@ class MujocoEngine:
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
         variants = with_laws(self.model, self._compiled, host_variants(variants))
-        run = Run(**{**vars(run), "variants": variants})
+        run = SimulationRun(**{**vars(run), "variants": variants})
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
         self.repeats = 0
@@ -134,7 +141,7 @@ class MujocoEngine:
         vars(self).update(state)
         self._workshops = queue.SimpleQueue()
 
-    def _simulated(self, run: Run, rows: Sequence[int]) -> list[VariantResult | None]:
+    def _simulated(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants, as many at a time as may be."""
         count = min(self.threads, len(rows))
         if run.variants.laws and count >= FEWEST and len(rows) * run.steps >= WORTH:
@@ -143,12 +150,12 @@ class MujocoEngine:
         with ThreadPoolExecutor(1 if run.variants.laws else count) as pool:
             return list(pool.map(lambda n: self._simulate(run, n), rows))
 
-    def _in_turn(self, run: Run) -> list[VariantResult | None]:
+    def _in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
         """Simulate all variants one after the other, in another process."""
         with quiet_warnings():
             return [self._simulate(run, n) for n in range(run.variants.count)]
 
-    def _simulate(self, run: Run, n: int) -> VariantResult | None:
+    def _simulate(self, run: SimulationRun, n: int) -> VariantResult | None:
         """Simulate variant n; None if its contacts or constraints did not fit the arena."""
         m = self._variant_model(run.variants, n)
         laws = [(law, values[n]) for law, values in run.variants.laws or ()]
@@ -270,7 +277,7 @@ class VariantResult:
     diverged: bool = False
 
     @staticmethod
-    def empty(m: mujoco.MjModel, run: Run) -> VariantResult:
+    def empty(m: mujoco.MjModel, run: SimulationRun) -> VariantResult:
         """Return a result without records."""
         r, b = len(run.record), len(run.body_ids)
         return VariantResult(
@@ -292,10 +299,10 @@ class VariantResult:
 def _simulate(
     m: mujoco.MjModel,
     d: mujoco.MjData,
-    run: Run,
+    run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[Law, np.ndarray]],
+    laws: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
     """Step through the commands `ctrl`, shape (K, nu), filling `result`; returns whether the state stayed sane.
 
@@ -339,7 +346,7 @@ def _simulate(
     return not number[DIVERGED].any()
 
 
-def _unwatched(m: mujoco.MjModel, run: Run) -> bool:
+def _unwatched(m: mujoco.MjModel, run: SimulationRun) -> bool:
     """Return whether states and sensors are all that is asked for, so that MuJoCo may step on its own."""
     plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and not m.na and not m.nmocap
     return run.contacts == "none" and not len(run.body_ids) and run.steps > 0 and plain
@@ -348,10 +355,10 @@ def _unwatched(m: mujoco.MjModel, run: Run) -> bool:
 def _in_one_call(
     m: mujoco.MjModel,
     d: mujoco.MjData,
-    run: Run,
+    run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[Law, np.ndarray]],
+    laws: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
     """Do what `_simulate` does where nothing is watched, in MuJoCo's own loop, which lets other threads run."""
     from mujoco import rollout
@@ -381,10 +388,10 @@ def _in_one_call(
 def _in_one_loop(
     m: mujoco.MjModel,
     d: mujoco.MjData,
-    run: Run,
+    run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[Law, np.ndarray]],
+    laws: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
     """Do what `_simulate` does where nothing but laws asks for a pause; what goes wrong is left to `_simulate`."""
     number = d.warning.number
@@ -420,7 +427,7 @@ def _in_one_loop(
 
 
 def _apply_laws(
-    m: mujoco.MjModel, d: mujoco.MjData, laws: Sequence[tuple[Law, np.ndarray]], base: Mapping[str, np.ndarray]
+    m: mujoco.MjModel, d: mujoco.MjData, laws: Sequence[tuple[ForceModel, np.ndarray]], base: Mapping[str, np.ndarray]
 ) -> None:
     """Let force laws act on the coming step, from fields as they are in `base` and no applied force."""
     d.qfrc_applied[:] = 0
@@ -431,7 +438,7 @@ def _apply_laws(
         law.apply(m, d, values)
 
 
-def _stops(ctrl: np.ndarray, run: Run) -> Iterator[int]:
+def _stops(ctrl: np.ndarray, run: SimulationRun) -> Iterator[int]:
     """Return the steps at which the simulation pauses, increasing, the last one K.
 
     Every step when contacts are watched; else around each record and where the commands change.
@@ -448,7 +455,7 @@ def _read(
     d: mujoco.MjData,
     step: int,
     row: int | None,
-    run: Run,
+    run: SimulationRun,
     result: VariantResult,
     qpos: np.ndarray,
     qvel: np.ndarray,

@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from concent_warp.simulate.engine import Variants
-    from concent_warp.simulate.inputs import Run
+    from concent_warp.simulate.inputs import SimulationRun
 
 T = TypeVar("T")
 FEWEST = 3
@@ -19,7 +19,9 @@ WORTH = 20_000
 """Steps, of all simulations together, from which on it pays to hand them over: they take a second in one thread."""
 
 
-def in_processes(work: Callable[[Run], list[T]], run: Run, rows: Sequence[int], count: int) -> list[T]:
+def in_processes(
+    work: Callable[[SimulationRun], list[T]], run: SimulationRun, rows: Sequence[int], count: int
+) -> list[T]:
     """Return what `work` finds for some variants of a run, in their order, shared among `count` processes.
 
     The processes stay for a while, for the next time.
@@ -31,7 +33,7 @@ def in_processes(work: Callable[[Run], list[T]], run: Run, rows: Sequence[int], 
     return [result for part in cast("list[list[T]]", found) for result in part]
 
 
-def _part_of(run: Run, rows: np.ndarray) -> Run:
+def _part_of(run: SimulationRun, rows: np.ndarray) -> SimulationRun:
     """Return a run of some of its variants."""
     return replace(run, variants=_some(run.variants, rows), ctrl=run.ctrl[rows % len(run.ctrl)])
 

@@ -16,7 +16,7 @@ import warp as wp
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
-from concent_warp.simulate.inputs import SPHERE_FIELDS, Run, check_run, compile_model, with_laws
+from concent_warp.simulate.inputs import SPHERE_FIELDS, SimulationRun, check_run, compile_model, with_laws
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.simulate.warp_model import batchable, check_drag, is_switch
 from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, world_bytes
@@ -39,7 +39,7 @@ HEADROOM = 1.5
 
 
 @dataclass(frozen=True)
-class Part:
+class ProgramResult:
     """What came out of the worlds of one program run."""
 
     records: list[torch.Tensor]
@@ -141,7 +141,7 @@ class WarpEngine:
         if self._buffers is None:
             self._buffers = self._first_buffers(run)
         self.repeats = self.limited = 0
-        parts: list[Part] = []
+        parts: list[ProgramResult] = []
         start = 0
         while start < variants.count:
             size = self._chunk(self._buffers, run)
@@ -151,7 +151,7 @@ class WarpEngine:
                 start += size
         return self._join(run, parts)
 
-    def _run_part(self, run: Run, rows: np.ndarray) -> Part | None:
+    def _run_part(self, run: SimulationRun, rows: np.ndarray) -> ProgramResult | None:
         """Simulate the variants `rows`, the last one standing in for those beyond; None if buffers had to grow."""
         assert self._buffers is not None
         count = run.variants.count
@@ -176,14 +176,14 @@ class WarpEngine:
             key, value = program.log(demand)
             inside = key[:, 0] < kept
             log = key[inside] + np.array([rows[0], 0, 0, 0]), value[inside]
-        return Part(
+        return ProgramResult(
             records=[values[:kept] for values in program.records()],
             touched=program.touched()[:kept] if run.contacts == "touched" else None,
             log=log,
             unstable_step=demand.unstable_step[:kept],
         )
 
-    def _program(self, run: Run, worlds: int) -> Program:
+    def _program(self, run: SimulationRun, worlds: int) -> Program:
         """Return a program for a run, a kept one if there is one."""
         assert self._buffers is not None
         fields, laws = run.variants.fields, run.variants.laws or ()
@@ -219,7 +219,7 @@ class WarpEngine:
         self._programs[plan] = program
         return program
 
-    def _first_buffers(self, run: Run) -> Buffers:
+    def _first_buffers(self, run: SimulationRun) -> Buffers:
         """Return sizes for the first run: what was given, else twice what the first variant needs in C MuJoCo."""
         contacts, constraints, total = _probe(self._compiled, run)
         return Buffers(
@@ -251,7 +251,7 @@ class WarpEngine:
             changes["log_rows"] = int(1.25 * demand.logged)
         return replace(buffers, **changes) if changes else None
 
-    def _chunk(self, buffers: Buffers, run: Run) -> int:
+    def _chunk(self, buffers: Buffers, run: SimulationRun) -> int:
         """Return how many variants to simulate at a time, in chunks of one size."""
         m, count = self._compiled, run.variants.count
         if buffers not in self._world_bytes:
@@ -272,7 +272,7 @@ class WarpEngine:
         chunks = -(-count // most)
         return -(-count // chunks)
 
-    def _join(self, run: Run, parts: Sequence[Part]) -> Rollout:
+    def _join(self, run: SimulationRun, parts: Sequence[ProgramResult]) -> Rollout:
         """Put the parts together in the order of the variants."""
         qpos, qvel, sensordata, position, quaternion = (
             parts[0].records[i] if len(parts) == 1 else torch.cat([part.records[i] for part in parts]) for i in range(5)
@@ -303,7 +303,7 @@ def _join_logs(logs: Sequence[tuple[np.ndarray, np.ndarray]]) -> ContactLog:
     return sorted_log(key[:, 0].astype(int), key[:, 1].astype(int), np.concatenate([key[:, 2:], value], axis=1))
 
 
-def _probe(compiled: mujoco.MjModel, run: Run) -> tuple[int, int, int]:
+def _probe(compiled: mujoco.MjModel, run: SimulationRun) -> tuple[int, int, int]:
     """Simulate the first variant's commands on the unchanged model in C MuJoCo.
 
     Returns:

@@ -23,7 +23,7 @@ from concent_warp.simulate.engine import Contacts
 from concent_warp.simulate.warp_model import WorldModel
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER: mjw.euler,
@@ -53,7 +53,7 @@ class Plan:
     """Properties of the spheres that vary, `sphere_position` and so on."""
     fields: tuple[tuple[str, bool], ...]
     """Model fields that vary, each with whether any value is not zero; those that laws edit are among them."""
-    laws: tuple[tuple[Law, int], ...] = ()
+    laws: tuple[tuple[ForceModel, int], ...] = ()
     """Force laws, each with how many parameters it has."""
 
 

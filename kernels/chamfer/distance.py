@@ -27,7 +27,7 @@ import torch
 import warp as wp
 
 from .distance_cuda import Tiling
-from .pairs import Pairs, batch_of, broadcast_shape
+from .pairs import PointSetPairs, batch_of, broadcast_shape
 
 
 class ChamferParts(NamedTuple):
@@ -136,7 +136,7 @@ class ChamferPlan:
         gradient: bool = False,
         tiling: Tiling | None = None,
     ) -> None:
-        self._pairs = pairs = Pairs.of(a, b, a_valid, b_valid)
+        self._pairs = pairs = PointSetPairs.of(a, b, a_valid, b_valid)
         self._squared = squared
         self._tiling = tiling
         count, device = pairs.count, pairs.a.device
@@ -251,7 +251,7 @@ def _leading_shape(
 
 def _pairs_of_tensors(
     a: torch.Tensor, b: torch.Tensor, a_valid: torch.Tensor | None, b_valid: torch.Tensor | None
-) -> Pairs:
+) -> PointSetPairs:
     wp.init()
     whole = _leading_shape(a, b, a_valid, b_valid)
 
@@ -271,10 +271,10 @@ def _pairs_of_tensors(
 
     sets = [wp.from_torch(t, dtype=wp.vec3) for t in (compact(a, 2), compact(b, 2)) if t is not None]
     masks = [None if t is None else wp.from_torch(t) for t in (compact(a_valid, 1), compact(b_valid, 1))]
-    return Pairs.of(sets[0], sets[1], masks[0], masks[1])
+    return PointSetPairs.of(sets[0], sets[1], masks[0], masks[1])
 
 
-def _nearest_tensors(pairs: Pairs, device: torch.device) -> list[torch.Tensor]:
+def _nearest_tensors(pairs: PointSetPairs, device: torch.device) -> list[torch.Tensor]:
     return [torch.empty((pairs.count, size), dtype=torch.int32, device=device) for size in (pairs.n, pairs.m)]
 
 

@@ -55,7 +55,7 @@ def batch_of(leading: Sequence[int], whole: Sequence[int]) -> tuple[int, int] | 
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PointSetPairs:
     """Point sets of `count` pairs: arrays of sets (sets, points), and which set each pair uses."""
 
     a: wp.array
@@ -69,7 +69,9 @@ class Pairs:
     count: int
 
     @classmethod
-    def of(cls, a: wp.array, b: wp.array, a_valid: wp.array | None = None, b_valid: wp.array | None = None) -> Pairs:
+    def of(
+        cls, a: wp.array, b: wp.array, a_valid: wp.array | None = None, b_valid: wp.array | None = None
+    ) -> PointSetPairs:
         """Pairs of contiguous arrays of shape (..., points), `wp.vec3` for sets and `wp.bool` for masks.
 
         Raises:
@@ -127,9 +129,9 @@ class Pairs:
     def _most_second_points(self) -> int:
         return distance_cuda.SHARED_POINTS if self.device.is_cuda else distance_cpu.GATHERED_POINTS
 
-    def swapped(self) -> Pairs:
+    def swapped(self) -> PointSetPairs:
         """The same pairs with first and second set exchanged."""
-        return Pairs(
+        return PointSetPairs(
             self.b, self.a, self.b_valid, self.a_valid,
             self.b_batch, self.a_batch, self.b_valid_batch, self.a_valid_batch, self.count,
         )  # fmt: skip

@@ -25,7 +25,7 @@ BESIDE = wp.constant(0.3)
 
 
 @wp.struct
-class Scene:
+class SplatPoses:
     """Where O objects and C cameras are in W worlds."""
 
     owner: wp.array[int]  # object of a Gaussian, shape (N,)
@@ -129,7 +129,7 @@ def project(
     scale: wp.array[wp.vec3],
     opacity: wp.array[float],
     harmonics: wp.array2d[wp.vec3],
-    scene: Scene,
+    scene: SplatPoses,
     frame: Frame,
     place: wp.array[wp.vec4],
     shape: wp.array[wp.vec4],

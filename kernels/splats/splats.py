@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from .blend import Lists, blend, blend_gradient
-from .projection import Frame, Scene, project
+from .projection import Frame, SplatPoses, project
 from .tiles import DEPTH_BITS, emit, find_tiles, measure, pad
 
 TILES = {"cpu": 8, "cuda": 16}
@@ -84,7 +84,7 @@ class SplatArrays:
 
     def scene(self) -> Any:
         """Return owners and poses as the kernels take them."""
-        scene = Scene()
+        scene = SplatPoses()
         scene.owner, scene.object_pose = self.owner, self.object_poses
         scene.camera_pose, scene.pinhole, scene.ground = self.camera_poses, self.pinholes, self.ground
         if self.light is not None:
@@ -223,7 +223,7 @@ class SplatPlan:
         upstream = [rgb, alpha, depth, to_place, self._shape_gradient, self._colour_gradient]
         self._on_pixels(blend_gradient, [self.alpha, self.depth, self._left, self._last, *upstream])
         adjoint = [self.gradients[name] for name in PARAMETERS]
-        adjoint += [Scene(), Frame(), to_place, self._shape_gradient, self._colour_gradient, None, None]
+        adjoint += [SplatPoses(), Frame(), to_place, self._shape_gradient, self._colour_gradient, None, None]
         wp.launch(
             project,
             (self.images, self._splats),

@@ -17,7 +17,7 @@ from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.render.cameras import Camera, place_cameras
-from concent_warp.render.raw import RawCamera, Stage
+from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
@@ -26,7 +26,7 @@ BATCH = 16
 
 
 @dataclass(frozen=True)
-class Pairs:
+class ImagePairs:
     """N frames of one camera."""
 
     camera: Camera
@@ -42,10 +42,10 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.real)
 
-    def to(self, device: str | torch.device) -> Pairs:
+    def to(self, device: str | torch.device) -> ImagePairs:
         """Return the pairs on a device."""
         tensors = (self.real, self.simulated, self.pose, self.before)
-        return Pairs(self.camera, *(t.to(device) for t in tensors))
+        return ImagePairs(self.camera, *(t.to(device) for t in tensors))
 
 
 def drawn_scene(scene: Scene, cameras: Sequence[Camera]) -> mujoco.MjModel:
@@ -61,7 +61,7 @@ def pairs_of(
     *,
     device: str = "cpu",
     progress: Callable[[float], None] | None = None,
-) -> list[Pairs]:
+) -> list[ImagePairs]:
     """Return the pairs of each camera of a recording, at the size of its images.
 
     Args:
@@ -99,7 +99,7 @@ def pairs_of(
         simulated, pose = _rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, shown)
         real = torch.from_numpy(np.concatenate([s.rgb for s in streams])).permute(0, 3, 1, 2).contiguous()
         before = _frames_before([len(s.time) for s in streams])
-        found.append(Pairs(camera, real, simulated, pose, before))
+        found.append(ImagePairs(camera, real, simulated, pose, before))
     return found
 
 
@@ -121,7 +121,7 @@ def _rendered(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return images (N, 3, H, W) uint8 of states (N, nq) without the objects, and poses (N, 9) of the camera's body."""
     model = drawn_scene(scene, [camera])
-    stage = Stage(model, BATCH, device=device)
+    stage = PosedWorlds(model, BATCH, device=device)
     eye = RawCamera(stage, [camera.name], size, leave_out=scene.objects())
     images = torch.zeros((len(qpos), 3, *size), dtype=torch.uint8)
     poses = torch.zeros(len(qpos), 9)
@@ -137,7 +137,7 @@ def _rendered(
     return images, poses
 
 
-def carrier_pose(stage: Stage, camera: Camera) -> torch.Tensor:
+def carrier_pose(stage: PosedWorlds, camera: Camera) -> torch.Tensor:
     """Return position [m] and two columns of the rotation of the body that carries a camera, shape (W, 9).
 
     Zeros for a camera that is fixed in the world.

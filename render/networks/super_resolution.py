@@ -16,7 +16,7 @@ FACTOR = 4
 """Enlargement of an edge."""
 
 
-class Residual(nn.Module):
+class ResidualBlock(nn.Module):
     """Two convolutions past which the input goes."""
 
     def __init__(self, width: int, scale: float) -> None:
@@ -36,7 +36,7 @@ class SuperResolution(nn.Module):
         super().__init__()
         self.entry = _convolution(3, cfg.width)
         self.body = nn.Sequential(
-            *(Residual(cfg.width, cfg.scale) for _ in range(cfg.blocks)), _convolution(cfg.width, cfg.width)
+            *(ResidualBlock(cfg.width, cfg.scale) for _ in range(cfg.blocks)), _convolution(cfg.width, cfg.width)
         )
         self.exit = nn.Sequential(_convolution(cfg.width, 3 * FACTOR**2), nn.PixelShuffle(FACTOR))
         for parameter in self.exit.parameters():

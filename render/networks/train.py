@@ -20,7 +20,7 @@ from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
 from concent_warp.render.networks.flow import flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
-from concent_warp.render.networks.pairs import Pairs, to_signed
+from concent_warp.render.networks.pairs import ImagePairs, to_signed
 from concent_warp.render.networks.super_resolution import FACTOR, SuperResolution, reduced
 
 CHECKPOINT = "checkpoint.pt"
@@ -76,7 +76,7 @@ class RenderTraining:
     """All networks of a recording's cameras."""
 
     def __init__(
-        self, pairs: Sequence[Pairs], cfg: RenderTrainCfg, folder: Path | None = None, *, device: str = "cpu"
+        self, pairs: Sequence[ImagePairs], cfg: RenderTrainCfg, folder: Path | None = None, *, device: str = "cpu"
     ) -> None:
         """Make the networks.
 
@@ -245,7 +245,7 @@ def network_of(cfg: FlowNetworkCfg, camera: Camera) -> FlowNetworkCfg:
     return replace(cfg, posed=camera.moves)
 
 
-def _small_pairs(pairs: Pairs, size: int) -> Pairs:
+def _small_pairs(pairs: ImagePairs, size: int) -> ImagePairs:
     """Return the pairs at the size that the flow paints."""
 
     def less(images: torch.Tensor) -> torch.Tensor:

@@ -105,14 +105,14 @@ def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, ca
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(CheckpointedProcedure, "_fitted", interrupted)
+    monkeypatch.setattr(CheckpointedProcedure, "fitted", interrupted)
     arguments = ["--out", str(tmp_path / "kept")]
     assert diagnose(swing / "demo.h5", *arguments) == 130
     error = capsys.readouterr().err
     assert f"continue with: concent diagnose {swing / 'demo.h5'}" in error
     assert "Traceback" not in error
     assert list((tmp_path / "kept").glob("*.npz"))
-    monkeypatch.setattr(CheckpointedProcedure, "_fitted", finish)
+    monkeypatch.setattr(CheckpointedProcedure, "fitted", finish)
     assert diagnose(swing / "demo.h5", *arguments) == 0
     assert "Missing: joint_damping" in capsys.readouterr().out
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.comparison.contact_names import Partners, _box_of, _subtree
+from concent_warp.comparison.contact_names import ContactPartners, _box_of, _subtree
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -34,7 +34,9 @@ def partners(height=0.12, spheres=False):
     engine = MujocoEngine(model)
     m, time = scene.model, np.array([0, 0.4])
     demonstration = Demonstration("d", qpos=m.qpos0, qvel=np.zeros(m.nv), action={"motor": Channel(time, np.zeros(2))})
-    return Partners.of_replay(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
+    return ContactPartners.of_replay(
+        model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy()
+    )
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.extract import _from_log, extract
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEventSequence, Entity
-from concent_warp.events.touches import Motion
+from concent_warp.events.touches import BodyPoses
 from concent_warp.simulate.engine import ContactLog
 
 DT = 0.01
@@ -33,13 +33,13 @@ ROLES = Roles(
 Row = tuple[int, int, int, tuple[float, float, float], tuple[float, float, float], float]
 
 
-def still() -> Motion:
+def still() -> BodyPoses:
     """Return the motion of bodies that stay where they are, the block turned by a quarter about z at (1, 0, 0)."""
     position = np.zeros((STEPS, 4, 3))
     position[:, 2] = 1, 0, 0
     rotation = np.tile(np.eye(3), (STEPS, 4, 1, 1))
     rotation[:, 2] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    return Motion(DT, position, rotation)
+    return BodyPoses(DT, position, rotation)
 
 
 def log(*rows: Row) -> ContactLog:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.run import Log, settle, simulate
+from concent_warp.reality.run import WorldLog, settle, simulate
 from concent_warp.reality.sensors.sensing import SensingCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
@@ -13,7 +13,7 @@ SCENE = ShapeSorterCfg().build()
 SENSING = SensingCfg(point_count=8, point_rate=5.0, tracking_std=0.0)
 
 
-def run(*effects: HiddenEffect, step: float = 0.0, duration: float = 0.4) -> tuple[mujoco.MjModel, Log]:
+def run(*effects: HiddenEffect, step: float = 0.0, duration: float = 0.4) -> tuple[mujoco.MjModel, WorldLog]:
     """Hold the arm still, then command joint 1 `step` [rad] further from 0.1 s on, and return what happened."""
     model = WorldCfg().build(SCENE, effects).compile()
     data = mujoco.MjData(model)
@@ -27,7 +27,7 @@ def run(*effects: HiddenEffect, step: float = 0.0, duration: float = 0.4) -> tup
     return model, log
 
 
-def block(model: mujoco.MjModel, log: Log) -> np.ndarray:
+def block(model: mujoco.MjModel, log: WorldLog) -> np.ndarray:
     address = model.joint("block_joint").qposadr[0]
     return np.array(log.qpos)[:, address : address + 3]
 

@@ -7,22 +7,24 @@ import numpy as np
 import pytest
 
 from concent_warp.reality.hidden.drives import Late, Sluggish
-from concent_warp.reality.hidden.hidden_effect import Hidden, drives
+from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig, drives
 from concent_warp.reality.hidden.registry import EVERY, INSIDE, hidden
 from concent_warp.reality.hidden.sizes import MAGNITUDES
 from concent_warp.reality.rigs.registry import RIGS
-from concent_warp.reality.rigs.rig import Rig, Trial, perform, record_rig
+from concent_warp.reality.rigs.rig import Rig, RigTrial, perform, record_rig
 
 PENDULUM = RIGS["pendulum"]
 
 
-def swing(*found: Hidden, target: float = 0.0, start: float | None = None, duration: float = 1.0) -> np.ndarray:
+def swing(
+    *found: HiddenEffectOfRig, target: float = 0.0, start: float | None = None, duration: float = 1.0
+) -> np.ndarray:
     """Hold the pendulum at `target` [rad] and return time, encoder and marker height, shape (K, 3)."""
     effects = [h.effect for h in found]
     model = PENDULUM.world(effects).compile()
     action = {"servo": (np.zeros(1), np.array([target]))}
     settle, qpos = (0.8, {}) if start is None else (0.0, {"hinge": [start]})
-    trial = Trial(duration, action, qpos=qpos, settle=settle)
+    trial = RigTrial(duration, action, qpos=qpos, settle=settle)
     motion, _, _ = perform(model, trial, effects, PENDULUM.physics)
     angle = motion.sensordata[:, :1]
     for effect in effects:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.reality.hidden.registry import hidden
 from concent_warp.reality.rigs.registry import RIGS
-from concent_warp.reality.rigs.rig import Trial, perform, record_rig
+from concent_warp.reality.rigs.rig import RigTrial, perform, record_rig
 
 SLIDE, DROP, SPIN = RIGS["slide"], RIGS["drop"], RIGS["spin"]
 FLAT = [0.01 - 1e-5, 1, 0, 0, 0]
@@ -19,7 +19,9 @@ def stopping_distance(velocity: tuple[float, float], name: str, magnitude: float
     """Launch the block [m/s] from (x, 0) and return how far it gets [m]."""
     made = hidden(name, magnitude, SLIDE)
     model = SLIDE.world([made.effect]).compile()
-    trial = Trial(0.8, qpos={"block_joint": [x, 0.0, *FLAT]}, qvel={"block_joint": [*velocity, 0, 0, 0, 0]}, settle=0.1)
+    trial = RigTrial(
+        0.8, qpos={"block_joint": [x, 0.0, *FLAT]}, qvel={"block_joint": [*velocity, 0, 0, 0, 0]}, settle=0.1
+    )
     motion, _, _ = perform(model, trial, [made.effect], SLIDE.physics)
     return float(np.linalg.norm(motion.sensordata[-1, :2] - motion.sensordata[0, :2]))
 
@@ -48,7 +50,7 @@ def flight(name: str, magnitude: float, velocity: tuple[float, float, float], du
     made = hidden(name, magnitude, DROP)
     model = DROP.world([made.effect]).compile()
     start = [0, 0, 5.0, 1, 0, 0, 0]
-    trial = Trial(duration, qpos={"ball_joint": start}, qvel={"ball_joint": [*velocity, 0, 0, 0]})
+    trial = RigTrial(duration, qpos={"ball_joint": start}, qvel={"ball_joint": [*velocity, 0, 0, 0]})
     seen, _, _ = perform(model, trial, [made.effect], DROP.physics)
     void, _, _ = perform(DROP.world().compile(), trial, [], DROP.physics)
     return seen.sensordata[-1, :3] - void.sensordata[-1, :3]
@@ -80,7 +82,7 @@ def test_torsional_friction_stops_a_spin_after_its_torque():
     made = hidden("torsional_friction", coefficient, SPIN)
     model = SPIN.world([made.effect]).compile()
     start = [0, 0, 0.03 - 1e-4, 1, 0, 0, 0]
-    trial = Trial(0.2, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settle=0.2)
+    trial = RigTrial(0.2, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settle=0.2)
     motion, _, _ = perform(model, trial, [made.effect], SPIN.physics)
     turned = 2 * np.arctan2(motion.sensordata[-1, 6], motion.sensordata[-1, 3])
     slowing = coefficient * 9.81 / (0.4 * 0.03**2)

@@ -7,7 +7,7 @@ import torch
 
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, Recording
 from concent_warp.render.cameras import Camera
-from concent_warp.render.raw import RawCamera, Stage
+from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.render.splats.splats import Splats
 from concent_warp.scene.scene import Scene
 
@@ -75,7 +75,7 @@ def states(seed: int, count: int) -> np.ndarray:
 def filmed(qpos: np.ndarray, cameras=("base", "wrist"), objects: bool = False) -> dict[str, np.ndarray]:
     """Return what the real cameras see, uint8, shape (T, SIZE, SIZE, 3) each."""
     model = real_model()
-    stage = Stage(model, len(qpos))
+    stage = PosedWorlds(model, len(qpos))
     eye = RawCamera(stage, cameras, (SIZE, SIZE), leave_out=() if objects else ("ball",), shadows=True)
     stage.place(qpos)
     images = (255 * eye.render().rgb).round().to(torch.uint8).numpy()

@@ -5,7 +5,7 @@ import torch
 from small_arm import XML, ball, states
 
 from concent_warp.render.composite import HybridCamera, _composed
-from concent_warp.render.figure import Album, decomposition
+from concent_warp.render.figure import FrameSelection, decomposition
 from concent_warp.render.raw import _camera_ids
 from concent_warp.render.shadows import ShadowCfg
 from concent_warp.scene.scene import Scene
@@ -92,7 +92,7 @@ def test_figure_has_a_row_for_each_sample_and_camera(tmp_path):
     import cv2
 
     camera = HybridCamera(Scene(XML).model, ["base", "wrist"], SIZE, 2, objects=["ball"], splats={"ball": ball()})
-    album = Album()
+    album = FrameSelection()
     for state in states(0, 21):
         album.add(camera.shoot(np.tile(state, (2, 1))), world=1)
     chosen = album.chosen()

@@ -16,7 +16,7 @@ from concent_warp.render.networks.cfg import (
 from concent_warp.render.networks.flow import draw, flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
-from concent_warp.render.networks.pairs import Pairs, _columns, _frames_before
+from concent_warp.render.networks.pairs import ImagePairs, _columns, _frames_before
 from concent_warp.render.networks.super_resolution import SuperResolution, _enlarged, reduced
 from concent_warp.render.networks.train import RenderTraining
 
@@ -39,7 +39,7 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def pairs(name="base", body=None, count=12) -> Pairs:
+def pairs(name="base", body=None, count=12) -> ImagePairs:
     """Return frames of a bright square that moves; the simulation shows it dark."""
     camera = Camera(name, body, (0, 0, 1), (1, 0, 0, 0), 45.0)
     real = torch.full((count, 3, 64, 64), 120, dtype=torch.uint8)
@@ -47,7 +47,7 @@ def pairs(name="base", body=None, count=12) -> Pairs:
     for k in range(count):
         real[k, 0, 16:32, 4 * k : 4 * k + 16] = 250
         simulated[k, :, 16:32, 4 * k : 4 * k + 16] = 80
-    return Pairs(camera, real, simulated, torch.rand(count, 9), _frames_before([count]))
+    return ImagePairs(camera, real, simulated, torch.rand(count, 9), _frames_before([count]))
 
 
 def test_flow_of_a_perfect_network_ends_at_its_image():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from concent_warp.errors import RenderError, SceneError
-from concent_warp.render.raw import RawCamera, Stage, _camera_ids, _matrix_quaternions
+from concent_warp.render.raw import PosedWorlds, RawCamera, _camera_ids, _matrix_quaternions
 from concent_warp.scene.cameras import BASE, WRIST, with_cameras
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
@@ -30,7 +30,7 @@ def sorter() -> tuple[mujoco.MjModel, np.ndarray]:
 
 def test_sphere_above_a_plane_is_where_geometry_has_it():
     model = Scene(XML).model
-    stage = Stage(model, 2)
+    stage = PosedWorlds(model, 2)
     camera = RawCamera(stage, ["above"], (33, 33))
     qpos = np.tile(model.qpos0, (2, 1))
     qpos[1, 0] = 0.15
@@ -48,7 +48,7 @@ def test_sphere_above_a_plane_is_where_geometry_has_it():
 
 def test_depth_and_segmentation_are_those_of_c_mujoco(sorter):
     model, qpos = sorter
-    stage = Stage(model, 1)
+    stage = PosedWorlds(model, 1)
     images = RawCamera(stage, [BASE, WRIST], SIZE)
     stage.place(qpos[None])
     found = images.render()
@@ -82,7 +82,7 @@ def cast_through_pixels(model, data, name, matrix):
 
 def test_images_are_the_ray_tracers_memory_and_follow_it(sorter):
     model, qpos = sorter
-    stage = Stage(model, 2)
+    stage = PosedWorlds(model, 2)
     camera = RawCamera(stage, [BASE], SIZE)
     stage.place(np.tile(qpos, (2, 1)))
     first = camera.render()
@@ -99,7 +99,7 @@ def test_images_are_the_ray_tracers_memory_and_follow_it(sorter):
 
 def test_bodies_that_are_left_out_show_what_is_behind_them(sorter):
     model, qpos = sorter
-    stage = Stage(model, 1)
+    stage = PosedWorlds(model, 1)
     whole, without = (RawCamera(stage, [BASE], (48, 48), leave_out=out) for out in ((), ("block", "box")))
     stage.place(qpos[None])
     objects = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name in ("block", "box")]
@@ -112,7 +112,7 @@ def test_bodies_that_are_left_out_show_what_is_behind_them(sorter):
 
 def test_wrist_camera_moves_with_the_hand_and_poses_are_those_of_mujoco(sorter):
     model, qpos = sorter
-    stage = Stage(model, 1)
+    stage = PosedWorlds(model, 1)
     data = mujoco.MjData(model)
     for angle in (0.0, 0.4):
         data.qpos[:] = qpos
@@ -129,7 +129,7 @@ def test_wrist_camera_moves_with_the_hand_and_poses_are_those_of_mujoco(sorter):
 
 def test_camera_that_is_not_there_is_said_in_one_sentence(sorter):
     with pytest.raises(RenderError, match=r"no such camera.*base.*found \['side'\]"):
-        RawCamera(Stage(sorter[0], 1), ["side"], SIZE)
+        RawCamera(PosedWorlds(sorter[0], 1), ["side"], SIZE)
     with pytest.raises(SceneError, match="no such camera"):
         with_cameras(Scene(XML), ["wrist"])
 
@@ -153,7 +153,7 @@ def test_images_of_a_gpu_are_those_of_the_cpu(sorter):
     states[:, 0] += np.linspace(0, 0.3, 4)
     found = []
     for device in ("cpu", "cuda:0"):
-        stage = Stage(model, 4, device=device)
+        stage = PosedWorlds(model, 4, device=device)
         camera = RawCamera(stage, [BASE, WRIST], (64, 64))
         for _ in range(3):  # the third one is a replay of what the first recorded
             stage.place(states)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.effect import Effect, Parameter, written
-from concent_warp.effects.force_model import Law
+from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
 from concent_warp.model import Model
@@ -161,7 +161,7 @@ class Needy(Effect):
         return (Parameter("size", "-", 0.0, 0.0, 1.0, 0.1),)
 
 
-class NoKernel(Law):
+class NoKernel(ForceModel):
     def apply(self, m, d, values):  # noqa: ARG002
         d.qfrc_applied[0] += values[0]
 

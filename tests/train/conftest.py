@@ -4,7 +4,7 @@ from small_insertion import SETTINGS, make_task
 
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.resets.sample import ResetStates, draw_states
 from concent_warp.train.task.task import Task
 
 
@@ -14,11 +14,11 @@ def task() -> Task:
 
 
 @pytest.fixture(scope="session")
-def states(task: Task) -> InitialStates:
+def states(task: Task) -> ResetStates:
     return draw_states(task, SETTINGS.reset, 0, count=40)
 
 
 @pytest.fixture
-def environment(task: Task, states: InitialStates) -> Environment:
+def environment(task: Task, states: ResetStates) -> Environment:
     torch.manual_seed(0)
     return make_environment(task, SETTINGS, states, device="cpu")

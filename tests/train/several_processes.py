@@ -14,20 +14,20 @@ from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import Ranks
 from concent_warp.train.learning.ppo import Trainer
 from concent_warp.train.resets.sample import draw_states
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
 
-def make_run() -> Run:
+def make_run() -> TrainingRun:
     model = make_model()
     demonstration = make_demonstration(model)
     environment = replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8))
     recording = Recording(model.scene.xml, (demonstration,))
-    return Run(model, recording, make_events(model, demonstration), TrainCfg(environment=environment, ppo=PPO))
+    return TrainingRun(model, recording, make_events(model, demonstration), TrainCfg(environment=environment, ppo=PPO))
 
 
-def rounds(run: Run, count: int) -> Run:
+def rounds(run: TrainingRun, count: int) -> TrainingRun:
     return replace(run, cfg=replace(run.cfg, ppo=replace(PPO, iterations=count)))
 
 

@@ -12,7 +12,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.policy.evaluate import run_episodes
-from concent_warp.train.resets.sample import InitialStates, draw_states
+from concent_warp.train.resets.sample import ResetStates, draw_states
 from concent_warp.train.task.movable import movable
 from concent_warp.train.task.stages import _worst_distance
 from concent_warp.train.task.task import Task
@@ -26,7 +26,7 @@ def chain() -> Task:
 
 
 @pytest.fixture(scope="module")
-def drawn(chain) -> InitialStates:
+def drawn(chain) -> ResetStates:
     return draw_states(chain, CHAIN.reset, 0, count=80)
 
 

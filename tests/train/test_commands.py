@@ -12,7 +12,7 @@ from concent_warp.effects.effect import AddedEffect, Parameter
 from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.commands import Follower, Following
+from concent_warp.train.environment.commands import CommandDynamics, CommandFilter
 from concent_warp.train.environment.effects import effects_of_worlds
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.task.task import Task
@@ -49,11 +49,11 @@ def test_commands_are_followed_as_the_effects_have_it(late):
     parts = []
     for added, row in zip(late.model.effects, rows, strict=True):
         found = [added.effect.late(late.compiled, value) for value in row]
-        parts.append(Following(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
-    following = Following.of(parts)
+        parts.append(CommandDynamics(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
+    following = CommandDynamics.of(parts)
     assert following is not None
     assert len(values.late) == 2
-    follower = Follower(following, late.compiled.opt.timestep, DECIMATION, "cpu")
+    follower = CommandFilter(following, late.compiled.opt.timestep, DECIMATION, "cpu")
     ctrl = rng.normal(size=(30, WORLDS, late.compiled.nu)).astype(np.float32)
     follower.begin(torch.ones(WORLDS, dtype=torch.bool), torch.from_numpy(ctrl[0]))
     acted = []
@@ -68,7 +68,7 @@ def test_commands_are_followed_as_the_effects_have_it(late):
 
 def test_worlds_that_begin_anew_forget_what_was_commanded(late):
     lag = np.full((2, late.compiled.nu), 0.1)
-    follower = Follower(Following(lag, (lag,)), 0.005, DECIMATION, "cpu")
+    follower = CommandFilter(CommandDynamics(lag, (lag,)), 0.005, DECIMATION, "cpu")
     old, new = torch.zeros(2, late.compiled.nu), torch.ones(2, late.compiled.nu)
     follower.begin(torch.tensor([True, True]), old)
     follower.follow(new)

@@ -8,7 +8,7 @@ import torch
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError
-from concent_warp.reality.hidden.in_task import MET, TaskWorld, _pads, wanted
+from concent_warp.reality.hidden.in_task import MET, TaskWorld, pads, wanted
 from concent_warp.reality.rigs.grasp import SCENE
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
@@ -116,5 +116,5 @@ def test_unknown_effects_are_refused_before_anything_runs(capsys):
 
 
 def test_pads_are_the_geoms_of_all_fingers():
-    assert _pads(SCENE.model, ["gripper"]) == ("left_pad", "right_pad")
-    assert _pads(SCENE.model, ["nothing"]) == ()
+    assert pads(SCENE.model, ["gripper"]) == ("left_pad", "right_pad")
+    assert pads(SCENE.model, ["nothing"]) == ()

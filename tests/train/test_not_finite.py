@@ -11,7 +11,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round, Trainer
+from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, Trainer
 
 WORLD, WORLDS = 2, 6
 NAN = float("nan")
@@ -102,7 +102,7 @@ def test_policy_is_the_same_whether_a_world_ends_not_finite_or_too_fast(task, st
         environment.reset()
         trainer.learn()
         assert sum(this.log["diverged worlds"] for this in trainer.history) == 1
-        with np.load(tmp_path / str(value) / OFFENCE) as offence:
+        with np.load(tmp_path / str(value) / DIVERGED_STATE_FILE) as offence:
             assert np.isnan(offence["qvel"][0]) if value != value else offence["qvel"][0] == value
         found.append(trainer.algorithm.save())
     for name in ("actor_state_dict", "critic_state_dict"):
@@ -131,7 +131,7 @@ def test_training_that_diverges_stops_and_keeps_its_last_checkpoint(task, states
     cfg = TrainCfg(checkpoint=1, environment=SETTINGS, ppo=replace(PPO, iterations=8, schedule="fixed"))
     trainer = Trainer(environment, cfg, tmp_path)
 
-    def spoil(this: Round) -> None:
+    def spoil(this: Iteration) -> None:
         if this.iteration == 2:
             trainer.algorithm.optimizer.param_groups[0]["lr"] = 1e30
 

@@ -20,7 +20,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 Trained = tuple[Path, torch.Tensor, torch.Tensor]
 
@@ -35,7 +35,7 @@ def trained(tmp_path_factory) -> Trained:
     environment = replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8))
     folder = tmp_path_factory.mktemp("run")
     trainer, _ = train_run(
-        Run(model, recording, events, TrainCfg(environment=environment, ppo=ppo)), folder, device="cpu"
+        TrainingRun(model, recording, events, TrainCfg(environment=environment, ppo=ppo)), folder, device="cpu"
     )
     seen = trainer.environment.get_observations()["policy"]
     seen = seen[[0, 1, 2, 3, 0]] + 0.3 * torch.randn(5, seen.shape[1], generator=torch.Generator().manual_seed(0))
@@ -86,7 +86,7 @@ def test_commands_follow_from_metadata_alone(trained, tmp_path):
 
     folder, _, _ = trained
     said = Policy.load(folder).export(tmp_path / "policy.onnx")
-    run = Run.load(folder)
+    run = TrainingRun.load(folder)
     task = run.task()
     environment = make_environment(task, run.cfg.environment, run.evaluation_states(task, 4, 0), device="cpu")
     environment.start_from(range(4))

@@ -16,7 +16,7 @@ from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, pretrained_checkpoint
 from concent_warp.train.policy.ship import ship
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_sma
         assert "/" not in origin["command"]
         assert origin["steps"] > 0
         assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
-        run = Run.load(FOLDER / name)
+        run = TrainingRun.load(FOLDER / name)
         weights = torch.load(pretrained_checkpoint(name), weights_only=False)["actor_state_dict"]
         assert weights["obs_normalizer._mean"].shape[1] == Layout.of(run.task()).size
 
@@ -82,7 +82,7 @@ def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_p
     for name, value in whole[0]["actor_state_dict"].items():
         assert torch.equal(value, whole[1]["actor_state_dict"][name])
     assert (small / CHECKPOINT).stat().st_size < 0.6 * (folder / CHECKPOINT).stat().st_size
-    tasks = [Run.load(path).task() for path in (folder, small)]
+    tasks = [TrainingRun.load(path).task() for path in (folder, small)]
     np.testing.assert_array_equal(tasks[0].replay.qpos, tasks[1].replay.qpos)
     for name in ("body_a", "point_a", "body_b", "point_b", "used"):
         np.testing.assert_array_equal(getattr(tasks[0].table, name), getattr(tasks[1].table, name))

@@ -18,22 +18,22 @@ from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
-from concent_warp.train.learning.ppo import CHECKPOINT, OFFENCE, Round
+from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration
 from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.run import Run, train_run
+from concent_warp.train.run import TrainingRun, train_run
 
 LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
 
 @pytest.fixture(scope="module")
-def made() -> Run:
+def made() -> TrainingRun:
     model = make_model()
     recording = Recording(model.scene.xml, (make_demonstration(model),))
     events = extract(model, recording[0], MujocoEngine(model, threads=1))
     cfg = TrainCfg(environment=replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8)), ppo=SHORT)
-    return Run(model, recording, events, cfg)
+    return TrainingRun(model, recording, events, cfg)
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
@@ -73,7 +73,7 @@ def test_resumed_training_is_the_same_as_one_that_was_not_stopped(made, tmp_path
 
 
 def test_interruption_keeps_what_was_learnt(made, tmp_path):
-    def interrupt(this: Round) -> None:
+    def interrupt(this: Iteration) -> None:
         if this.iteration == 2:
             raise KeyboardInterrupt
 
@@ -133,7 +133,7 @@ def test_first_diverged_state_is_saved(made, tmp_path, monkeypatch):
     _, last = train_run(made, tmp_path, device="cpu")
     assert last is not None
     assert last.log["diverged worlds"] > 0
-    assert (tmp_path / OFFENCE).is_file()
+    assert (tmp_path / DIVERGED_STATE_FILE).is_file()
 
 
 def test_interval_is_wilsons():

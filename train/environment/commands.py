@@ -18,7 +18,7 @@ ATOMIC = 1e-5
 
 
 @dataclass(frozen=True)
-class Following:
+class CommandDynamics:
     """How what acts in N worlds follows what was commanded."""
 
     delay: np.ndarray
@@ -27,19 +27,19 @@ class Following:
     """Time constants of lags, one after the other [s], shape (N, nu) each."""
 
     @staticmethod
-    def of(parts: Sequence[Following]) -> Following | None:
+    def of(parts: Sequence[CommandDynamics]) -> CommandDynamics | None:
         """Return what several come to, None where nothing is late."""
         if not parts:
             return None
         lags = tuple(lag for part in parts for lag in part.lags if lag.max() > ATOMIC)
         delay = np.sum([part.delay for part in parts], axis=0)
-        return Following(delay, lags) if lags or delay.max() > 0 else None
+        return CommandDynamics(delay, lags) if lags or delay.max() > 0 else None
 
 
-class Follower:
+class CommandFilter:
     """Turns the commands of N worlds into what acts in each step of an action. Captured with what surrounds it."""
 
-    def __init__(self, following: Following, timestep: float, decimation: int, device: str) -> None:
+    def __init__(self, following: CommandDynamics, timestep: float, decimation: int, device: str) -> None:
         """Make room.
 
         Args:

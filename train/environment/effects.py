@@ -16,15 +16,15 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
-from concent_warp.train.environment.commands import Following
+from concent_warp.train.environment.commands import CommandDynamics
 from concent_warp.train.task.task import Task
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 QUANTILE = 1.959964
 """Half width of the 95 % interval of a normal distribution in standard deviations."""
-Laws = list[tuple["Law", np.ndarray]]
+Laws = list[tuple["ForceModel", np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class EffectsOfWorlds:
     """Values of the model fields that differ between worlds, shape (N, ...) each."""
     laws: Laws
     """Force laws with their parameters in each world, shape (N, P) each."""
-    late: tuple[Following, ...]
+    late: tuple[CommandDynamics, ...]
     """Delays and lags of the commands, of each effect on them."""
     values: tuple[np.ndarray, ...]
     """Parameters of each effect, shape (N, P) each."""
@@ -79,11 +79,11 @@ def effects_of_worlds(
     return EffectsOfWorlds(fields, laws, late, tuple(values), tuple(kept))
 
 
-def _following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> Following:
+def _following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> CommandDynamics:
     """Return how commands are followed under an effect on them; its parameters in the worlds are of shape (N, P)."""
     found = [effect.late(m, row) for row in values]
     delay, lag = (np.array([late[k] for late in found if late is not None]) for k in range(2))
-    return Following(delay, (lag,))
+    return CommandDynamics(delay, (lag,))
 
 
 def _any_open(added: AddedEffect) -> bool:

@@ -26,7 +26,7 @@ from concent_warp.train.environment.physics import Graph, Physics, captured
 from concent_warp.train.environment.reward import disturbance, effort, engineered, relative_pose
 from concent_warp.train.environment.rotation import inverse, rotate
 from concent_warp.train.environment.vcp import virtual_collision
-from concent_warp.train.resets.sample import InitialStates
+from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
 TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
@@ -47,7 +47,7 @@ class Environment(VecEnv):
     the target's pairs have been together for some steps, and its episode ends when object 1 has come to rest in place.
     """
 
-    def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: InitialStates) -> None:
+    def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: ResetStates) -> None:
         """Make the environment and start all worlds.
 
         Args:

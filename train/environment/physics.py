@@ -15,10 +15,10 @@ import warp as wp
 
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
-from concent_warp.train.environment.commands import Follower, Following
+from concent_warp.train.environment.commands import CommandDynamics, CommandFilter
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -92,10 +92,10 @@ class MujocoPhysics:
         model: mujoco.MjModel,
         worlds: int,
         decimation: int,
-        laws: Sequence[tuple[Law, np.ndarray]] = (),
+        laws: Sequence[tuple[ForceModel, np.ndarray]] = (),
         actors: Sequence[Sequence[Actor]] = (),
         fields: Mapping[str, np.ndarray] | None = None,
-        following: Following | None = None,
+        following: CommandDynamics | None = None,
     ) -> None:
         """Make the worlds.
 
@@ -109,7 +109,7 @@ class MujocoPhysics:
             following: How what acts follows the commands; at once by default.
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
-        self._follower = following and Follower(following, model.opt.timestep, decimation, self.device)
+        self._follower = following and CommandFilter(following, model.opt.timestep, decimation, self.device)
         self.memory = {} if self._follower is None else self._follower.memory
         self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
         self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
@@ -221,13 +221,13 @@ class WarpPhysics:
         model: mujoco.MjModel,
         worlds: int,
         decimation: int,
-        laws: Sequence[tuple[Law, np.ndarray]] = (),
+        laws: Sequence[tuple[ForceModel, np.ndarray]] = (),
         *,
         device: str,
         nconmax: int,
         njmax: int,
         fields: Mapping[str, np.ndarray] | None = None,
-        following: Following | None = None,
+        following: CommandDynamics | None = None,
         capture: bool = True,
     ) -> None:
         """Make the worlds and capture their step.
@@ -266,7 +266,7 @@ class WarpPhysics:
             self._model = made.mjw
             wp.synchronize_device(self._warp_device)
             self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
-            self._laws: list[tuple[Law, Any]] = [(law, wp.array(values, dtype=float)) for law, values in laws]
+            self._laws: list[tuple[ForceModel, Any]] = [(law, wp.array(values, dtype=float)) for law, values in laws]
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
             self._follow(following, capture)
@@ -292,13 +292,13 @@ class WarpPhysics:
             d.overflow.zero_()
         wp.synchronize_device(self._warp_device)
 
-    def _follow(self, following: Following | None, capture: bool) -> None:
+    def _follow(self, following: CommandDynamics | None, capture: bool) -> None:
         """Keep the commands apart from what acts, where the one follows the other."""
         self._follower, self.memory, self._acting = None, {}, None
         if following is None:
             return
         self.ctrl = torch.zeros_like(self.ctrl)
-        follower = Follower(following, float(self.model.opt.timestep), self._decimation, self.device)
+        follower = CommandFilter(following, float(self.model.opt.timestep), self._decimation, self.device)
         self._follower, self.memory = follower, follower.memory
         self._acting = [wp.from_torch(acts) for acts in follower.acting]
         self._filter = captured(lambda: follower.follow(self.ctrl), capture and self._warp_device.is_cuda)

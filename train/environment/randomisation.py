@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.commands import Following
+from concent_warp.train.environment.commands import CommandDynamics
 from concent_warp.train.task.task import Task
 
 ONE, NONE = (1.0, 1.0), (0.0, 0.0)
@@ -70,7 +70,7 @@ def drawn_fields(
     return found
 
 
-def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> Following:
+def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> CommandDynamics:
     """Return the delay and the lag of the arm's commands in N worlds."""
     rng = np.random.default_rng([seed, 4])
     times = []
@@ -79,7 +79,7 @@ def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -
         if extent != NONE:
             values[:, task.robot.actuator] = rng.uniform(*extent, (worlds, 1))
         times.append(values)
-    return Following(times[0], (times[1],))
+    return CommandDynamics(times[0], (times[1],))
 
 
 def _moved_by_robot(task: Task) -> list[int]:

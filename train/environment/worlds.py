@@ -7,12 +7,12 @@ import copy
 import mujoco
 
 from concent_warp.train.cfg import EnvironmentCfg
-from concent_warp.train.environment.commands import Following
+from concent_warp.train.environment.commands import CommandDynamics
 from concent_warp.train.environment.effects import effects_of_worlds
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics, Physics, WarpPhysics
 from concent_warp.train.environment.randomisation import drawn_fields, drawn_following
-from concent_warp.train.resets.sample import InitialStates
+from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
 ROOM = 2.0
@@ -30,7 +30,7 @@ CONES = {
 
 
 def make_environment(
-    task: Task, cfg: EnvironmentCfg, states: InitialStates, *, device: str | None = None, seed: int = 0
+    task: Task, cfg: EnvironmentCfg, states: ResetStates, *, device: str | None = None, seed: int = 0
 ) -> Environment:
     """Return the environment of a task on a device, the first CUDA device by default where there is one."""
     return Environment(task, cfg, _make_physics(task, cfg, device=device, seed=seed), states)
@@ -50,7 +50,7 @@ def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None,
         from concent_warp.simulate.warp_model import batchable as variable
     effects = effects_of_worlds(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
     fields = drawn_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
-    following = Following.of([*effects.late, drawn_following(task, cfg.worlds, cfg.randomisation, seed)])
+    following = CommandDynamics.of([*effects.late, drawn_following(task, cfg.worlds, cfg.randomisation, seed)])
     if plain:
         return MujocoPhysics(m, cfg.worlds, cfg.simulation_steps, effects.laws, fields=fields, following=following)
     contacts, constraints = buffers(task, cfg)

@@ -25,7 +25,7 @@ from concent_warp.train.learning.normalisation import bound_observations
 
 CHECKPOINT = "checkpoint.pt"
 """File of the latest state of a training in its run folder."""
-OFFENCE = "diverged.npz"
+DIVERGED_STATE_FILE = "diverged.npz"
 """File of the first state from which a world diverged."""
 
 
@@ -33,7 +33,7 @@ Total = Callable[[torch.Tensor], torch.Tensor]
 """Adds up what several processes have each for themselves."""
 
 
-class Trainee(Protocol):
+class TrainingEnvironment(Protocol):
     """What PPO needs of an environment: rsl-rl's `VecEnv`, a log read once a round, and states to go on from."""
 
     num_envs: int
@@ -49,7 +49,7 @@ class Trainee(Protocol):
 
 
 @dataclass
-class Round:
+class Iteration:
     """What a round of collecting and updating came to."""
 
     iteration: int
@@ -68,14 +68,14 @@ class Round:
     """What the environment and the losses came to."""
 
 
-Report = Callable[[Round], None]
+Report = Callable[[Iteration], None]
 
 
 class Trainer:
     """A policy in training."""
 
     def __init__(
-        self, environment: Trainee, cfg: TrainCfg, folder: Path | None = None, ranks: Ranks | None = None
+        self, environment: TrainingEnvironment, cfg: TrainCfg, folder: Path | None = None, ranks: Ranks | None = None
     ) -> None:
         """Make policy and value function.
 
@@ -94,10 +94,10 @@ class Trainer:
         if not self.ranks.first:
             _seed_everything(self.ranks.seed(cfg.seed))
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
-        self.history: list[Round] = []
+        self.history: list[Iteration] = []
         self._offended = False
 
-    def learn(self, report: Report | None = None, *, seconds: float | None = None) -> Round | None:
+    def learn(self, report: Report | None = None, *, seconds: float | None = None) -> Iteration | None:
         """Train to the last round, to the target, or for some time, and return the last round.
 
         A checkpoint is written every so many rounds, at the end, and when the training is interrupted.
@@ -112,7 +112,7 @@ class Trainer:
         begun = time.monotonic()
         self.algorithm.train_mode()
         observations = self.environment.get_observations()
-        last: Round | None = None
+        last: Iteration | None = None
         with self._writer() as write, self.ranks.interruptions() as interrupted:
             try:
                 while self.iteration < self.cfg.ppo.iterations:
@@ -137,7 +137,7 @@ class Trainer:
         """Return what the first process thinks: clocks differ."""
         return late if self.ranks.alone else self.ranks.gathered(late)[0]
 
-    def _round(self, observations: TensorDict) -> tuple[Round, TensorDict]:
+    def _round(self, observations: TensorDict) -> tuple[Iteration, TensorDict]:
         """Collect and update once."""
         ppo, environment = self.algorithm, self.environment
         start = time.monotonic()
@@ -159,7 +159,7 @@ class Trainer:
         log |= {f"loss {name}": value for name, value in means.items()}
         log |= {"learning rate": ppo.learning_rate, "std": float(ppo.actor.output_std.detach().mean())}
         rate = self.steps_of_round / (end - start)
-        this = Round(self.iteration, self.steps, self.seconds, collected - start, end - collected, rate, log)
+        this = Iteration(self.iteration, self.steps, self.seconds, collected - start, end - collected, rate, log)
         self.history.append(this)
         return this, observations
 
@@ -204,9 +204,9 @@ class Trainer:
             return
         states = [state for state in self.ranks.gathered(self.environment.offending_state()) if state is not None]
         self._offended = bool(states)
-        if not states or self.folder is None or not self.ranks.first or (self.folder / OFFENCE).exists():
+        if not states or self.folder is None or not self.ranks.first or (self.folder / DIVERGED_STATE_FILE).exists():
             return
-        np.savez(self.folder / OFFENCE, **states[0])  # pyright: ignore[reportArgumentType]
+        np.savez(self.folder / DIVERGED_STATE_FILE, **states[0])  # pyright: ignore[reportArgumentType]
 
     @contextlib.contextmanager
     def _writer(self) -> Iterator[Report]:
@@ -216,7 +216,7 @@ class Trainer:
             return
         with curve(self.folder, self.steps) as write:
 
-            def write_round(this: Round) -> None:
+            def write_round(this: Iteration) -> None:
                 spent = {"collecting": this.collecting, "updating": this.updating}
                 point = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds}
                 # The environment's log counts the steps of this round alone: those so far go last.
@@ -287,12 +287,12 @@ class Trainer:
         return self.algorithm.get_policy()
 
 
-def _ignore(this: Round) -> None:
+def _ignore(this: Iteration) -> None:
     """Do nothing with a round."""
     del this
 
 
-def _make_ppo(environment: Trainee, cfg: PpoCfg, ranks: Ranks) -> PPO:
+def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, ranks: Ranks) -> PPO:
     """Return rsl-rl's PPO for an environment; its gradients are averaged over the processes."""
     settings = {
         "num_steps_per_env": cfg.steps,

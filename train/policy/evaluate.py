@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.resets.sample import InitialStates
+from concent_warp.train.resets.sample import ResetStates
 
 PolicyFunction = Callable[[TensorDict], torch.Tensor]
 """From observations to actions, shape (N, A), without exploration."""
@@ -90,7 +90,7 @@ class Evaluation:
 def run_episodes(
     environment: Environment,
     policy: PolicyFunction,
-    states: InitialStates,
+    states: ResetStates,
     *,
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,

@@ -24,7 +24,7 @@ from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.learning.normalisation import bound_observations
 from concent_warp.train.learning.ppo import network
-from concent_warp.train.run import Run
+from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
 
 FORMAT, VERSION = "concent-policy", 1
@@ -36,7 +36,7 @@ PACKAGES = ("concent-warp", "torch", "onnx", "rsl-rl-lib", "mujoco", "mujoco-war
 SUFFIXES = (".onnx", ".pt")
 
 
-def export(run: Run, weights: Mapping[str, Any], out: Path) -> dict[str, Any]:
+def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str, Any]:
     """Write a run's policy without exploration, and return its metadata.
 
     Args:

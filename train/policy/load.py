@@ -12,7 +12,7 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
 from concent_warp.train.policy.evaluate import PolicyFunction
 from concent_warp.train.policy.pretrained import FOLDER, names, pretrained_checkpoint
-from concent_warp.train.run import Run
+from concent_warp.train.run import TrainingRun
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Policy:
         ['pick', 'align', 'insert']
     """
 
-    run: Run
+    run: TrainingRun
     """Model, demonstration, contact events and settings that it was trained with."""
     weights: Mapping[str, Any] = field(repr=False)
     """The checkpoint: tensors and plain data."""
@@ -54,7 +54,7 @@ class Policy:
             raise TrainError("no such training", where=path, expected="its run folder, or a checkpoint file in one")
         checkpoint = path / CHECKPOINT if path.is_dir() else path
         weights = load_checkpoint(checkpoint)
-        return Policy(Run.load(checkpoint.parent), weights, checkpoint.parent)
+        return Policy(TrainingRun.load(checkpoint.parent), weights, checkpoint.parent)
 
     @property
     def pretrained(self) -> bool:

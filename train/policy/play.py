@@ -18,7 +18,7 @@ TOUCH = 5e-4
 
 
 @dataclass(frozen=True)
-class Moment:
+class PlayedState:
     """What there is to see between two steps."""
 
     position: np.ndarray
@@ -41,7 +41,7 @@ class Player:
     def __init__(self, environment: Environment, policy: PolicyFunction, episodes: int) -> None:
         """Start the first of the episodes that the environment has initial states for."""
         self.environment, self.policy = environment, policy
-        self.touches = Touches(environment.task)
+        self.touches = TouchingSpheres(environment.task)
         self.ended: list[str] = []
         """Outcomes of the episodes that have ended."""
         self._states, self._next = episodes, 0
@@ -70,13 +70,13 @@ class Player:
         self.begin()
         return outcome
 
-    def moment(self) -> Moment:
+    def moment(self) -> PlayedState:
         """Return what there is to see now."""
         environment, task = self.environment, self.environment.task
         position = environment.physics.position[0].cpu().numpy().astype(float)
         quaternion = environment.physics.quaternion[0].cpu().numpy().astype(float)
         stage = int(environment.stage[0])
-        return Moment(
+        return PlayedState(
             position=position,
             quaternion=quaternion,
             touching=self.touches.of(environment.physics.qpos[0].cpu().numpy(), position, quaternion),
@@ -86,7 +86,7 @@ class Player:
         )
 
 
-class Touches:
+class TouchingSpheres:
     """Tells which spheres of a model touch something, also those that the physics leaves out."""
 
     def __init__(self, task: Task) -> None:

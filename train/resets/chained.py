@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.train.cfg import ResetCfg
-from concent_warp.train.resets.reset_states import Draft, Drawing, about_vertical, place
+from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, about_vertical, place
 from concent_warp.train.task.task import Task
 
 FARTHER = 3.0
@@ -24,7 +24,7 @@ FARTHER = 3.0
 
 
 @dataclass(frozen=True)
-class Motion:
+class PlanarMotion:
     """A rigid motion about the vertical."""
 
     pivot: np.ndarray
@@ -39,7 +39,7 @@ class Motion:
         return self.pivot + about_vertical(self.turn) @ (point - self.pivot) + self.shift - point
 
 
-class ChainDrawing(Drawing):
+class ChainedResetSampler(ResetSampler):
     """Draws states of all stages of a chain, and starts of the whole."""
 
     def __init__(self, task: Task, cfg: ResetCfg, seed: int, device: str) -> None:
@@ -68,7 +68,7 @@ class ChainDrawing(Drawing):
         mujoco.mj_kinematics(self.m, self.d)
         return self.d.site_xpos[self.task.robot.tool].copy(), self.d.xpos[self.task.objects[0]].copy()
 
-    def draft(self) -> Draft:
+    def draft(self) -> ResetCandidate:
         """Draw a moment of some stage, or a start, and places of the objects."""
         begins = bool(self.rng.random() < self.cfg.free) and self.task.first == 0
         stage = self.task.first if begins else int(self.rng.choice(self.task.chained))
@@ -80,25 +80,25 @@ class ChainDrawing(Drawing):
         draft.kept = draft.kept and draft.case == 3
         return draft
 
-    def rearranged(self, draft: Draft) -> tuple[Motion, Motion]:
+    def rearranged(self, draft: ResetCandidate) -> tuple[PlanarMotion, PlanarMotion]:
         """Put object 2 elsewhere, and return what is done to objects 1 and 2."""
         motions = []
         for k in (0, 1):
             aside = self.rng.uniform(-self.cfg.place[k], self.cfg.place[k], 2)
             shift, turn = np.array([*aside, 0.0]), self.rng.uniform(-self.cfg.heading[k], self.cfg.heading[k])
-            motions.append(Motion(self.held_at[0][1], shift, turn))
+            motions.append(PlanarMotion(self.held_at[0][1], shift, turn))
         if len(self.task.objects) < 2:
             return motions[0], motions[0]
         free, mocap = self.free[1], self.mocap[1]
         if free is None and mocap is None:
-            return motions[0], Motion(np.zeros(3), np.zeros(3), 0.0)
+            return motions[0], PlanarMotion(np.zeros(3), np.zeros(3), 0.0)
         poses, address = (draft.mocap.ravel(), 7 * mocap) if mocap is not None else (draft.qpos, free)
         assert address is not None
-        second = Motion(poses[address : address + 3].copy(), motions[1].shift, motions[1].turn)
+        second = PlanarMotion(poses[address : address + 3].copy(), motions[1].shift, motions[1].turn)
         place(poses, address, second.pivot, (second.shift, second.turn))
         return motions[0], second
 
-    def bend(self, draft: Draft, motions: tuple[Motion, Motion]) -> None:
+    def bend(self, draft: ResetCandidate, motions: tuple[PlanarMotion, PlanarMotion]) -> None:
         """Move hand and object 1 to where they are on the way between objects that stand elsewhere."""
         first, second = motions
         tool, held = self.poses(draft.time)
@@ -106,7 +106,7 @@ class ChainDrawing(Drawing):
         address, farther = self.free[0], 1.0
         if draft.case == 1:
             share = self.progress(tool, 0, at=0)
-            moved = Motion(first.pivot, share * first.shift, share * first.turn)
+            moved = PlanarMotion(first.pivot, share * first.shift, share * first.turn)
             if address is not None:
                 place(draft.qpos, address, first.pivot, (first.shift, first.turn))
             if draft.begins:
@@ -116,7 +116,7 @@ class ChainDrawing(Drawing):
         else:
             share = self.progress(held, 1, at=1) if draft.case == 2 and draft.time < self.touch else 1.0
             shift = (1 - share) * first.of(held) + share * second.of(held)
-            moved = Motion(held, shift, (1 - share) * first.turn + share * second.turn)
+            moved = PlanarMotion(held, shift, (1 - share) * first.turn + share * second.turn)
         own, own_turn = (np.zeros(3), 0.0) if draft.kept else self.displacement(lift=True)
         shift, turn = moved.of(pivot) + farther * own, moved.turn + own_turn
         draft.position, draft.rotation = pivot + shift, about_vertical(turn) @ turn_matrix
@@ -129,7 +129,7 @@ class ChainDrawing(Drawing):
         whole = float(np.linalg.norm(end - start))
         return float(np.clip(1 - np.linalg.norm(end - point) / whole, 0, 1)) if whole > 1e-6 else 1.0
 
-    def wander(self, draft: Draft, share: float) -> None:
+    def wander(self, draft: ResetCandidate, share: float) -> None:
         """Start the search for joint positions elsewhere, so that arms with joints to spare take other postures too."""
         robot, reach = self.task.robot, share * self.cfg.joints
         draft.qpos[robot.qpos] += self.rng.uniform(-reach, reach, len(robot.qpos))

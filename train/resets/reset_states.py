@@ -21,7 +21,7 @@ ROUNDS = 20
 
 
 @dataclass(frozen=True)
-class InitialStates:
+class ResetStates:
     """M states at rest to start episodes from."""
 
     qpos: np.ndarray
@@ -45,7 +45,7 @@ class InitialStates:
 
 
 @dataclass
-class Draft:
+class ResetCandidate:
     """A state on its way."""
 
     time: float
@@ -71,7 +71,7 @@ class Draft:
     """The tool's orientation there, shape (3, 3)."""
 
 
-class Drawing:
+class ResetSampler:
     """Draws states of one stage and tries them in C MuJoCo.
 
     Moments are drawn from shortly before the stage that precedes it to the stage's first contact; for states that are
@@ -107,9 +107,9 @@ class Drawing:
         free = joint >= 0 and self.m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
         return int(self.m.jnt_qposadr[joint]) if free else None
 
-    def states(self, count: int, progress: Callable[[float], None] | None) -> InitialStates:
+    def states(self, count: int, progress: Callable[[float], None] | None) -> ResetStates:
         """Return `count` states."""
-        found: list[tuple[np.ndarray, Draft]] = []
+        found: list[tuple[np.ndarray, ResetCandidate]] = []
         for _ in range(ROUNDS):
             for draft in self.solved([self.draft() for _ in range(count)]):
                 if (settled := self.tried(draft)) is not None:
@@ -125,10 +125,10 @@ class Drawing:
             fix="displace them less, with --environment.reset.position and .turn",
         )
 
-    def collected(self, found: list[tuple[np.ndarray, Draft]]) -> InitialStates:
+    def collected(self, found: list[tuple[np.ndarray, ResetCandidate]]) -> ResetStates:
         """Return settled states in one."""
         drafts = [draft for _, draft in found]
-        return InitialStates(
+        return ResetStates(
             qpos=np.array([qpos for qpos, _ in found]),
             qvel=np.zeros((len(found), self.m.nv)),
             ctrl=np.array([draft.ctrl for draft in drafts]),
@@ -140,7 +140,7 @@ class Drawing:
             discarded=self.discarded,
         )
 
-    def draft(self) -> Draft:
+    def draft(self) -> ResetCandidate:
         """Draw a moment and a displacement."""
         start, onset, end = self.window
         kept = self.rng.random() < self.cfg.demonstrated
@@ -155,13 +155,13 @@ class Drawing:
             self.turn_in_hand(draft)
         return draft
 
-    def demonstrated(self, time: float, kept: bool, stage: int) -> Draft:
+    def demonstrated(self, time: float, kept: bool, stage: int) -> ResetCandidate:
         """Return a demonstrated moment as it is."""
         row = self.task.replay.row(time)
         qpos, ctrl = self.task.replay.qpos[row].copy(), self.task.replay.ctrl[row].copy()
-        return Draft(time, self.case(time), kept, qpos, ctrl, stage, self.places.copy())
+        return ResetCandidate(time, self.case(time), kept, qpos, ctrl, stage, self.places.copy())
 
-    def solved(self, drafts: list[Draft]) -> Iterator[Draft]:
+    def solved(self, drafts: list[ResetCandidate]) -> Iterator[ResetCandidate]:
         """Give the drafts with their joints decided, those left out that the hand cannot reach."""
         robot = self.task.robot
         asked = [i for i, draft in enumerate(drafts) if draft.position is not None]
@@ -189,7 +189,7 @@ class Drawing:
                 draft.qpos[robot.qpos] = joints
             yield draft
 
-    def tried(self, draft: Draft) -> np.ndarray | None:
+    def tried(self, draft: ResetCandidate) -> np.ndarray | None:
         """Return positions of a draft at rest, shape (nq,), None where it is discarded; sets its commands."""
         if not draft.kept and self.overlap(draft) > self.cfg.overlap:
             self.discarded["overlapping"] += 1
@@ -218,7 +218,7 @@ class Drawing:
                 touching |= len(names) > 1 and {contact.a, contact.b} == set(names[:2])
         return 1 + holding + (holding and touching)
 
-    def scatter(self, draft: Draft) -> None:
+    def scatter(self, draft: ResetCandidate) -> None:
         """Displace the robot's joints and every free object by themselves (case 1)."""
         robot, cfg, moved = self.task.robot, self.cfg, draft.qpos
         moved[robot.qpos] += self.rng.uniform(-cfg.joints, cfg.joints, len(robot.qpos))
@@ -229,7 +229,7 @@ class Drawing:
             if address is not None:
                 place(moved, address, moved[address : address + 3], self.displacement(lift=False))
 
-    def displace(self, draft: Draft) -> None:
+    def displace(self, draft: ResetCandidate) -> None:
         """Move hand and objects as one; where the hand is to be is left to inverse kinematics (cases 2 and 3)."""
         if self.free[0] is None:  # what is held hangs on a joint of its own, and cannot be moved along
             draft.kept = True
@@ -245,7 +245,7 @@ class Drawing:
             assert address is not None
             place(draft.qpos, address, pivot, (shift, turn))
 
-    def turn_in_hand(self, draft: Draft) -> None:
+    def turn_in_hand(self, draft: ResetCandidate) -> None:
         """Turn object 1 in the hand about the axis along which it is held, as it turns where an edge of it catches."""
         address, table, stage = self.free[0], self.task.table, draft.stage
         held = self.task.held[stage] & (table.body_b[stage] == self.task.objects[0])
@@ -266,7 +266,7 @@ class Drawing:
         up = self.rng.uniform(0, cfg.lift) if lift else 0.0
         return np.array([*aside, up]), float(self.rng.uniform(-cfg.turn, cfg.turn))
 
-    def overlap(self, draft: Draft) -> float:
+    def overlap(self, draft: ResetCandidate) -> float:
         """Return the deepest penetration of a sphere in another object or the surroundings [m], 0 for none.
 
         The hand counts only where it is to be clear of the objects.
@@ -284,7 +284,7 @@ class Drawing:
                 deepest = max(deepest, -float(contact.dist))
         return deepest
 
-    def settle(self, draft: Draft) -> np.ndarray | None:
+    def settle(self, draft: ResetCandidate) -> np.ndarray | None:
         """Return positions after the settling time, None where the state fell apart."""
         m, d = self.m, self.d
         mujoco.mj_resetData(m, d)
@@ -301,7 +301,7 @@ class Drawing:
             return None
         return d.qpos.copy()
 
-    def watched(self, draft: Draft) -> np.ndarray:
+    def watched(self, draft: ResetCandidate) -> np.ndarray:
         """Return what must not move while a draft settles [m]: object 1 in the hand, or where the hand is clear."""
         if draft.case > 1:
             return self.in_hand()

@@ -8,7 +8,7 @@ At a demonstrated moment the robot holds object 1 or does not, and object 1 touc
 
 Where one stage is trained, object 2 stays where it is fixed, and states between cases 2 and 3 are drawn: as
 demonstrated on object 2, or displaced, and lifted off it. Where stages are chained, objects stand anywhere, and all
-moments of the demonstration are drawn from (`ChainDrawing`).
+moments of the demonstration are drawn from (`ChainedResetSampler`).
 
 States whose inverse kinematics fails, whose displacement makes objects overlap, or whose chain breaks while they settle
 are discarded, and counted.
@@ -19,11 +19,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from concent_warp.train.cfg import ResetCfg
-from concent_warp.train.resets.chained import ChainDrawing
-from concent_warp.train.resets.reset_states import Drawing, InitialStates
+from concent_warp.train.resets.chained import ChainedResetSampler
+from concent_warp.train.resets.reset_states import ResetSampler, ResetStates
 from concent_warp.train.task.task import Task
 
-__all__ = ["InitialStates", "draw_states"]
+__all__ = ["ResetStates", "draw_states"]
 
 
 def draw_states(
@@ -34,7 +34,7 @@ def draw_states(
     count: int | None = None,
     device: str = "cpu",
     progress: Callable[[float], None] | None = None,
-) -> InitialStates:
+) -> ResetStates:
     """Draw initial states of the task's stage, or of all its stages.
 
     Args:
@@ -48,5 +48,5 @@ def draw_states(
     Raises:
         TrainError: Too few of the states drawn can be used.
     """
-    drawing = Drawing if task.demonstrated is None else ChainDrawing
+    drawing = ResetSampler if task.demonstrated is None else ChainedResetSampler
     return drawing(task, cfg, seed, device).states(cfg.states if count is None else count, progress)

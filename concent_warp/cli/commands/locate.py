@@ -12,7 +12,7 @@ from rich.markup import escape
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.locate import locate_forces
-from concent_warp.diagnosis.forces.result import Location
+from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.forces.window_forces import WindowCfg
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
@@ -45,7 +45,7 @@ class Arguments:
     """Replace files that are there."""
 
 
-def run(arguments: Arguments) -> Location:
+def run(arguments: Arguments) -> UnexplainedForces:
     """Locate, and print or write what was asked for."""
     if arguments.window is not None and not arguments.window > 0:
         raise RecordingError("a window must have a length", expected="--window above 0 s", found=arguments.window)

@@ -16,7 +16,7 @@ from concent_warp.run_folder import resuming_command
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
-    from concent_warp.train.learning.ppo import Round
+    from concent_warp.train.learning.ppo import Iteration
     from concent_warp.train.policy.load import Policy
 
 
@@ -85,11 +85,11 @@ def run(arguments: Arguments) -> Policy:
     model = given_model(arguments.model, recording)
     events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     cfg = arguments.cfg()
-    last: Round | None = None
+    last: Iteration | None = None
     try:
         with status_bar("training") as update:
 
-            def progress(this: Round) -> None:
+            def progress(this: Iteration) -> None:
                 nonlocal last
                 last = this
                 text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"

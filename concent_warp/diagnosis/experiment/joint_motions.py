@@ -9,7 +9,15 @@ import mujoco
 import numpy as np
 
 from concent_warp.comparison.units import words
-from concent_warp.diagnosis.experiment.motions import EXTRA, LONGEST, RATE, Bench, Motion, heavier, slope_turned
+from concent_warp.diagnosis.experiment.motions import (
+    EXTRA,
+    LONGEST,
+    RATE,
+    ProposedMotion,
+    RecordedRange,
+    heavier,
+    slope_turned,
+)
 from concent_warp.effects.select import driven_joints, gripper_actuators, last_links, servo_gain
 from concent_warp.recording.recording import Channel
 
@@ -43,7 +51,7 @@ class Drives:
     """Highest speed [1/s], shape (D,)."""
 
     @staticmethod
-    def of(bench: Bench) -> Drives | None:
+    def of(bench: RecordedRange) -> Drives | None:
         """Return the position drives that are no grippers and were moved; None where there is none."""
         m = bench.m
         gripping = set(gripper_actuators(m))
@@ -85,7 +93,7 @@ def _top_speed(channel: Channel) -> float:
     return float(np.abs(value[10:] - value[:-10]).max() / WINDOW) if len(value) > 10 else 0.0
 
 
-def drive_motions(bench: Bench, tilted: bool) -> Iterator[Motion]:
+def drive_motions(bench: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
     """Yield what drives could do; where the table or base may be `tilted`, with it turned too."""
     if not bench.m.nu:
         return
@@ -102,7 +110,7 @@ def drive_motions(bench: Bench, tilted: bool) -> Iterator[Motion]:
                 yield replace(motion, name=f"{motion.name} with payload", text=text, change=heavier(link))
 
 
-def _payload_links(bench: Bench, drives: Drives) -> list[str]:
+def _payload_links(bench: RecordedRange, drives: Drives) -> list[str]:
     """Return the names of the last links that the drives carry and that something can be fastened to."""
     m = bench.m
     moved = {int(m.jnt_bodyid[j]) for a in drives.ids for j in driven_joints(m, a)}
@@ -118,7 +126,7 @@ def _above(m: mujoco.MjModel, body: int) -> set[int]:
     return found
 
 
-def _courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
+def _courses(bench: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:
     """Yield the motions that drives are asked for together, each in its own range, with objects out of the way."""
     m = bench.m
     who = words(m.actuator(drives.ids[0]).name) if len(drives.ids) == 1 else "all drives together"
@@ -135,7 +143,7 @@ def _courses(bench: Bench, drives: Drives) -> Iterator[Motion]:
         lead = drives.first + (begin - drives.first) * there[:, None]
         return np.concatenate([lead, drives.middle + drives.half * np.concatenate(parts)[:, None]])
 
-    def motion(name: str, text: str, parts: Sequence[np.ndarray]) -> Motion:
+    def motion(name: str, text: str, parts: Sequence[np.ndarray]) -> ProposedMotion:
         return _commanded(bench, drives, name, f"{text}{_cleared_text(bench)}", course(parts))
 
     if len(drives.ids) == 1:
@@ -168,13 +176,13 @@ def _ramp(a: float, b: float, duration: float) -> np.ndarray:
     return np.linspace(a, b, max(int(duration * RATE), 2))
 
 
-def _cleared_text(bench: Bench) -> str:
+def _cleared_text(bench: RecordedRange) -> str:
     """Return which objects are put away, in words."""
     names = [words(bench.m.body(b).name) for b in bench.bodies]
     return f", with {' and '.join(names)} out of the way" if names else ""
 
 
-def _commanded(bench: Bench, drives: Drives, name: str, text: str, course: np.ndarray) -> Motion:
+def _commanded(bench: RecordedRange, drives: Drives, name: str, text: str, course: np.ndarray) -> ProposedMotion:
     """Return a motion from commands (K, D); the other actuators hold still."""
     course = course[: int(LONGEST * RATE)]
     time = np.arange(len(course)) / RATE
@@ -186,28 +194,30 @@ def _commanded(bench: Bench, drives: Drives, name: str, text: str, course: np.nd
     for i, b in enumerate(bench.bodies):
         qpos[int(bench.m.jnt_qposadr[bench.m.body_jntadr[b]])] += AWAY * (1 + i)
         away.append(bench.m.body(b).name)
-    return Motion(name, text, len(course) / RATE, qpos, 0 * qvel, action, tuple(away))
+    return ProposedMotion(name, text, len(course) / RATE, qpos, 0 * qvel, action, tuple(away))
 
 
-def _repeats(bench: Bench, tilted: bool) -> Iterator[Motion]:
+def _repeats(bench: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
     """Yield what was commanded in the longest demonstration, done otherwise."""
     d, m = bench.longest, bench.m
     qpos, qvel = bench.starts[bench.recording.demonstrations.index(d)]
     for pace in (FASTER, SLOWER):
         action = {name: Channel(c.time / pace, c.value) for name, c in d.action.items()}
         text = f"repeat the same commands {'faster' if pace > 1 else 'slower'}, {pace:g} times the pace"
-        yield Motion("repeat at another pace", text, min(d.duration / pace, LONGEST), qpos, qvel, action)
+        yield ProposedMotion("repeat at another pace", text, min(d.duration / pace, LONGEST), qpos, qvel, action)
     duration = min(d.duration, LONGEST)
     if tilted:
         text = "turn the base on which everything stands by 180 deg, so that its slope runs the other way, and repeat"
-        yield Motion("turned base", f"{text} the same commands", duration, qpos, qvel, d.action, change=slope_turned)
+        yield ProposedMotion(
+            "turned base", f"{text} the same commands", duration, qpos, qvel, d.action, change=slope_turned
+        )
     hands = [m.actuator(a).name for a in gripper_actuators(m)]
     if hands and bench.bodies:
         still: dict[str, Channel] = {**d.action, **{n: c for n, c in bench.holding(d).items() if n in hands}}
         text = "push without a grasp: repeat the same commands with the gripper left as it is at first"
-        yield Motion("push without grasp", text, duration, qpos, qvel, still)
+        yield ProposedMotion("push without grasp", text, duration, qpos, qvel, still)
         text = f"grip with {100 * LIGHTER:.0f} % of the commanded closing and repeat the other commands"
-        yield Motion("lighter grip", text, duration, qpos, qvel, _loosened(d.action, hands))
+        yield ProposedMotion("lighter grip", text, duration, qpos, qvel, _loosened(d.action, hands))
 
 
 def _loosened(action: Mapping[str, Channel], hands: Sequence[str]) -> dict[str, Channel]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import Source
+from concent_warp.fit.effects.observation import ObservedRecording
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import commands, initial_state
 
@@ -44,7 +44,7 @@ def _as_it_is(model: Model) -> Model:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ProposedMotion:
     """Something that could be done and recorded."""
 
     name: str
@@ -65,7 +65,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Bench:
+class RecordedRange:
     """What the present recording shows of what can be done."""
 
     model: Model
@@ -79,9 +79,9 @@ class Bench:
         return self.model.compile()
 
     @cached_property
-    def source(self) -> Source:
+    def source(self) -> ObservedRecording:
         """The recording as the model reads it."""
-        return Source(self.model, self.recording, self.noise)
+        return ObservedRecording(self.model, self.recording, self.noise)
 
     @cached_property
     def starts(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.comparison.units import words
-from concent_warp.diagnosis.experiment.motions import EXTRA, Bench, Motion, heavier, slope_turned
+from concent_warp.diagnosis.experiment.motions import EXTRA, ProposedMotion, RecordedRange, heavier, slope_turned
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
@@ -42,10 +42,10 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Toy:
+class ThrowableBody:
     """A free body that may be thrown, pushed and dropped by hand."""
 
-    bench: Bench
+    bench: RecordedRange
     body: int
     engine: EngineName
 
@@ -101,20 +101,20 @@ class Toy:
         qpos: np.ndarray,
         velocity: Sequence[float] | np.ndarray = (0, 0, 0),
         spin: Sequence[float] | np.ndarray = (0, 0, 0),
-    ) -> Motion:
+    ) -> ProposedMotion:
         """Return a motion from a state, at a velocity [m/s] and spin [rad/s] of the body, both in the world frame."""
         qvel = np.zeros(self.bench.m.nv)
         turned = Rotation.from_quat(qpos[self.at + 3 : self.at + 7], scalar_first=True)
         qvel[self.dof : self.dof + 3] = velocity
         qvel[self.dof + 3 : self.dof + 6] = turned.inv().apply(spin)
         action = self.bench.holding(self.bench.recording.demonstrations[0])
-        return Motion(name, text, float(np.clip(duration, *MOMENT)), qpos, qvel, action)
+        return ProposedMotion(name, text, float(np.clip(duration, *MOMENT)), qpos, qvel, action)
 
 
-def body_motions(bench: Bench, engine: EngineName, tilted: bool) -> Iterator[Motion]:
+def body_motions(bench: RecordedRange, engine: EngineName, tilted: bool) -> Iterator[ProposedMotion]:
     """Yield what could be done with objects; where the table may be `tilted`, with it turned too."""
     for body in bench.bodies[:MOST_BODIES]:
-        toy = Toy(bench, body, engine)
+        toy = ThrowableBody(bench, body, engine)
         moves = [*_surface_motions(toy), *_flights(toy)]
         yield from moves
         yield from _turned_starts(toy)
@@ -127,7 +127,7 @@ def body_motions(bench: Bench, engine: EngineName, tilted: bool) -> Iterator[Mot
                 yield replace(motion, name=f"{motion.name}, turned table", text=text, change=slope_turned)
 
 
-def _surface_motions(toy: Toy) -> Iterator[Motion]:
+def _surface_motions(toy: ThrowableBody) -> Iterator[ProposedMotion]:
     """Yield slides, spins, rolls and drops where there is a place on which the body rests."""
     rest, what, v = toy.rest, words(toy.name), toy.speed
     if rest is None:
@@ -162,7 +162,7 @@ def _surface_motions(toy: Toy) -> Iterator[Motion]:
     yield toy.motion("tilted drop", text, np.sqrt(2 * HEIGHTS[1] / 9.81) + 0.6, lifted)
 
 
-def _flights(toy: Toy) -> Iterator[Motion]:
+def _flights(toy: ThrowableBody) -> Iterator[ProposedMotion]:
     """Yield throws as the fastest one of those recorded, faster, slower and the other way."""
     thrown = [
         (qpos, qvel)
@@ -189,7 +189,7 @@ def _flights(toy: Toy) -> Iterator[Motion]:
         yield toy.motion("throw", text, duration, qpos, launch + velocity * UP, turning)
 
 
-def _turned_starts(toy: Toy) -> Iterator[Motion]:
+def _turned_starts(toy: ThrowableBody) -> Iterator[ProposedMotion]:
     """Yield what was commanded to a robot, with the object turned about the vertical before."""
     d, bench = toy.bench.longest, toy.bench
     if not d.action:
@@ -198,12 +198,12 @@ def _turned_starts(toy: Toy) -> Iterator[Motion]:
     for degrees in (90, 180):
         turned = toy.pose(qpos, np.zeros(3), np.radians(degrees) * UP)
         text = f"turn {words(toy.name)} by {degrees} deg and repeat the same commands"
-        yield Motion("repeat with the turned object", text, d.duration, turned, qvel, d.action)
+        yield ProposedMotion("repeat with the turned object", text, d.duration, turned, qvel, d.action)
     text = f"with {100 * EXTRA:.0f} % more mass on {words(toy.name)}, repeat the same commands"
-    yield Motion("repeat, heavier", text, d.duration, qpos, qvel, d.action, change=heavier(toy.name))
+    yield ProposedMotion("repeat, heavier", text, d.duration, qpos, qvel, d.action, change=heavier(toy.name))
 
 
-def _roll(toy: Toy, rest: np.ndarray) -> tuple[np.ndarray, float] | None:
+def _roll(toy: ThrowableBody, rest: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return direction (3,) and radius [m] of the body's rolling from its rest, None for one that is not round."""
     m = toy.bench.m
     geoms = np.flatnonzero((m.geom_bodyid == toy.body) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0)))

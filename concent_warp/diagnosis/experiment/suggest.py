@@ -17,12 +17,12 @@ import numpy as np
 
 from concent_warp.comparison.units import times, words
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
-from concent_warp.diagnosis.experiment.motions import Bench, Motion
+from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.object_motions import body_motions
 from concent_warp.errors import ConcentError
-from concent_warp.fit.effects.observation import Reading, Source, Window, start_spread
+from concent_warp.fit.effects.observation import ObservedRecording, Reading, Window, start_spread
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
-from concent_warp.fit.effects.prediction import Prediction, Trial, turn
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest, turn
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS
@@ -75,7 +75,7 @@ def suggest(
     if len(chosen) < 2:
         return None
     first = next(iter(chosen.values()))
-    bench = Bench(first, recording, channel_noises(first, recording))
+    bench = RecordedRange(first, recording, channel_noises(first, recording))
     tilted = any(a.effect.name == "gravity_tilt" for model in chosen.values() for a in model.effects)
     menu = [*drive_motions(bench, tilted), *body_motions(bench, engine, tilted)]
     looked = [(_score(found), k) for k, motion in enumerate(menu) if (found := _rough(chosen, bench, motion, engine))]
@@ -98,14 +98,16 @@ def _score(found: Separations) -> float:
     return float(np.mean([np.log1p(value) for value, _ in found.values()]))
 
 
-def _rough(models: Mapping[str, Model], bench: Bench, motion: Motion, engine: EngineName) -> Separations | None:
+def _rough(
+    models: Mapping[str, Model], bench: RecordedRange, motion: ProposedMotion, engine: EngineName
+) -> Separations | None:
     """Return how far hypotheses differ in a motion from the very same start; None where one cannot be simulated."""
     window = _imagined(bench, motion, motion.duration)
     return None if window is None else _separations(models, motion, window, engine)
 
 
 def _close(
-    models: Mapping[str, Model], bench: Bench, motion: Motion, engine: EngineName, seed: int
+    models: Mapping[str, Model], bench: RecordedRange, motion: ProposedMotion, engine: EngineName, seed: int
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion whose start is known only as well as it is measured.
 
@@ -115,7 +117,7 @@ def _close(
     if whole is None:
         return None
     model = motion.change(bench.model)
-    source = Source(model, bench.recording, bench.noise)
+    source = ObservedRecording(model, bench.recording, bench.noise)
     reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, seed)
     if (window := _imagined(bench, motion, reach)) is None:
         return None
@@ -134,11 +136,11 @@ def _start_effects(model: Model, window: Window, engine: EngineName) -> np.ndarr
     filled = tuple(replace(r, value=v) for r, v in zip(window.readings, values, strict=True))
     prediction = Prediction(model, (), [replace(window, readings=filled)], engine=engine)
     steps = PROBE * np.diag(window.spread)
-    found = prediction.residuals([Trial(0, prediction.start, step) for step in steps])
+    found = prediction.residuals([SimulationRequest(0, prediction.start, step) for step in steps])
     return np.stack(found, axis=1) / PROBE
 
 
-def _imagined(bench: Bench, motion: Motion, duration: float) -> Window | None:
+def _imagined(bench: RecordedRange, motion: ProposedMotion, duration: float) -> Window | None:
     """Return the beginning of a motion as a window of a recording yet to be made; None where nothing is measured."""
     m = bench.m
     channels, readings, clock, count = bench.channels(motion.away), [], [], 0
@@ -162,7 +164,11 @@ def _imagined(bench: Bench, motion: Motion, duration: float) -> Window | None:
 
 
 def _separations(
-    models: Mapping[str, Model], motion: Motion, window: Window, engine: EngineName, starts: np.ndarray | None = None
+    models: Mapping[str, Model],
+    motion: ProposedMotion,
+    window: Window,
+    engine: EngineName,
+    starts: np.ndarray | None = None,
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion; None where one cannot be simulated.
 
@@ -195,7 +201,7 @@ def _separations(
 def _readings(model: Model, window: Window, engine: EngineName) -> list[np.ndarray]:
     """Return what instruments would read in a window from time 0, one (T, dim) for each of its readings."""
     prediction = Prediction(model, (), [window], engine=engine)
-    (reader,) = prediction.readers([Trial(0, prediction.start)])
+    (reader,) = prediction.readers([SimulationRequest(0, prediction.start)])
     for added in model.effects:
         if added.effect.measures:
             reader = added.effect.measure(model.scene.model, reader, added.array)
@@ -210,7 +216,7 @@ def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np
     return found
 
 
-def _experiment(motion: Motion, found: Separations, first: str) -> Experiment:
+def _experiment(motion: ProposedMotion, found: Separations, first: str) -> Experiment:
     """Return the experiment, in words that tell what separates the likeliest hypothesis, `first`, from the others."""
     best = max(found, key=lambda pair: found[pair][0])
     pairs = sorted((pair for pair in found if first in pair), key=lambda pair: -found[pair][0])

@@ -18,7 +18,7 @@ from concent_warp.diagnosis.forces.wrench import Wrenches, joined, steady_force,
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import BodyMotion, Motion
+    from concent_warp.estimation.measured_motion import MeasuredMotion, SmoothedBodyMotion
     from concent_warp.model import Model
 
 FEWEST_WINDOWS = 3
@@ -26,12 +26,12 @@ FEWEST_WINDOWS = 3
 
 
 @dataclass(frozen=True)
-class Part:
+class BodyRecord:
     """A body in one demonstration; K windows, n of them told from."""
 
-    motion: Motion
+    motion: MeasuredMotion
     windows: Windows
-    body: BodyMotion
+    body: SmoothedBodyMotion
     state: BodyWindows
     valid: np.ndarray
     """Windows that tell something, shape (K,) bool."""
@@ -44,7 +44,7 @@ class Part:
         return self.state.phase[self.valid]
 
 
-def _body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows]) -> list[Part]:
+def _body_parts(name: str, motions: Sequence[MeasuredMotion], windows: Sequence[Windows]) -> list[BodyRecord]:
     """Return a body in each demonstration in which it was measured."""
     found = [
         (motion, window, body, body_windows(motion, window, body))
@@ -62,11 +62,13 @@ def _body_parts(name: str, motions: Sequence[Motion], windows: Sequence[Windows]
         # Where it comes to rest in the model at another time than it did, friction acts in one of the two alone.
         valid = np.isfinite(force[:, : 6 if turned else 3]).all(axis=1) & np.asarray(state.phase != BETWEEN)
         seen = wrenches(force, covariance, state, labels, valid, turned=turned)
-        parts.append(Part(motion, window, body, state, valid, seen))
+        parts.append(BodyRecord(motion, window, body, state, valid, seen))
     return parts
 
 
-def body_force(model: Model, name: str, motions: Sequence[Motion], windows: Sequence[Windows], seed: int) -> BodyForce:
+def body_force(
+    model: Model, name: str, motions: Sequence[MeasuredMotion], windows: Sequence[Windows], seed: int
+) -> BodyForce:
     """Return the unexplained force on a free body."""
     parts = _body_parts(name, motions, windows)
     everything = joined([part.seen for part in parts])
@@ -114,14 +116,14 @@ def _projected(sight: np.ndarray, tables: Sequence[Mapping[str, np.ndarray]]) ->
     return {name: np.einsum("nij,nj->ni", sight, value) for name, value in together.items()}
 
 
-def _body_phases(model: Model, parts: Sequence[Part], seed: int) -> list[PhaseForce]:
+def _body_phases(model: Model, parts: Sequence[BodyRecord], seed: int) -> list[PhaseForce]:
     """Return the steady force and its place in each phase but rest, which shows no forces."""
     names = {str(phase) for part in parts for phase in part.phase} - {REST}
     found = [_body_phase(model, parts, phase, seed) for phase in sorted(names)]
     return [phase for phase in found if phase is not None]
 
 
-def _body_phase(model: Model, parts: Sequence[Part], phase: str, seed: int) -> PhaseForce | None:
+def _body_phase(model: Model, parts: Sequence[BodyRecord], phase: str, seed: int) -> PhaseForce | None:
     """Return the steady force and its place in one phase; None where there is too little of it, or all is hidden."""
     chosen = [np.asarray(part.phase == phase) for part in parts]
     counts = [int(c.sum()) for c in chosen]

@@ -15,7 +15,7 @@ from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import BodyMotion, Motion
+    from concent_warp.estimation.measured_motion import MeasuredMotion, SmoothedBodyMotion
 
 PUSHED, BETWEEN = "pushed", "between"
 """Further phases: the robot presses on it from one side; it sets out or comes to rest."""
@@ -66,7 +66,7 @@ class BodyWindows:
     """Body to world, shape (K, 3, 3)."""
 
 
-def body_windows(motion: Motion, windows: Windows, body: BodyMotion) -> BodyWindows:
+def body_windows(motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMotion) -> BodyWindows:
     """Return what a body touches in the model's simulation of each window, and what follows from it."""
     m = motion.compiled
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1

@@ -15,7 +15,7 @@ from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.contact_state import BodyWindows
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import Motion
+    from concent_warp.estimation.measured_motion import MeasuredMotion
 
 DIRECTION, SPEED, ACCELERATION = "direction of motion", "velocity", "acceleration"
 SLOW, LIMIT = "direction of slow motion", "drive force near its peak"
@@ -32,7 +32,7 @@ RATE_STEP = 0.01
 """Time over which the rate of a command is taken [s]."""
 
 
-def joint_features(windows: Windows, motion: Motion) -> dict[str, dict[str, np.ndarray]]:
+def joint_features(windows: Windows, motion: MeasuredMotion) -> dict[str, dict[str, np.ndarray]]:
     """Return the features of each measured joint, by its name, shape (K, 1) each.
 
     Units: "velocity" rad/s (m/s), "acceleration" rad/s^2, "direction of motion" -1..1, "position" rad about its mean,

@@ -13,9 +13,9 @@ from concent_warp.diagnosis.forces.body_forces import body_force, judged
 from concent_warp.diagnosis.forces.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
 from concent_warp.diagnosis.forces.features import CONTACT, joint_features
 from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
-from concent_warp.diagnosis.forces.result import DETECTABLE, Location
+from concent_warp.diagnosis.forces.result import DETECTABLE, UnexplainedForces
 from concent_warp.diagnosis.forces.window_forces import WindowCfg, Windows, window_forces, window_length
-from concent_warp.estimation.measured_motion import Motion, measured_motion
+from concent_warp.estimation.measured_motion import MeasuredMotion, measured_motion
 from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -38,7 +38,7 @@ def locate_forces(
     engine: EngineName = "mujoco",
     out: str | Path | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Location:
+) -> UnexplainedForces:
     """Find the forces that a model lacks: by joint, and on which place of which object.
 
     Args:
@@ -84,7 +84,7 @@ def locate_forces(
     bodies = [judged(f, ok, f.ratio > BEYOND_NOISE) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
     joints.sort(key=lambda f: (not f.significant, -f.ratio))
     bodies.sort(key=lambda f: (not f.significant, -f.ratio))
-    found = Location(windows[0].length, tuple(joints), tuple(bodies))
+    found = UnexplainedForces(windows[0].length, tuple(joints), tuple(bodies))
     if out is not None:
         write_json(Path(out), found.to_json())
     return found
@@ -95,14 +95,14 @@ def _ignore(share: float) -> None:
     del share
 
 
-def _all_joints(motions: Sequence[Motion]) -> list[tuple[str, str, int]]:
+def _all_joints(motions: Sequence[MeasuredMotion]) -> list[tuple[str, str, int]]:
     """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
     return sorted(
         {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
     )
 
 
-def _all_bodies(motions: Sequence[Motion]) -> list[str]:
+def _all_bodies(motions: Sequence[MeasuredMotion]) -> list[str]:
     """Return the names of the free bodies measured in any demonstration."""
     return list(dict.fromkeys(b.name for m in motions for b in m.bodies))
 

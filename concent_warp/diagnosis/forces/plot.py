@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from concent_warp.diagnosis.forces.force_data import JointForce
-    from concent_warp.diagnosis.forces.result import Location
+    from concent_warp.diagnosis.forces.result import UnexplainedForces
     from concent_warp.model import Model
 
 ARROW = 0.7
@@ -22,7 +22,7 @@ MOST_JOINTS = 4
 FORCE, SHAPE, NOISE = "#d62728", "#8fa8c4", "#b8c4d0"
 
 
-def plot_location(location: Location, model: Model, path: Path) -> None:
+def plot_location(location: UnexplainedForces, model: Model, path: Path) -> None:
     """Draw a location as an image.
 
     Args:

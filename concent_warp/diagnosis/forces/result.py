@@ -20,7 +20,7 @@ DETECTABLE = 3.0
 
 
 @dataclass(frozen=True)
-class Location:
+class UnexplainedForces:
     """Where the model lacks forces."""
 
     window: float

@@ -23,7 +23,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.simulate.engine import ContactLog, Engine, Variants
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.measured_motion import Motion
+    from concent_warp.estimation.measured_motion import MeasuredMotion
 
 SHARES = (np.arange(5) + 0.5) / 5
 """Instants within a window, as shares of its length, at which what forces depend on is taken."""
@@ -85,12 +85,12 @@ class Windows:
         return np.sqrt(np.einsum("kii->ki", self.covariance))
 
 
-def window_length(motion: Motion) -> float:
+def window_length(motion: MeasuredMotion) -> float:
     """Return the length of windows that suits what was measured [s]."""
     return float(min(max(0.12 if motion.bodies else 0.1, 8 * motion.period), 0.3))
 
 
-def window_forces(name: str, engine: Engine, motion: Motion, cfg: WindowCfg) -> Windows:
+def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: WindowCfg) -> Windows:
     """Simulate all windows of a demonstration, by its name, and return the unexplained forces.
 
     Raises:

@@ -21,7 +21,12 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.measured_motion import BodyMotion, JointMotion, Motion, Signal
+    from concent_warp.estimation.measured_motion import (
+        MeasuredMotion,
+        SmoothedBodyMotion,
+        SmoothedJointMotion,
+        SmoothedSignal,
+    )
     from concent_warp.simulate.engine import ContactLog, Engine
 
 FEWEST_READINGS = 5
@@ -68,7 +73,7 @@ class Readings:
 class WindowSolver:
     """Turns departures from simulated windows into forces."""
 
-    def __init__(self, motion: Motion, engine: Engine, length: float) -> None:
+    def __init__(self, motion: MeasuredMotion, engine: Engine, length: float) -> None:
         self.motion = motion
         self.timestep = engine.timestep
         self.length = length
@@ -106,7 +111,7 @@ class WindowSolver:
     def _body(
         self,
         window: Simulated,
-        body: BodyMotion,
+        body: SmoothedBodyMotion,
         mass: np.ndarray,
         acceleration: np.ndarray,
         noise: np.ndarray,
@@ -140,7 +145,7 @@ class WindowSolver:
 
     def _joints(self, window: Simulated, acceleration: np.ndarray, noise: np.ndarray, known: np.ndarray) -> None:
         """Fill in what is found of the joints, all at once: they pull at one another."""
-        joints: list[JointMotion] = []
+        joints: list[SmoothedJointMotion] = []
         readings: list[Readings] = []
         for joint in self.motion.joints:
             path = window.path[:, :, joint.qpos, None]
@@ -163,7 +168,7 @@ class WindowSolver:
         acceleration[:, dofs] = found
         noise[np.ix_(dofs, dofs)] = covariance
 
-    def _drives(self, joints: list[JointMotion]) -> tuple[np.ndarray, np.ndarray]:
+    def _drives(self, joints: list[SmoothedJointMotion]) -> tuple[np.ndarray, np.ndarray]:
         """Return how accelerations of joints answer to their positions and velocities, constraints left out, (n, n)."""
         m, d = self.model, self.data
         dofs = [j.dof for j in joints]
@@ -177,7 +182,9 @@ class WindowSolver:
         both = np.stack(columns, axis=1)
         return both[:, : len(joints)], both[:, len(joints) :]
 
-    def _readings(self, start: float, signal: Signal, path: np.ndarray, rows: np.ndarray, *, turning: bool) -> Readings:
+    def _readings(
+        self, start: float, signal: SmoothedSignal, path: np.ndarray, rows: np.ndarray, *, turning: bool
+    ) -> Readings:
         """Return the readings of a signal in a window against what was simulated, `path` (V, S + 1, dim)."""
         chosen = np.flatnonzero((signal.time >= start) & (signal.time <= start + self.length))
         clock = signal.time[chosen] - start
@@ -193,7 +200,7 @@ class WindowSolver:
         return Readings(clock, off, signal.std, rows)
 
 
-def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: BodyMotion) -> np.ndarray:
+def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMotion) -> np.ndarray:
     """Return the damping of a body's motion (world frame, about its origin) by sliding on what is fixed, shape (6, 6).
 
     Friction f against the slip v, |f| fixed: df/dv = -|f| / |v| (1 - n n' - v v' / |v|^2), n the normal.

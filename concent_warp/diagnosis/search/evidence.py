@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from concent_warp.diagnosis.result import Detectable, Finding
-from concent_warp.diagnosis.search.steps import Candidate, Node, Screened
+from concent_warp.diagnosis.search.steps import Candidate, FittedModel, Screened
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
 from concent_warp.fit.effects.prediction import Prediction
 
@@ -15,7 +15,7 @@ SAME = 0.02
 """Errors that differ by less than this share are taken for the same."""
 
 
-def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
+def fitted_parameters(base: FittedModel, c: Candidate) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
     With the law's own error, see `law_errors`.
@@ -35,7 +35,7 @@ def fitted_parameters(base: Node, c: Candidate) -> tuple[FittedParameter, ...]:
     return tuple(found)
 
 
-def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
+def removed(base: FittedModel, c: Candidate) -> tuple[tuple[str, float], ...]:
     """Return by how much the squared residual of each channel falls, as a share, most first."""
     before: dict[str, float] = {}
     after: dict[str, float] = {}
@@ -47,7 +47,9 @@ def removed(base: Node, c: Candidate) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(((n, s) for n, s in shares.items() if s > 0), key=lambda pair: -pair[1]))
 
 
-def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 1.0) -> list[tuple[Candidate, Finding]]:
+def alike(
+    base: FittedModel, good: Sequence[tuple[Candidate, Finding]], slack: float = 1.0
+) -> list[tuple[Candidate, Finding]]:
     """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
 
     They are where what they leave differs by less than 2 standard errors, over the blocks and by the roughness of the
@@ -69,12 +71,12 @@ def alike(base: Node, good: Sequence[tuple[Candidate, Finding]], slack: float = 
     return sorted(group, key=lambda pair: -_plausibility(base, *pair))
 
 
-def _log_errors(base: Node, c: Candidate) -> float:
+def _log_errors(base: FittedModel, c: Candidate) -> float:
     """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, blocks of time."""
     return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))
 
 
-def _plausibility(base: Node, c: Candidate, f: Finding) -> float:
+def _plausibility(base: FittedModel, c: Candidate, f: Finding) -> float:
     """Return twice the log posterior of a candidate, up to a constant.
 
     Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
@@ -87,7 +89,7 @@ def _plausibility(base: Node, c: Candidate, f: Finding) -> float:
     return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 
-def detectable_size(base: Node, s: Screened, share: float) -> Detectable | None:
+def detectable_size(base: FittedModel, s: Screened, share: float) -> Detectable | None:
     """Return the smallest size of a candidate that the search would have found in half of all cases.
 
     A parameter off its null value by x adds H x^2 to the error, of which it must be more than a share.

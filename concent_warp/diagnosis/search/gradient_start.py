@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.diagnosis.search.steps import Node, Screened, remainders, total
+from concent_warp.diagnosis.search.steps import FittedModel, Screened, remainders, total
 from concent_warp.effects.effect import Effect
 from concent_warp.errors import ConcentError
 from concent_warp.fit.effects.least_squares import Solver
@@ -46,7 +46,7 @@ class GradientStarts:
         except ConcentError as error:
             raise type(error)(str(error).rstrip("."), fix="or diagnose without --gradient") from None
 
-    def led(self, base: Node, screened: Sequence[Screened], parallel: Parallel) -> list[Screened]:
+    def led(self, base: FittedModel, screened: Sequence[Screened], parallel: Parallel) -> list[Screened]:
         """Return screened candidates, those with a factor started from it where that is better.
 
         With effects that were added Newton may have to give up: then they are as they were.
@@ -86,7 +86,7 @@ def _moved(effect: Effect, values: np.ndarray, factor: float) -> np.ndarray:
     return result
 
 
-def _started(base: Node, screened: Screened, factor: float) -> Screened:
+def _started(base: FittedModel, screened: Screened, factor: float) -> Screened:
     """Return a screened candidate that starts from a factor, where that takes away more of the error than its start."""
     effect = screened.effect
     solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.diagnosis.search.steps import Candidate, Node, judged
+from concent_warp.diagnosis.search.steps import Candidate, FittedModel, judged
 from concent_warp.fit.effects.intervals import covariance
 from concent_warp.fit.effects.least_squares import Solver
 from concent_warp.fit.effects.prediction import Prediction
@@ -43,7 +43,7 @@ WIDTH_ONLY = float("inf")
 
 
 @dataclass(frozen=True)
-class Look:
+class ProfilePoint:
     """The cost some way from a fit, initial states fitted anew."""
 
     parameter: int
@@ -59,16 +59,16 @@ class Look:
     """By how much the cost would grow if it were quadratic."""
 
 
-AllOf = Callable[[Callable[..., Look], Sequence[tuple[Any, ...]]], Sequence[Look]]
+AllOf = Callable[[Callable[..., ProfilePoint], Sequence[tuple[Any, ...]]], Sequence[ProfilePoint]]
 """Does independent pieces of work, and returns their results in order."""
 
 
-def _solver_of(base: Node, c: Candidate) -> Solver:
+def _solver_of(base: FittedModel, c: Candidate) -> Solver:
     """Return what fits a candidate."""
     return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine))
 
 
-def _ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[int, float]]:
+def _ways(base: FittedModel, c: Candidate, tried: Sequence[ProfilePoint] = ()) -> list[tuple[int, float]]:
     """Return where to look next: parameter of the candidate, and how far along its profile in standard deviations.
 
     Both sides of each parameter at first; farther on the sides where the valley does not show yet.
@@ -90,13 +90,13 @@ def _ways(base: Node, c: Candidate, tried: Sequence[Look] = ()) -> list[tuple[in
     return found
 
 
-def _roughness(c: Candidate, tried: Sequence[Look], parameter: int) -> float:
+def _roughness(c: Candidate, tried: Sequence[ProfilePoint], parameter: int) -> float:
     """Return by how much the cost rises more than derivatives promise where it is looked at first, 0 if it does not."""
     near = [s for s in tried if s.parameter == parameter and abs(s.reach) == NEAR]
     return max(float(np.mean([s.cost - c.fit.cost - s.expected for s in near])), 0.0) if near else 0.0
 
 
-def _look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
+def _look(base: FittedModel, c: Candidate, parameter: int, reach: float) -> ProfilePoint:
     """Look at the cost some way along the profile of a parameter."""
     solver, known = _solver_of(base, c), covariance(c.sums, base.blocks)
     move = reach * known[parameter] / np.sqrt(known[parameter, parameter])
@@ -106,17 +106,17 @@ def _look(base: Node, c: Candidate, parameter: int, reach: float) -> Look:
     offsets, starts, residuals = solver.search.refined(values, solver.follow(c.fit, move), everywhere, ROUNDS)
     expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
     cost = solver.cost(residuals, offsets, values)
-    return Look(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
+    return ProfilePoint(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
 
 
-def _taken_up(base: Node, c: Candidate, seen: Look) -> Candidate:
+def _taken_up(base: FittedModel, c: Candidate, seen: ProfilePoint) -> Candidate:
     """Fit a candidate from where a look has found a lower cost; what is not better in the end is dropped."""
     solver = _solver_of(base, c)
     found = judged(base, c.effect, solver, solver.fit(seen.values, seen.offsets, seen.starts))
     return found if found.fit.cost < c.fit.cost else c
 
 
-def settled(base: Node, c: Candidate, all_of: AllOf) -> Candidate:
+def settled(base: FittedModel, c: Candidate, all_of: AllOf) -> Candidate:
     """Return a candidate with values that no look around betters, and with how sharply the data tell them.
 
     Args:
@@ -138,15 +138,15 @@ def settled(base: Node, c: Candidate, all_of: AllOf) -> Candidate:
     return _told(base, c, _looks(base, c, all_of, WIDTH_ONLY))
 
 
-def _told(base: Node, c: Candidate, seen: Sequence[Look]) -> Candidate:
+def _told(base: FittedModel, c: Candidate, seen: Sequence[ProfilePoint]) -> Candidate:
     """Return a candidate with what looks around it tell: how sharp its values are, and how rough its cost."""
     rough = max((_roughness(c, seen, s.parameter) for s in seen), default=0.0)
     return replace(c, spread=_spreads(base, c, seen), rough=rough)
 
 
-def _looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[Look]:
+def _looks(base: FittedModel, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[ProfilePoint]:
     """Look around a fit, farther where need be; stop where a lower cost is found."""
-    seen: list[Look] = []
+    seen: list[ProfilePoint] = []
     for _ in range(1 + EXTENSIONS):
         untried = _ways(base, c, seen)
         if not untried:
@@ -157,7 +157,7 @@ def _looks(base: Node, c: Candidate, all_of: AllOf, worth: float = WORTH) -> lis
     return seen
 
 
-def _spreads(base: Node, c: Candidate, seen: Sequence[Look]) -> np.ndarray:
+def _spreads(base: FittedModel, c: Candidate, seen: Sequence[ProfilePoint]) -> np.ndarray:
     """Return the standard deviations of a candidate's parameters, in units of their scale, shape (P,).
 
     Those of the linear fit, larger by what the valley is flatter, by how far its middle is off, and by how far the

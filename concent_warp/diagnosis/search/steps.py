@@ -30,7 +30,7 @@ FAR = 1.0
 
 
 @dataclass(frozen=True)
-class Node:
+class FittedModel:
     """A model with its own parameters and the initial states fitted: what a candidate has to beat."""
 
     model: Model
@@ -97,11 +97,11 @@ class Candidate:
     polished: bool = False
     """Whether it has been taken up again for next to nothing: once more would do the same."""
 
-    def gain(self, base: Node) -> np.ndarray:
+    def gain(self, base: FittedModel) -> np.ndarray:
         """Return by how much the held-out error of each block falls against a node, shape (B,)."""
         return base.errors - self.errors
 
-    def share(self, base: Node) -> float:
+    def share(self, base: FittedModel) -> float:
         """Return the gain as a share of the node's held-out error."""
         return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
 
@@ -119,7 +119,7 @@ def node(
     engine: EngineName,
     *,
     rough: bool = False,
-) -> Node:
+) -> FittedModel:
     """Fit a model's own parameters and the initial states; `rough`ly where all that counts is the calmest part."""
     solver = Solver(Prediction(model, (), windows, engine=engine))
     measured = [np.zeros(len(w.spread)) for w in windows]
@@ -130,7 +130,7 @@ def node(
     return _assessed(model, windows, blocks, fit, engine)
 
 
-def without(last: Node, effect: int) -> Node:
+def without(last: FittedModel, effect: int) -> FittedModel:
     """Return the node of a model less one of its effects, all that is left fitted again."""
     model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
     solver = Solver(Prediction(model, (), last.windows, engine=last.engine))
@@ -138,15 +138,15 @@ def without(last: Node, effect: int) -> Node:
     return _assessed(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
 
 
-def _assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> Node:
+def _assessed(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> FittedModel:
     """Return a fitted model as a node."""
     pieces = tuple(projected(fit))
     limit = huber_limit([piece.residual for piece in pieces])
     errors = HeldOut(block_sums(pieces, blocks, limit), blocks).own()
-    return Node(model, tuple(windows), blocks, fit, pieces, limit, errors, engine)
+    return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine)
 
 
-def strengthened(base: Node, rivals: Sequence[Candidate]) -> Node:
+def strengthened(base: FittedModel, rivals: Sequence[Candidate]) -> FittedModel:
     """Return the node with initial states fitted anew from where its rivals have them, window by window.
 
     A fit may end in a local minimum of an initial state; a rival that only got out of one has explained nothing.
@@ -157,7 +157,7 @@ def strengthened(base: Node, rivals: Sequence[Candidate]) -> Node:
     return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 
 
-def screen(base: Node, effect: Effect) -> Screened:
+def screen(base: FittedModel, effect: Effect) -> Screened:
     """Look at what a candidate could do, from its sensitivities and a few scanned values.
 
     Sensitivities are taken at the node's initial states, and at the measured ones where those are far off: initial
@@ -184,7 +184,7 @@ def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Line
     return tuple(replace(piece, residual=known.residual) for piece, known in zip(pieces, of, strict=True))
 
 
-def _linear_gain(base: Node, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
+def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
     """Return the share of the held-out error that a linear step with the sensitivities takes away."""
     errors = HeldOut(block_sums(with_residuals(pieces, plain), base.blocks, base.limit), base.blocks).own()
     return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
@@ -195,7 +195,7 @@ def _sensitive_start(solver: Solver, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, solver.scale)
 
 
-def _scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.ndarray]:
+def _scan(solver: Solver, base: FittedModel, values: np.ndarray) -> tuple[float, np.ndarray]:
     """Try the values that parameters name for that; return the best one's gain, and where a fit is to start."""
     trials = []
     for k, parameter in enumerate(solver.p.parameters):
@@ -217,7 +217,9 @@ def _scan(solver: Solver, base: Node, values: np.ndarray) -> tuple[float, np.nda
     return best, start
 
 
-def remainders(solver: Solver, base: Node, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[np.ndarray]:
+def remainders(
+    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     """Return the residuals at some values, with what a change of the initial states takes up, to first order, left out.
 
     Args:
@@ -235,12 +237,12 @@ def remainders(solver: Solver, base: Node, values: np.ndarray, offsets: Sequence
     return rest
 
 
-def total(base: Node, residuals: Sequence[np.ndarray]) -> float:
+def total(base: FittedModel, residuals: Sequence[np.ndarray]) -> float:
     """Return the robust sum of squares of projected residuals."""
     return float(2 * sum(huber(r, base.limit).sum() for r in residuals))
 
 
-def fit_candidate(base: Node, screened: Screened, cfg: LeastSquaresCfg | None = None) -> Candidate:
+def fit_candidate(base: FittedModel, screened: Screened, cfg: LeastSquaresCfg | None = None) -> Candidate:
     """Fit a candidate together with the model's own parameters and the initial states."""
     solver = Solver(Prediction(base.model, (screened.effect,), base.windows, engine=base.engine), cfg)
     if screened.measured:
@@ -248,7 +250,7 @@ def fit_candidate(base: Node, screened: Screened, cfg: LeastSquaresCfg | None = 
     return judged(base, screened.effect, solver, solver.fit(screened.start, base.fit.offsets, base.fit.starts))
 
 
-def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False) -> Candidate:
+def polish_candidate(base: FittedModel, candidate: Candidate, *, thorough: bool = False) -> Candidate:
     """Take up the fit of a candidate again with initial states fitted anew; the worse of the two is dropped.
 
     Where that brings next to nothing, it is not done again.
@@ -263,7 +265,7 @@ def polish_candidate(base: Node, candidate: Candidate, *, thorough: bool = False
     return replace(best, polished=found.fit.cost > (1 - BETTER) * candidate.fit.cost)
 
 
-def restarted_candidate(base: Node, candidate: Candidate, leader: Fit, quick: bool = False) -> Candidate:
+def restarted_candidate(base: FittedModel, candidate: Candidate, leader: Fit, quick: bool = False) -> Candidate:
     """Take up the fit of a candidate from the leader's initial states; the worse of the two is dropped.
 
     Either window by window, where they serve its parameters better, or all of them, with the parameters that go with
@@ -280,7 +282,7 @@ def restarted_candidate(base: Node, candidate: Candidate, leader: Fit, quick: bo
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 
-def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Window]) -> Candidate:
+def piecewise_candidate(base: FittedModel, candidate: Candidate, pieces: Sequence[Window]) -> Candidate:
     """Take up the fit of a candidate from values that short windows lead to; the worse of the two is dropped.
 
     Over long windows sticking and slipping make many minima; short ones, each with an initial state of its own, have
@@ -296,12 +298,12 @@ def piecewise_candidate(base: Node, candidate: Candidate, pieces: Sequence[Windo
     return found if found.fit.cost < candidate.fit.cost else candidate
 
 
-def extended(base: Node, added: Candidate) -> Node:
+def extended(base: FittedModel, added: Candidate) -> FittedModel:
     """Return the node of the model that a candidate makes of a node's."""
     return _assessed(added.model, base.windows, base.blocks, added.fit, base.engine)
 
 
-def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
+def judged(base: FittedModel, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
     """Return a fitted candidate with its held-out gain over the node."""
     pieces = tuple(projected(fit))
     sums = block_sums(pieces, base.blocks, base.limit)
@@ -318,7 +320,7 @@ def judged(base: Node, effect: Effect, solver: Solver, fit: Fit) -> Candidate:
     )
 
 
-def chance(base: Node, screened: Sequence[Screened], draws: int, seed: int) -> np.ndarray:
+def chance(base: FittedModel, screened: Sequence[Screened], draws: int, seed: int) -> np.ndarray:
     """Return the largest gain of all candidates on data that lack nothing, as a share of the error, shape (draws,).
 
     See `concent_warp.fit.effects.cross_validation` for how such data are made.

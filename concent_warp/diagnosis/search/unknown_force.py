@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.diagnosis.result import UnknownForceFound
-from concent_warp.diagnosis.search.steps import Node, Screened, chance, screen, with_residuals
+from concent_warp.diagnosis.search.steps import FittedModel, Screened, chance, screen, with_residuals
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, free_bodies, name, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
@@ -76,7 +76,7 @@ Results = Callable[[Callable[..., Screened], Sequence[tuple[Any, ...]]], Iterabl
 """Does independent pieces of work, a function and the arguments of each, and gives their results in order."""
 
 
-def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> UnknownForceFound | None:
+def unknown_force(nodes: Sequence[FittedModel], cfg: Settings, results: Results) -> UnknownForceFound | None:
     """Return a force of no known form that explains what effects do not; None where there is none beyond chance.
 
     It is looked for in what the last model leaves, unless that is little more than noise; and, where several effects
@@ -105,7 +105,7 @@ def unknown_force(nodes: Sequence[Node], cfg: Settings, results: Results) -> Unk
 
 
 def _best_force(
-    base: Node, rival: Node | None, lacked: float, cfg: Settings, results: Results
+    base: FittedModel, rival: FittedModel | None, lacked: float, cfg: Settings, results: Results
 ) -> UnknownForceFound | None:
     """Return the force that explains most of what a node leaves.
 
@@ -143,13 +143,13 @@ def _best_force(
     return UnknownForceFound(force.words, gains[best], p, min(share, 1.0), None if rival is None else instead)
 
 
-def _held_out(base: Node, s: Screened) -> np.ndarray:
+def _held_out(base: FittedModel, s: Screened) -> np.ndarray:
     """Return the held-out error of each block, shape (B,), after a linear step with the sensitivities."""
     pieces = with_residuals(s.pieces, base.pieces)
     return HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
 
 
-def _dealt_in_turn(base: Node) -> Node:
+def _dealt_in_turn(base: FittedModel) -> FittedModel:
     """Return a node whose blocks are dealt to the folds in turn, even where its folds are whole demonstrations.
 
     A force of no known form says nothing of places where it was not seen, and few throws go where others went.
@@ -160,7 +160,7 @@ def _dealt_in_turn(base: Node) -> Node:
     return replace(base, blocks=blocks, errors=errors)
 
 
-def _weighed(base: Node, s: Screened, share: float) -> Screened:
+def _weighed(base: FittedModel, s: Screened, share: float) -> Screened:
     """Return a force whose bumps are each expected to explain as much, together a share of the error."""
     own = base.pieces[0].jacobian.shape[1]
     square = np.sum([(piece.jacobian[:, own:] ** 2).sum(axis=0) for piece in s.pieces], axis=0)
@@ -171,7 +171,7 @@ def _weighed(base: Node, s: Screened, share: float) -> Screened:
     return replace(s, pieces=tuple(replace(piece, jacobian=piece.jacobian * scale) for piece in s.pieces))
 
 
-def _together(base: Node, screened: Sequence[Screened], share: float) -> Screened:
+def _together(base: FittedModel, screened: Sequence[Screened], share: float) -> Screened:
     """Return all forces at once, each expected to explain as much, together a share of the error."""
     own = base.pieces[0].jacobian.shape[1]
     parts = [_weighed(base, s, share / len(screened)).pieces for s in screened]
@@ -182,7 +182,7 @@ def _together(base: Node, screened: Sequence[Screened], share: float) -> Screene
     return replace(screened[0], pieces=pieces)
 
 
-def _forces(base: Node) -> list[Effect]:
+def _forces(base: FittedModel) -> list[Effect]:
     """Return the forces that are tried: on all joints by position, by velocity; on each free body in several ways."""
     m = base.model.compile()
     qpos, qvel = _visited(base, m)
@@ -250,7 +250,7 @@ def _spread_out(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.array(chosen), width
 
 
-def _visited(base: Node, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def _visited(base: FittedModel, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the states that the node's model goes through, positions (T, nq) and velocities (T, nv)."""
     engine = MujocoEngine(base.model)
     qpos, qvel = [np.zeros((0, m.nq))], [np.zeros((0, m.nv))]

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.library.contact_forces import AnisotropicForce, Pull
+from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce
 from concent_warp.effects.library.drives import GRIPS
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
@@ -22,7 +22,7 @@ from concent_warp.effects.select import (
 )
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 SLIDING, TORSIONAL, ROLLING = 0, 1, 2
 NEXT_TO_NOTHING = 1e-5
@@ -151,7 +151,7 @@ class AnisotropicFriction(SurfaceEffect):
         """One ratio."""
         return (Parameter("ratio", "-", 1.0, 0.05, 10.0, 0.4),)
 
-    def law(self, m: mujoco.MjModel) -> Law:
+    def law(self, m: mujoco.MjModel) -> ForceModel:
         """The force that the grain adds."""
         return AnisotropicForce(m, self.ids(m))
 
@@ -221,10 +221,10 @@ class Adhesion(SurfaceEffect):
         scan = tuple(weight * x for x in (0.1, 0.3, 1.0, 3.0))
         return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
 
-    def law(self, m: mujoco.MjModel) -> Law:
+    def law(self, m: mujoco.MjModel) -> ForceModel:
         """The pull."""
         moving = np.flatnonzero(np.isin(m.body_weldid, m.body_weldid[self.ids(m)]))
-        return Pull(m, moving, self.GAP)
+        return AdhesionForce(m, moving, self.GAP)
 
 
 class PadFriction(Effect):

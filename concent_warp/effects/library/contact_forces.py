@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.force_model import Law
+from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.select import standing_geoms
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ SMOOTH = 2e-3
 """Sliding speed [m/s] below which the force fades out."""
 
 
-class AnisotropicForce(Law):
+class AnisotropicForce(ForceModel):
     """-(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y at each contact of a body with what stands still.
 
     v is the sliding velocity [m/s], N the normal force [N] of the step before. The parameter is the ratio, shape (1,).
@@ -37,11 +37,11 @@ class AnisotropicForce(Law):
         self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         extra = float(values[0]) - 1.0
         if not extra:
             return lambda: None
@@ -80,7 +80,7 @@ class AnisotropicForce(Law):
         return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
-        """See `Law.launch`."""
+        """See `ForceModel.launch`."""
         import warp as wp
 
         from concent_warp.kernels import force_models
@@ -90,7 +90,7 @@ class AnisotropicForce(Law):
         force_models.anisotropic(m, d, *self._device, values, SMOOTH)
 
 
-class Pull(Law):
+class AdhesionForce(ForceModel):
     """Pulls the points of a body that lie within a gap of a plane or box that stands still towards it.
 
     The points are corners of boxes, ends of capsules, four points of each rim of cylinders, the outermost vertices of
@@ -114,11 +114,11 @@ class Pull(Law):
         self._device: tuple[wp.array[Any], wp.array[Any], wp.array[Any], wp.array[Any]] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         strength = float(values[0])
         if strength <= 0:
             return lambda: None
@@ -187,7 +187,7 @@ class Pull(Law):
         return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
-        """See `Law.launch`."""
+        """See `ForceModel.launch`."""
         import warp as wp
 
         from concent_warp.kernels import force_models

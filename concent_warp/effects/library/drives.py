@@ -22,7 +22,7 @@ from concent_warp.effects.select import (
 )
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""
@@ -252,7 +252,7 @@ class Backlash(ServoEffect):
         scan = tuple(size * x for x in (0.005, 0.01, 0.02, 0.04, 0.08))
         return (Parameter("play", unit, 0.0, 0.0, 0.5 * size, 0.02 * size, scan=scan),)
 
-    def law(self, m: mujoco.MjModel) -> Law:
+    def law(self, m: mujoco.MjModel) -> ForceModel:
         """Torque that takes back the drive's within the play."""
         return LooseGear(self.ids(m), m.nuserdata - m.nu)
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.force_model import Law
+from concent_warp.effects.force_model import ForceModel
 
 if TYPE_CHECKING:
     import mujoco_warp as mjw
     import warp as wp
 
 
-class DofLaw(Law):
+class DofLaw(ForceModel):
     """A law that acts on some degrees of freedom."""
 
     def __init__(self, dof: np.ndarray) -> None:
@@ -42,11 +42,11 @@ class StribeckFriction(DofLaw):
     edits = ("dof_frictionloss",)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         loss, qvel, qacc, half = m.dof_frictionloss, d.qvel, d.qacc, 0.5 * m.opt.timestep
         speed = max(float(values[-1]), 1e-6)
         rows = [(int(i), max(float(extra), 0.0)) for i, extra in zip(self.dof, values[:-1], strict=True)]
@@ -59,7 +59,7 @@ class StribeckFriction(DofLaw):
         return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
-        """See `Law.launch`."""
+        """See `ForceModel.launch`."""
         from concent_warp.kernels import force_models
 
         force_models.stribeck(m, d, self.device_dof(), values)
@@ -75,11 +75,11 @@ class LoadFriction(DofLaw):
     edits = ("dof_frictionloss",)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         loss, motor, weight = m.dof_frictionloss, d.qfrc_actuator, d.qfrc_bias
         rows = [(int(i), 0.5 * max(float(c), 0.0)) for i, c in zip(self.dof, values, strict=True)]
 
@@ -90,7 +90,7 @@ class LoadFriction(DofLaw):
         return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
-        """See `Law.launch`."""
+        """See `ForceModel.launch`."""
         from concent_warp.kernels import force_models
 
         force_models.load(m, d, self.device_dof(), values)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from concent_warp.effects.force_model import Law
+from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.select import driven_joints
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import warp as wp
 
 
-class LooseGear(Law):
+class LooseGear(ForceModel):
     """Lets a servo's force through to the link only where its rotor presses on an end of the play.
 
     The rotor, without mass, is ahead of the link by x, |x| <= |g| play / 2, with g the gear. With e the error of the
@@ -35,11 +35,11 @@ class LooseGear(Law):
         self._device: wp.array[Any] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `Law.apply`."""
+        """See `ForceModel.apply`."""
         self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `Law.bound`."""
+        """See `ForceModel.bound`."""
         play = float(values[0])
         if play <= 0:
             return lambda: None
@@ -60,7 +60,7 @@ class LooseGear(Law):
         return act
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
-        """See `Law.launch`."""
+        """See `ForceModel.launch`."""
         import warp as wp
 
         from concent_warp.kernels import force_models

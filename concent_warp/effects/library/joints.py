@@ -12,7 +12,7 @@ from concent_warp.effects.library.friction_forces import LoadFriction, StribeckF
 from concent_warp.effects.select import SINGLE, dof_of, joints_by_type, typical_torque
 
 if TYPE_CHECKING:
-    from concent_warp.effects.force_model import Law
+    from concent_warp.effects.force_model import ForceModel
 
 STIFF = 1.5
 """Time constant of friction constraints in time steps; MuJoCo's default creeps."""
@@ -183,7 +183,7 @@ class Stribeck(DryFriction):
         )
         return (*parameters, speed)
 
-    def law(self, m: mujoco.MjModel) -> Law:
+    def law(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on speed."""
         return StribeckFriction(dof_of(m, self.ids(m)))
 
@@ -201,6 +201,6 @@ class LoadDependentFriction(DryFriction):
         """One coefficient for each joint."""
         return self.each("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
 
-    def law(self, m: mujoco.MjModel) -> Law:
+    def law(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on load."""
         return LoadFriction(dof_of(m, self.ids(m)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from concent_warp.fit.effects.prediction import Course, Prediction, Trial
+from concent_warp.fit.effects.prediction import Course, Prediction, SimulationRequest
 
 AFTER = 1.0
 """Time after which an error has to have faded [s]."""
@@ -26,10 +26,10 @@ WATCHED = (0.75, 0.85, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
-class Known:
+class ReferenceSimulation:
     """A simulation that others are close to."""
 
-    trial: Trial
+    trial: SimulationRequest
     residual: np.ndarray
     """Its residuals, shape (count,)."""
 
@@ -41,7 +41,10 @@ def is_long(prediction: Prediction, window: int) -> bool:
 
 
 def residuals_near(
-    prediction: Prediction, known: Mapping[int, Known], trials: Sequence[Trial], hoped: Sequence[bool]
+    prediction: Prediction,
+    known: Mapping[int, ReferenceSimulation],
+    trials: Sequence[SimulationRequest],
+    hoped: Sequence[bool],
 ) -> tuple[list[np.ndarray], list[bool]]:
     """Return the residuals of trials that differ from known ones of their windows by the initial state only.
 
@@ -72,7 +75,9 @@ def residuals_near(
     return [r for r in found if r is not None], [i not in set(rest) for i in range(len(trials))]
 
 
-def _has_faded(prediction: Prediction, trial: Trial, other: Trial, course: Course, first: Course) -> bool:
+def _has_faded(
+    prediction: Prediction, trial: SimulationRequest, other: SimulationRequest, course: Course, first: Course
+) -> bool:
     """Return whether a simulation has found to the way of another one."""
     m, spread = prediction.compiled, prediction.windows[trial.window].spread
     none = np.zeros_like(spread)

@@ -15,7 +15,7 @@ from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_
 from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
-from concent_warp.fit.effects.prediction import Prediction, Trial
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import HUBER, huber, huber_limit
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -176,7 +176,7 @@ def check_finite(prediction: Prediction, source: str) -> None:
     Raises:
         ModelError: It does not in more than half of them.
     """
-    readers = prediction.readers([Trial(w, prediction.start) for w in range(len(prediction.windows))])
+    readers = prediction.readers([SimulationRequest(w, prediction.start) for w in range(len(prediction.windows))])
     lost = [
         not all(np.isfinite(reader(r.channel, r.time)).all() for r in window.readings)
         for window, reader in zip(prediction.windows, readers, strict=True)

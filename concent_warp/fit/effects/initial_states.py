@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from concent_warp.fit.effects.fading import Known, is_long, residuals_near
-from concent_warp.fit.effects.prediction import Prediction, Trial
+from concent_warp.fit.effects.fading import ReferenceSimulation, is_long, residuals_near
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import far, huber, huber_limit, huber_weight, trust
 
 DAMPINGS = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
@@ -62,9 +62,9 @@ class StartSearch:
         self.fading = [np.full(len(w.spread), is_long(prediction, i)) for i, w in enumerate(prediction.windows)]
         """Components of each window's initial state whose errors have faded so far."""
 
-    def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
+    def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[SimulationRequest]:
         """Return one trial a window."""
-        return [Trial(w, values, offset * self.p.windows[w].spread) for w, offset in enumerate(offsets)]
+        return [SimulationRequest(w, values, offset * self.p.windows[w].spread) for w, offset in enumerate(offsets)]
 
     def look_around(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
@@ -80,7 +80,7 @@ class StartSearch:
         trials, moved, hoped = [], [], []
         for w in windows:
             moved.append(offsets[w] + np.diag(self.probe[w]))
-            trials += [Trial(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
+            trials += [SimulationRequest(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
             hoped += self.fading[w].tolist()
         found, faded = residuals_near(self.p, self.known(values, offsets, residuals, windows), trials, hoped)
         looks, at = [], 0
@@ -96,9 +96,12 @@ class StartSearch:
 
     def known(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
-    ) -> dict[int, Known]:
+    ) -> dict[int, ReferenceSimulation]:
         """Return the simulations of some windows that others are close to."""
-        return {w: Known(Trial(w, values, offsets[w] * self.p.windows[w].spread), residuals[w]) for w in windows}
+        return {
+            w: ReferenceSimulation(SimulationRequest(w, values, offsets[w] * self.p.windows[w].spread), residuals[w])
+            for w in windows
+        }
 
     def refined(
         self,
@@ -147,7 +150,9 @@ class StartSearch:
         widths = np.resize(WIDTHS, (BEGINNINGS, 1))
         drawn = [widths * rng.normal(size=(BEGINNINGS, len(offsets[w]))) for w in windows]
         rows = [
-            Trial(w, values, o * self.p.windows[w].spread) for w, of in zip(windows, drawn, strict=True) for o in of
+            SimulationRequest(w, values, o * self.p.windows[w].spread)
+            for w, of in zip(windows, drawn, strict=True)
+            for o in of
         ]
         seen = self.p.residuals(rows)
         for k, w in enumerate(windows):
@@ -179,7 +184,7 @@ class StartSearch:
                 if np.mean(residuals[w] ** 2) > odd**2:
                     there += _around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
                 tried.append(there)
-                rows += [Trial(w, values, o * self.p.windows[w].spread) for o in there]
+                rows += [SimulationRequest(w, values, o * self.p.windows[w].spread) for o in there]
                 hoped += [bool(self.fading[w].all())] * len(there)
             known = self.known(values, offsets, residuals, unsettled)
             (found, _), moving, at = residuals_near(self.p, known, rows, hoped), [], 0

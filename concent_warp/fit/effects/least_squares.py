@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.fit.effects.initial_states import ROUNDS, StartSearch, start_cost
-from concent_warp.fit.effects.prediction import Prediction, Trial
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import far, huber, huber_limit, huber_weight, trust
 
 PRIOR = 10.0
@@ -273,7 +273,7 @@ class Solver:
             found.append(o - np.linalg.solve(aw @ a + np.diag(trust(o)), aw @ (piece.jacobian @ move)))
         return found
 
-    def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[Trial]:
+    def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[SimulationRequest]:
         """Return one trial a window."""
         return self.search.trials(values, offsets)
 

@@ -104,7 +104,7 @@ def start_spread(m: mujoco.MjModel, noise: Mapping[str, float]) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Source:
+class ObservedRecording:
     """A recording as a model reads it: which channels count, with what noise, and the state at any time."""
 
     model: Model

@@ -12,7 +12,14 @@ from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import pooled_noise
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.estimation.windows import Measured
-from concent_warp.fit.effects.observation import FEWEST, START_NOISE, Source, Window, first_time, start_spread
+from concent_warp.fit.effects.observation import (
+    FEWEST,
+    START_NOISE,
+    ObservedRecording,
+    Window,
+    first_time,
+    start_spread,
+)
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
@@ -105,7 +112,7 @@ def observe(
     Raises:
         RecordingError: There is too little to compare.
     """
-    source = Source(model, recording, noise or channel_noises(model, recording))
+    source = ObservedRecording(model, recording, noise or channel_noises(model, recording))
     windows: list[Window] = []
     for number, d in enumerate(recording.demonstrations):
         channels = [c for c in source.noise if c in d.measured]
@@ -125,7 +132,9 @@ def observe(
     return windows
 
 
-def keeps_close(source: Source, d: Demonstration, start: float, last: float, engine: EngineName, seed: int) -> float:
+def keeps_close(
+    source: ObservedRecording, d: Demonstration, start: float, last: float, engine: EngineName, seed: int
+) -> float:
     """Return for how long [s] what errors of a start do to the motion stays in proportion to them."""
     m = source.model.compile()
     span = min(last - start, LONGEST)

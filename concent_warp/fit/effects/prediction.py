@@ -31,7 +31,7 @@ MEMORY = 2**25
 
 
 @dataclass(frozen=True)
-class Trial:
+class SimulationRequest:
     """One simulation: a window, from a state off the measured one, with values of the parameters."""
 
     window: int
@@ -138,7 +138,7 @@ class Prediction:
             self._engines[key] = engine, model.spec().compile()
         return self._engines[key]
 
-    def readers(self, trials: Sequence[Trial]) -> list[Reader]:
+    def readers(self, trials: Sequence[SimulationRequest]) -> list[Reader]:
         """Simulate, and return what the model's instruments read in each trial; times count from the window's start.
 
         Effects of measurement are applied on top, by `observed`. What was simulated lately is not simulated again.
@@ -153,12 +153,12 @@ class Prediction:
             size -= self._kept.pop(next(iter(self._kept)))[1]
         return found
 
-    def _key(self, trial: Trial) -> tuple[int, bytes, bytes]:
+    def _key(self, trial: SimulationRequest) -> tuple[int, bytes, bytes]:
         """Return what a simulation depends on."""
         offset = b"" if trial.offset is None else trial.offset.tobytes()
         return trial.window, trial.values[~self.measured_only].tobytes(), offset
 
-    def courses(self, trials: Sequence[Trial], time: float | None = None) -> list[Course]:
+    def courses(self, trials: Sequence[SimulationRequest], time: float | None = None) -> list[Course]:
         """Simulate trials, each to the end of its window or for some time [s] only."""
         courses: list[Course | None] = [None] * len(trials)
         groups: dict[tuple[tuple[float, ...], int], list[int]] = {}
@@ -178,7 +178,9 @@ class Prediction:
         span = w.end - w.start if time is None else min(time, w.end - w.start)
         return max(int(np.ceil(span / self._base.scene.model.opt.timestep - 1e-9)), 1)
 
-    def _simulate(self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[Trial], steps: int) -> list[Course]:
+    def _simulate(
+        self, engine: Engine, bare: mujoco.MjModel, trials: Sequence[SimulationRequest], steps: int
+    ) -> list[Course]:
         """Simulate trials of equal length in one engine."""
         m, n = engine.compiled, len(trials)
         values = np.array([t.values for t in trials])
@@ -239,7 +241,7 @@ class Prediction:
             residual[r.rows] = np.nan_to_num(value / r.std, nan=LOST, posinf=LOST, neginf=-LOST).ravel()
         return np.clip(residual, -LOST, LOST)
 
-    def residuals(self, trials: Sequence[Trial]) -> list[np.ndarray]:
+    def residuals(self, trials: Sequence[SimulationRequest]) -> list[np.ndarray]:
         """Return the residuals of each trial, see `observed`."""
         readers = self.readers(trials)
         return [self.observed(t.window, r, t.values) for t, r in zip(trials, readers, strict=True)]

@@ -43,7 +43,7 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class Aim:
+class TargetTensors:
     """One target of one segment as tensors on the device that computes the losses."""
 
     segment: int
@@ -92,7 +92,7 @@ class Objective:
         self.record, _, _ = bracketing(times, engine.timestep, steps)
         self.bodies = tuple(dict.fromkeys(t.body for s in segments for t in s.targets))
         self.simulations = 0
-        self._aims: dict[tuple[torch.device, torch.dtype], list[Aim]] = {}
+        self._aims: dict[tuple[torch.device, torch.dtype], list[TargetTensors]] = {}
 
     def __call__(self, candidates: Candidates) -> Losses:
         """Return the losses of P candidates."""
@@ -148,7 +148,7 @@ class Objective:
         fit, held = fit or held, held or fit
         return torch.stack(fit).mean(dim=0), torch.stack(held).mean(dim=0)
 
-    def distances(self, position: torch.Tensor, quaternion: torch.Tensor, aim: Aim) -> torch.Tensor:
+    def distances(self, position: torch.Tensor, quaternion: torch.Tensor, aim: TargetTensors) -> torch.Tensor:
         """Return Chamfer distances [m], shape (P, T).
 
         Args:
@@ -166,7 +166,7 @@ class Objective:
         predicted = (aim.anchor @ pose).float()
         return chamfer(predicted, aim.observed, aim.seen, aim.seen, squared=self.squared)
 
-    def aims(self, device: torch.device, dtype: torch.dtype) -> list[Aim]:
+    def aims(self, device: torch.device, dtype: torch.dtype) -> list[TargetTensors]:
         """Return the targets on a device, where they stay."""
         key = device, dtype
         if key not in self._aims:
@@ -175,7 +175,7 @@ class Objective:
             ]
         return self._aims[key]
 
-    def aim(self, segment: int, target: BodyTarget, device: torch.device, dtype: torch.dtype) -> Aim:
+    def aim(self, segment: int, target: BodyTarget, device: torch.device, dtype: torch.dtype) -> TargetTensors:
         """Put a target on a device."""
         import torch
 
@@ -189,7 +189,7 @@ class Objective:
             fit, held = np.flatnonzero(counted & ~out), np.flatnonzero(counted & out)
             held = held if len(held) else fit
         kind: dict[str, Any] = {"dtype": dtype, "device": device}
-        return Aim(
+        return TargetTensors(
             segment=segment,
             body=self.bodies.index(target.body),
             anchor=torch.as_tensor(np.column_stack([target.anchor, np.ones(len(target.anchor))]), **kind),

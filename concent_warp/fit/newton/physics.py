@@ -50,7 +50,7 @@ class NewtonCfg:
 
 
 @dataclass(frozen=True)
-class Inertia:
+class BodyInertia:
     """A simulated body as its contacts feel it."""
 
     name: str
@@ -63,7 +63,7 @@ class Inertia:
 
 
 @dataclass(frozen=True)
-class Physics:
+class NewtonPhysics:
     """Numbers that satisfy the rules."""
 
     substeps: int
@@ -80,7 +80,7 @@ class Physics:
     """Depth at which damping is full [m]."""
 
 
-def coupling(body: Inertia, points: np.ndarray) -> float:
+def coupling(body: BodyInertia, points: np.ndarray) -> float:
     """Return how strongly contacts at points (n, 3) [m], body frame, act on a body together: L [1/kg]."""
     arm = points - body.com
     skew = np.zeros((len(arm), 3, 3))
@@ -96,11 +96,11 @@ def coupling(body: Inertia, points: np.ndarray) -> float:
 def choose_physics(
     cfg: NewtonCfg,
     timestep: float,
-    bodies: Sequence[Inertia],
+    bodies: Sequence[BodyInertia],
     couplings: Sequence[float],
     friction: float,
     gravity: float,
-) -> Physics:
+) -> NewtonPhysics:
     """Return numbers by the rules.
 
     Args:
@@ -140,4 +140,4 @@ def choose_physics(
         )
     k = int(fine.argmax())
     step = float(steps[k, 0])
-    return Physics(first + k, step, stiffness, np.minimum(damping, limit[k]), float(limit[k].min()), cfg.onset)
+    return NewtonPhysics(first + k, step, stiffness, np.minimum(damping, limit[k]), float(limit[k].min()), cfg.onset)

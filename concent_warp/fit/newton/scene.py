@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.errors import EngineError, ModelError
 from concent_warp.estimation.object_tracks import Segment, observed_states
-from concent_warp.fit.newton.physics import FEWEST, Inertia, NewtonCfg, Physics, choose_physics, coupling
+from concent_warp.fit.newton.physics import FEWEST, BodyInertia, NewtonCfg, NewtonPhysics, choose_physics, coupling
 from concent_warp.model import Model
 from concent_warp.simulate.engine import Rollout, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -26,7 +26,7 @@ LOOKED_AT = 200
 
 
 @dataclass(frozen=True)
-class Pairs:
+class CollisionPairs:
     """C pairs that may collide; the first shape is a fitted sphere of a simulated body."""
 
     sphere: np.ndarray
@@ -63,12 +63,12 @@ class NewtonScene:
 
     model: Model
     segments: tuple[Segment, ...]
-    physics: Physics
+    physics: NewtonPhysics
     bodies: tuple[str, ...]
     """Names of the bodies of a world: first those simulated, then those replayed."""
-    moving: tuple[Inertia, ...]
+    moving: tuple[BodyInertia, ...]
     """The simulated ones, D of them."""
-    pairs: Pairs
+    pairs: CollisionPairs
     start: np.ndarray
     """Poses at the start of each of n segments, position and quaternion xyzw, shape (n, nb, 7)."""
     start_velocity: np.ndarray
@@ -170,7 +170,7 @@ def _looked_at(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout)
     return np.concatenate([simulated, np.stack(observed)]).reshape(-1, m.nq)
 
 
-def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float) -> tuple[list[int], Pairs]:
+def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: float) -> tuple[list[int], CollisionPairs]:
     """Return the ids of all bodies that take part, simulated ones first, and the pairs that may collide.
 
     Args:
@@ -219,7 +219,7 @@ def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: floa
     frame = np.concatenate([m.geom_pos[second], m.geom_quat[second][:, [1, 2, 3, 0]]], axis=1)
     still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     priority = np.sign(m.geom_priority[second] - m.geom_priority[first])
-    return ids, Pairs(
+    return ids, CollisionPairs(
         sphere=sphere[first],
         other=sphere[second],
         body=np.array([[row[int(b)] for b in m.geom_bodyid[g]] for g in (first, second)]).T,
@@ -231,14 +231,14 @@ def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: floa
     )
 
 
-def _inertia_of(m: mujoco.MjModel, body: int) -> Inertia:
+def _inertia_of(m: mujoco.MjModel, body: int) -> BodyInertia:
     """Return the inertia of a body."""
     turn = Rotation.from_quat(m.body_iquat[body], scalar_first=True).as_matrix()
     inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
-    return Inertia(m.body(body).name, float(m.body_mass[body]), inertia, m.body_ipos[body].copy())
+    return BodyInertia(m.body(body).name, float(m.body_mass[body]), inertia, m.body_ipos[body].copy())
 
 
-def _strength(m: mujoco.MjModel, model: Model, body: int, inertia: Inertia, rollout: Rollout) -> float:
+def _strength(m: mujoco.MjModel, model: Model, body: int, inertia: BodyInertia, rollout: Rollout) -> float:
     """Return how strongly the contacts of a body act on it, at the worst step of a rollout with all contacts [1/kg]."""
     assert model.geometry is not None
     assert rollout.contacts is not None
@@ -264,7 +264,7 @@ def _touches(m: mujoco.MjModel, rollout: Rollout, variant: int, body: int) -> bo
     return bool((m.geom_bodyid[log.geom[first]] == body).any())
 
 
-def _velocity_of(m: mujoco.MjModel, qvel: np.ndarray, body: int, pose: np.ndarray, inertia: Inertia) -> np.ndarray:
+def _velocity_of(m: mujoco.MjModel, qvel: np.ndarray, body: int, pose: np.ndarray, inertia: BodyInertia) -> np.ndarray:
     """Return the velocity of a free body's centre of mass and its turning, world frame, shape (6,)."""
     address = m.jnt_dofadr[m.body_jntadr[body]]
     turn = Rotation.from_quat(pose[3:])

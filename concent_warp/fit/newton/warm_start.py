@@ -30,7 +30,7 @@ from concent_warp.fit.newton.scene import newton_scene
 from concent_warp.recording.recording import Demonstration
 
 
-class Warming:
+class GradientWarmStart:
     """Gradients from the state of a fit before its first generation."""
 
     def __init__(self, search: Search, demonstrations: Sequence[Demonstration], cfg: GradientCfg) -> None:

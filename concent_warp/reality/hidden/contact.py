@@ -7,7 +7,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.sliding_friction import Coefficients, frictionless, normal_forces, rub
 from concent_warp.reality.world import HiddenEffect
@@ -27,32 +27,32 @@ def instead(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
     Where the world rubs by a law of its own, only what is missing is added: friction is linear in the coefficients.
     """
     if rig.physics.force is None:
-        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in _own_geoms(rig)))
+        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in own_geoms(rig)))
         edit = partial(frictionless, geoms=geoms)
         return HiddenEffect(name, edit=edit, force=rub(coefficients, rig.body, rig.surface))
     mu = drawn_friction(rig)
     return HiddenEffect(name, force=rub(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
 
 
-def _own_geoms(rig: Rig) -> np.ndarray:
+def own_geoms(rig: Rig) -> np.ndarray:
     """Return the geoms of the rig's body, ids of shape (n,)."""
     return np.flatnonzero(rig.scene.model.geom_bodyid == rig.scene.model.body(rig.body).id)
 
 
-def _sliding_friction(rig: Rig, magnitude: float) -> Hidden:
+def sliding_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another coefficient [-]."""
     effect = instead(rig, "sliding_friction", lambda _t, _p: np.array([magnitude, magnitude]))
-    return Hidden("sliding_friction", effect, {"coefficient": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("sliding_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def _anisotropic_friction(rig: Rig, magnitude: float) -> Hidden:
+def anisotropic_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction along the surface's y is that along x times a ratio [-]."""
     mu = drawn_friction(rig) * np.array([1.0, magnitude])
     effect = instead(rig, "anisotropic_friction", lambda _t, _p: mu)
-    return Hidden("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
 
 
-def _turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
+def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
     """Return a torque of `magnitude` [m] times the normal force against turning about the normal, or across it.
 
     Friction against the other way of turning is as drawn. Both are laws of the world's own: MuJoCo's contacts, which
@@ -77,19 +77,19 @@ def _turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEff
     return HiddenEffect("rolling_friction" if rolling else "torsional_friction", edit=edit, force=force)
 
 
-def _torsional_friction(rig: Rig, magnitude: float) -> Hidden:
+def torsional_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another coefficient against spinning in place [m]."""
-    effect = _turning_friction(rig, magnitude, rolling=False)
-    return Hidden("torsional_friction", effect, {"coefficient": magnitude}, (rig.body,))
+    effect = turning_friction(rig, magnitude, rolling=False)
+    return HiddenEffectOfRig("torsional_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def _rolling_friction(rig: Rig, magnitude: float) -> Hidden:
+def rolling_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another coefficient against rolling [m]."""
-    effect = _turning_friction(rig, magnitude, rolling=True)
-    return Hidden("rolling_friction", effect, {"coefficient": magnitude}, (rig.body,))
+    effect = turning_friction(rig, magnitude, rolling=True)
+    return HiddenEffectOfRig("rolling_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
-def _contact_compliance(rig: Rig, magnitude: float) -> Hidden:
+def contact_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another damping ratio [-] of the contact, and a time constant that goes with its root."""
     drawn = rig.scene.model.geom(rig.surface).solref
     time_constant = float(drawn[0] * np.sqrt(magnitude / drawn[1]))
@@ -99,12 +99,12 @@ def _contact_compliance(rig: Rig, magnitude: float) -> Hidden:
             geom.solref = [time_constant, magnitude]
 
     truth = {"time_constant": time_constant, "damping_ratio": magnitude}
-    return Hidden("contact_compliance", HiddenEffect("contact_compliance", edit=edit), truth, (rig.body,))
+    return HiddenEffectOfRig("contact_compliance", HiddenEffect("contact_compliance", edit=edit), truth, (rig.body,))
 
 
-def _adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> Hidden:
+def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> HiddenEffectOfRig:
     """A force [N] that pulls each lower corner of a box to the surface while it is within a gap [m] of it."""
-    half = rig.scene.model.geom_size[_own_geoms(rig)[0]]
+    half = rig.scene.model.geom_size[own_geoms(rig)[0]]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -117,10 +117,10 @@ def _adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> Hidden:
             data.xfrc_applied[b, :3] += pull
             data.xfrc_applied[b, 3:] += np.cross(data.xpos[b] + lever - data.xipos[b], pull)
 
-    return Hidden("adhesion", HiddenEffect("adhesion", force=force), {"force": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("adhesion", HiddenEffect("adhesion", force=force), {"force": magnitude}, (rig.body,))
 
 
-def _grip_force(rig: Rig, magnitude: float) -> Hidden:
+def grip_force(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """The gripper's stiffness, damping and limit times a factor [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -130,10 +130,10 @@ def _grip_force(rig: Rig, magnitude: float) -> Hidden:
             actuator.biasprm = magnitude * np.array(actuator.biasprm)
             actuator.forcerange = magnitude * np.array(actuator.forcerange)
 
-    return Hidden("grip_force", HiddenEffect("grip_force", edit=edit), {"gain": magnitude}, rig.grippers)
+    return HiddenEffectOfRig("grip_force", HiddenEffect("grip_force", edit=edit), {"gain": magnitude}, rig.grippers)
 
 
-def _pad_friction(rig: Rig, magnitude: float) -> Hidden:
+def pad_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another coefficient of the pads on what they hold [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -144,19 +144,21 @@ def _pad_friction(rig: Rig, magnitude: float) -> Hidden:
 
     m = rig.scene.model
     fingers = tuple(m.body(m.geom(name).bodyid[0]).name for name in rig.pads)
-    return Hidden("pad_friction", HiddenEffect("pad_friction", edit=edit), {"coefficient": magnitude}, fingers)
+    return HiddenEffectOfRig(
+        "pad_friction", HiddenEffect("pad_friction", edit=edit), {"coefficient": magnitude}, fingers
+    )
 
 
 CONTACT: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        _sliding_friction,
-        _anisotropic_friction,
-        _torsional_friction,
-        _rolling_friction,
-        _contact_compliance,
-        _adhesion,
-        _grip_force,
-        _pad_friction,
+        sliding_friction,
+        anisotropic_friction,
+        torsional_friction,
+        rolling_friction,
+        contact_compliance,
+        adhesion,
+        grip_force,
+        pad_friction,
     )
 }

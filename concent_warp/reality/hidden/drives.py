@@ -7,12 +7,12 @@ from collections import deque
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Drive, Fresh, Hidden, drives, each
+from concent_warp.reality.hidden.hidden_effect import Builder, Drive, HiddenEffectOfRig, PerTrialState, drives, each
 from concent_warp.reality.rigs.rig import Rig, perform
 from concent_warp.reality.world import HiddenEffect
 
 
-class Late(Fresh):
+class Late(PerTrialState):
     """Commands pass through a queue and act after a delay; over a step, the mean of what acts in it."""
 
     def __init__(self, delay: float) -> None:
@@ -35,7 +35,7 @@ class Late(Fresh):
         return np.diff(starts) @ np.stack([value for _, value in self.queue])
 
 
-class Sluggish(Fresh):
+class Sluggish(PerTrialState):
     """Set points follow the commands by dy/dt = (u - y) / time constant."""
 
     def __init__(self, time_constant: float) -> None:
@@ -54,7 +54,7 @@ class Sluggish(Fresh):
         return ctrl + self.time_constant * (before - self.y) / elapsed
 
 
-def _arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
+def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
     """Return the effect of a hook on the commands of the arm; the gripper's pass."""
     columns = [rig.scene.model.actuator(d.actuator).id for d in drives(rig)]
 
@@ -66,17 +66,19 @@ def _arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
     return HiddenEffect(type(hook).__name__, command=command)
 
 
-def _actuator_delay(rig: Rig, magnitude: float) -> Hidden:
+def actuator_delay(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Commands act later [s]."""
-    return Hidden("actuator_delay", _arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
+    return HiddenEffectOfRig("actuator_delay", arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
 
 
-def _actuator_lag(rig: Rig, magnitude: float) -> Hidden:
+def actuator_lag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Set points follow with a time constant [s]."""
-    return Hidden("actuator_lag", _arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig)))
+    return HiddenEffectOfRig(
+        "actuator_lag", arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig))
+    )
 
 
-def _actuator_gain(rig: Rig, magnitude: float) -> Hidden:
+def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Every drive's force is that of the drawing times a factor [-]."""
     found = drives(rig)
 
@@ -89,10 +91,10 @@ def _actuator_gain(rig: Rig, magnitude: float) -> Hidden:
             spec.joint(d.joint).armature += (magnitude - 1.0) * rig.physics.armature.get(d.joint, 0.0)
 
     truth = each("gain", names(found), np.full(len(found), magnitude))
-    return Hidden("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
+    return HiddenEffectOfRig("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
 
 
-def _actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
+def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """No drive exceeds a limit [N m or N]."""
     found = drives(rig)
 
@@ -110,7 +112,7 @@ def _actuator_saturation(rig: Rig, magnitude: float) -> Hidden:
                 data.qfrc_applied[dof] += rig.physics.armature.get(d.joint, 0.0) * data.qacc[dof]
 
     effect = HiddenEffect("actuator_saturation", edit=edit, force=force)
-    return Hidden("actuator_saturation", effect, {"limit": magnitude}, names(found))
+    return HiddenEffectOfRig("actuator_saturation", effect, {"limit": magnitude}, names(found))
 
 
 def strain(rig: Rig, demonstrations: int, seed: int) -> float:
@@ -126,7 +128,7 @@ def strain(rig: Rig, demonstrations: int, seed: int) -> float:
     return float(np.quantile(seen, 0.99, axis=0).max())
 
 
-def _joint_offset(rig: Rig, magnitude: float) -> Hidden:
+def joint_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """How far the true angle is beyond what encoder and drive take it for [rad or m], in alternate directions."""
     found = drives(rig)
     m = rig.scene.model
@@ -149,7 +151,7 @@ def _joint_offset(rig: Rig, magnitude: float) -> Hidden:
 
     joints = tuple(d.joint for d in found)
     effect = HiddenEffect("joint_offset", command=command, measure=measure)
-    return Hidden("joint_offset", effect, each("offset", joints, offset), joints)
+    return HiddenEffectOfRig("joint_offset", effect, each("offset", joints, offset), joints)
 
 
 def names(found: tuple[Drive, ...]) -> tuple[str, ...]:
@@ -160,10 +162,10 @@ def names(found: tuple[Drive, ...]) -> tuple[str, ...]:
 DRIVES: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        _actuator_gain,
-        _actuator_saturation,
-        _actuator_delay,
-        _actuator_lag,
-        _joint_offset,
+        actuator_gain,
+        actuator_saturation,
+        actuator_delay,
+        actuator_lag,
+        joint_offset,
     )
 }

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.hidden.drives import names
-from concent_warp.reality.hidden.hidden_effect import Builder, Drive, Fresh, Hidden, drives, each
+from concent_warp.reality.hidden.hidden_effect import Builder, Drive, HiddenEffectOfRig, PerTrialState, drives, each
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -22,7 +22,7 @@ FINE = 20
 """Parts of a step in which a rotor crosses its play."""
 
 
-class Rotor(Fresh):
+class Rotor(PerTrialState):
     """The rotor of one drive."""
 
     def __init__(self, drive: Drive, column: int) -> None:
@@ -91,7 +91,7 @@ class Loose(Rotor):
         return through
 
 
-def _geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
+def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
     """Return the effect of rotors in all drives; encoders read the rotor or the link."""
     m = rig.scene.model
     found = drives(rig)
@@ -124,19 +124,19 @@ def _geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_roto
     return HiddenEffect(name, edit=edit, force=force, measure=measure)
 
 
-def _backlash(rig: Rig, magnitude: float) -> Hidden:
+def backlash(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
-    effect = _geared(rig, "backlash", lambda d, i: Loose(d, i, magnitude), on_rotor=False)
-    return Hidden("backlash", effect, {"play": magnitude}, names(drives(rig)))
+    effect = geared(rig, "backlash", lambda d, i: Loose(d, i, magnitude), on_rotor=False)
+    return HiddenEffectOfRig("backlash", effect, {"play": magnitude}, names(drives(rig)))
 
 
-def _joint_compliance(rig: Rig, magnitude: float) -> Hidden:
+def joint_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
     found = drives(rig)
     compliance = {d.actuator: magnitude / d.weight for d in found}
-    effect = _geared(rig, "joint_compliance", lambda d, i: Sprung(d, i, compliance[d.actuator]), on_rotor=True)
+    effect = geared(rig, "joint_compliance", lambda d, i: Sprung(d, i, compliance[d.actuator]), on_rotor=True)
     truth = each("compliance", names(found), np.array(list(compliance.values())))
-    return Hidden("joint_compliance", effect, truth, names(found))
+    return HiddenEffectOfRig("joint_compliance", effect, truth, names(found))
 
 
-GEARS: dict[str, Builder] = {f.__name__: f for f in (_backlash, _joint_compliance)}
+GEARS: dict[str, Builder] = {f.__name__: f for f in (backlash, joint_compliance)}

@@ -13,7 +13,7 @@ from concent_warp.reality.world import HiddenEffect
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenEffectOfRig:
     """An effect hidden in a rig, and what it is."""
 
     name: str
@@ -25,7 +25,7 @@ class Hidden:
     """Joints, drives, bodies or sensors that it acts on; those of no effect here stay without it."""
 
 
-Builder = Callable[[Rig, float], Hidden]
+Builder = Callable[[Rig, float], HiddenEffectOfRig]
 """Makes an effect of a magnitude, in the unit of its main parameter."""
 
 
@@ -68,7 +68,7 @@ def drives(rig: Rig) -> tuple[Drive, ...]:
     return tuple(Drive(*f, weight=float(s / strength.max())) for f, s in zip(found, strength, strict=True))
 
 
-class Fresh:
+class PerTrialState:
     """State of a hook that begins anew with each trial, that is where time runs back."""
 
     def __init__(self) -> None:

@@ -15,11 +15,11 @@ import numpy as np
 from concent_warp.errors import ConcentError
 from concent_warp.reality.hidden.drives import DRIVES
 from concent_warp.reality.hidden.gears import GEARS
-from concent_warp.reality.hidden.hidden_effect import Hidden
+from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig
 from concent_warp.reality.hidden.joints import JOINTS
 from concent_warp.reality.hidden.objects import OBJECTS
 from concent_warp.reality.hidden.registry import hidden
-from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
 
@@ -49,7 +49,7 @@ class TaskWorld:
 
     def __post_init__(self) -> None:
         names = [name for name, _ in self.wanted]
-        if "pad_friction" in names and not _pads(self.scene.model, self.grippers):
+        if "pad_friction" in names and not pads(self.scene.model, self.grippers):
             raise ConcentError(
                 "pad_friction cannot be hidden: no geom of the fingers has a name", where=self.scene.source
             )
@@ -60,14 +60,14 @@ class TaskWorld:
         return Rig(
             "task",
             self.scene,
-            _unplanned,
+            unplanned,
             WorldPhysics(timestep=self.physics.timestep),
             body=self.body,
-            grippers=tuple(name for name in self.grippers if name in _actuators(m)),
-            pads=_pads(m, self.grippers),
+            grippers=tuple(name for name in self.grippers if name in actuators(m)),
+            pads=pads(m, self.grippers),
         )
 
-    def hidden(self) -> tuple[Hidden, ...]:
+    def hidden(self) -> tuple[HiddenEffectOfRig, ...]:
         """Return the effects, made anew: many have a state, so that each world needs its own."""
         rig = self.rig()
         return tuple(hidden(name, magnitude, rig) for name, magnitude in self.wanted)
@@ -124,21 +124,21 @@ def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
     return tuple(found.items())
 
 
-def _unplanned(rng: np.random.Generator, k: int) -> Trial:
+def unplanned(rng: np.random.Generator, k: int) -> RigTrial:
     """No motion is planned: the policy moves."""
     del rng, k
     raise NotImplementedError("a policy moves the world of a task")
 
 
-def _actuators(m: mujoco.MjModel) -> list[str]:
+def actuators(m: mujoco.MjModel) -> list[str]:
     """Return the names of a model's actuators."""
     return [m.actuator(a).name for a in range(m.nu)]
 
 
-def _pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
+def pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
     """Return the named geoms that can touch and whose bodies the grippers move."""
     joints: set[int] = set()
-    for name in set(grippers) & set(_actuators(m)):
+    for name in set(grippers) & set(actuators(m)):
         a = m.actuator(name).id
         target = int(m.actuator_trnid[a, 0])
         if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:

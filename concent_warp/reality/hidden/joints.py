@@ -13,7 +13,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Fresh, Hidden, drives, each
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, PerTrialState, drives, each
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -23,7 +23,7 @@ Level = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 """Given model, data and degree of freedom, returns the friction at steady sliding [N m or N]."""
 
 
-class Bristles(Fresh):
+class Bristles(PerTrialState):
     """Friction of one joint."""
 
     def __init__(self, joint: str, level: Level) -> None:
@@ -60,16 +60,18 @@ def friction(name: str, levels: dict[str, Level]) -> HiddenEffect:
     return HiddenEffect(name, force=force)
 
 
-def _joint_friction(rig: Rig, magnitude: float) -> Hidden:
+def joint_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Coulomb friction [N m or N] of the strongest drive; less in weaker ones."""
     found = drives(rig)
     torque = np.array([magnitude * d.weight for d in found])
     levels: dict[str, Level] = {d.joint: lambda _m, _d, _i, t=t: t for d, t in zip(found, torque, strict=True)}
     joints = tuple(d.joint for d in found)
-    return Hidden("joint_friction", friction("joint_friction", levels), each("torque", joints, torque), joints)
+    return HiddenEffectOfRig(
+        "joint_friction", friction("joint_friction", levels), each("torque", joints, torque), joints
+    )
 
 
-def _stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
+def stribeck_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction [N m or N] at rest that fades with speed."""
     found = drives(rig)
     speed = 0.03 if rig.slides else 0.3
@@ -83,10 +85,10 @@ def _stribeck_friction(rig: Rig, magnitude: float) -> Hidden:
     levels: dict[str, Level] = {d.joint: partial(level, top=t) for d, t in zip(found, extra, strict=True)}
     joints = tuple(d.joint for d in found)
     truth = {**each("extra", joints, extra), "speed": speed}
-    return Hidden("stribeck_friction", friction("stribeck_friction", levels), truth, joints)
+    return HiddenEffectOfRig("stribeck_friction", friction("stribeck_friction", levels), truth, joints)
 
 
-def _load_friction(rig: Rig, magnitude: float) -> Hidden:
+def load_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction by a coefficient [-] of the load between motor and link, the mean of the torques on both sides."""
     joints = tuple(d.joint for d in drives(rig))
 
@@ -95,10 +97,10 @@ def _load_friction(rig: Rig, magnitude: float) -> Hidden:
         return magnitude * 0.5 * abs(data.qfrc_actuator[dof] + data.qfrc_bias[dof])
 
     truth = each("coefficient", joints, np.full(len(joints), magnitude))
-    return Hidden("load_friction", friction("load_friction", dict.fromkeys(joints, level)), truth, joints)
+    return HiddenEffectOfRig("load_friction", friction("load_friction", dict.fromkeys(joints, level)), truth, joints)
 
 
-def _joint_damping(rig: Rig, magnitude: float) -> Hidden:
+def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Viscous friction beyond the drawing's [N m s/rad or N s/m] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
@@ -111,10 +113,10 @@ def _joint_damping(rig: Rig, magnitude: float) -> Hidden:
             data.qfrc_applied[dof] -= damping * data.qvel[dof]
 
     truth = each("damping", joints, drawn + added)
-    return Hidden("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
+    return HiddenEffectOfRig("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
 
 
-def _armature(rig: Rig, magnitude: float) -> Hidden:
+def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Rotor inertia beyond the drawing's [kg m^2 or kg] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
@@ -125,10 +127,12 @@ def _armature(rig: Rig, magnitude: float) -> Hidden:
         for joint, inertia in zip(joints, added, strict=True):
             spec.joint(joint).armature += inertia
 
-    return Hidden("armature", HiddenEffect("armature", edit=edit), each("inertia", joints, drawn + added), joints)
+    return HiddenEffectOfRig(
+        "armature", HiddenEffect("armature", edit=edit), each("inertia", joints, drawn + added), joints
+    )
 
 
-def _gravity_compensation(rig: Rig, magnitude: float) -> Hidden:
+def gravity_compensation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A share [-] of each link's weight that its controller holds up too much."""
     m = rig.scene.model
     free = {m.jnt_bodyid[j] for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE}
@@ -141,17 +145,17 @@ def _gravity_compensation(rig: Rig, magnitude: float) -> Hidden:
             data.xfrc_applied[body.id, 2] += magnitude * 9.81 * body.mass[0]
 
     effect = HiddenEffect("gravity_compensation", force=force)
-    return Hidden("gravity_compensation", effect, {"share": magnitude}, links)
+    return HiddenEffectOfRig("gravity_compensation", effect, {"share": magnitude}, links)
 
 
 JOINTS: dict[str, Builder] = {
     f.__name__: f
     for f in (
-        _joint_friction,
-        _stribeck_friction,
-        _load_friction,
-        _joint_damping,
-        _armature,
-        _gravity_compensation,
+        joint_friction,
+        stribeck_friction,
+        load_friction,
+        joint_damping,
+        armature,
+        gravity_compensation,
     )
 }

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden, each
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, each
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -16,55 +16,53 @@ Written = tuple[np.ndarray, np.ndarray]
 """Times (T,) [s] and values (T, dim)."""
 
 
-def _channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
+def channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
     """Return the sensors of some kinds."""
     m = rig.scene.model
     return tuple(m.sensor(i).name for i in range(m.nsensor) if SENSOR(int(m.sensor_type[i])) in kinds)
 
 
-def _clocked(rig: Rig) -> tuple[str, ...]:
+def clocked(rig: Rig) -> tuple[str, ...]:
     """Return the channels whose clock may be wrong: the tracker's where an object is tracked, else the encoders'."""
-    return (
-        _channels(rig, *POSES) if rig.body_tracked else _channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
-    )
+    return channels(rig, *POSES) if rig.body_tracked else channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
 
 
-def _time_base(rig: Rig, magnitude: float) -> Hidden:
+def time_base(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A clock that runs fast by a share [-]."""
-    wrong = _clocked(rig)
+    wrong = clocked(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time * (1 + magnitude) if name in wrong else time), value
 
-    return Hidden("time_base", HiddenEffect("time_base", measure=measure), {"scale": magnitude}, wrong)
+    return HiddenEffectOfRig("time_base", HiddenEffect("time_base", measure=measure), {"scale": magnitude}, wrong)
 
 
-def _latency(rig: Rig, magnitude: float) -> Hidden:
+def latency(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Readings are stamped too late [s]; those older than the recording are lost."""
-    wrong = _clocked(rig)
+    wrong = clocked(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time + magnitude if name in wrong else time), value
 
-    return Hidden("latency", HiddenEffect("latency", measure=measure), {"delay": magnitude}, wrong)
+    return HiddenEffectOfRig("latency", HiddenEffect("latency", measure=measure), {"delay": magnitude}, wrong)
 
 
-def _length_scale(rig: Rig, magnitude: float) -> Hidden:
+def length_scale(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Positions too large by a share [-]."""
-    wrong = _channels(rig, SENSOR.mjSENS_FRAMEPOS)
+    wrong = channels(rig, SENSOR.mjSENS_FRAMEPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
 
-    return Hidden("length_scale", HiddenEffect("length_scale", measure=measure), {"scale": magnitude}, wrong)
+    return HiddenEffectOfRig("length_scale", HiddenEffect("length_scale", measure=measure), {"scale": magnitude}, wrong)
 
 
-def _frame_offset(rig: Rig, magnitude: float) -> Hidden:
+def frame_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """The tracker stands elsewhere than calibrated: shifted [m] along x, -y and half along z, and turned."""
     shift = magnitude * np.array([1.0, -1.0, 0.5])
     turn = magnitude * 3.0 * np.array([1.0, 0.5, -1.0])
     rotation = Rotation.from_rotvec(turn)
-    wrong = _channels(rig, *POSES)
+    wrong = channels(rig, *POSES)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         if name not in wrong:
@@ -75,31 +73,31 @@ def _frame_offset(rig: Rig, magnitude: float) -> Hidden:
 
     axes: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
     truth: dict[str, float] = dict(zip(axes, map(float, (*shift, *turn)), strict=True))
-    return Hidden("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
+    return HiddenEffectOfRig("frame_offset", HiddenEffect("frame_offset", measure=measure), truth, wrong)
 
 
-def _sensor_bias(rig: Rig, magnitude: float) -> Hidden:
+def sensor_bias(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Encoders read too much by a constant [rad or m]."""
-    wrong = _channels(rig, SENSOR.mjSENS_JOINTPOS)
+    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value + magnitude if name in wrong else value
 
     truth = each("bias", wrong, np.full(len(wrong), magnitude))
-    return Hidden("sensor_bias", HiddenEffect("sensor_bias", measure=measure), truth, wrong)
+    return HiddenEffectOfRig("sensor_bias", HiddenEffect("sensor_bias", measure=measure), truth, wrong)
 
 
-def _sensor_gain(rig: Rig, magnitude: float) -> Hidden:
+def sensor_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Encoders read too much by a share [-]."""
-    wrong = _channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
 
     truth = each("scale", wrong, np.full(len(wrong), magnitude))
-    return Hidden("sensor_gain", HiddenEffect("sensor_gain", measure=measure), truth, wrong)
+    return HiddenEffectOfRig("sensor_gain", HiddenEffect("sensor_gain", measure=measure), truth, wrong)
 
 
 MEASUREMENT: dict[str, Builder] = {
-    f.__name__: f for f in (_time_base, _latency, _length_scale, _frame_offset, _sensor_bias, _sensor_gain)
+    f.__name__: f for f in (time_base, latency, length_scale, frame_offset, sensor_bias, sensor_gain)
 }

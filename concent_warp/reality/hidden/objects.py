@@ -5,12 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden, fixed_inertia
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, fixed_inertia
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect, chamfered_box
 
 
-def _mass(rig: Rig, magnitude: float) -> Hidden:
+def mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Mass and inertia times a factor [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -18,10 +18,10 @@ def _mass(rig: Rig, magnitude: float) -> Hidden:
         body.mass *= magnitude
         body.inertia = magnitude * np.array(body.inertia)
 
-    return Hidden("mass", HiddenEffect("mass", edit=edit), {"mass": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("mass", HiddenEffect("mass", edit=edit), {"mass": magnitude}, (rig.body,))
 
 
-def _center_of_mass(rig: Rig, magnitude: float) -> Hidden:
+def center_of_mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Centre of mass off the drawing's by this much along x and half as much along -y [m], body frame."""
     shift = magnitude * np.array([1.0, -0.5, 0.0])
 
@@ -30,20 +30,20 @@ def _center_of_mass(rig: Rig, magnitude: float) -> Hidden:
         body.ipos = np.array(body.ipos) + shift
 
     truth = dict(zip("xyz", map(float, shift), strict=True))
-    return Hidden("center_of_mass", HiddenEffect("center_of_mass", edit=edit), truth, (rig.body,))
+    return HiddenEffectOfRig("center_of_mass", HiddenEffect("center_of_mass", edit=edit), truth, (rig.body,))
 
 
-def _inertia(rig: Rig, magnitude: float) -> Hidden:
+def inertia(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Inertia times a factor [-] at the same mass: more of it far out."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)
         body.inertia = magnitude * np.array(body.inertia)
 
-    return Hidden("inertia", HiddenEffect("inertia", edit=edit), {"inertia": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("inertia", HiddenEffect("inertia", edit=edit), {"inertia": magnitude}, (rig.body,))
 
 
-def _size(rig: Rig, magnitude: float) -> Hidden:
+def size(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Lengths times a factor [-] at the same mass and inertia."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -52,10 +52,10 @@ def _size(rig: Rig, magnitude: float) -> Hidden:
             geom.size = magnitude * np.array(geom.size)
             geom.pos = magnitude * np.array(geom.pos)
 
-    return Hidden("size", HiddenEffect("size", edit=edit), {"size": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("size", HiddenEffect("size", edit=edit), {"size": magnitude}, (rig.body,))
 
 
-def _contact_geometry(rig: Rig, magnitude: float) -> Hidden:
+def contact_geometry(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A box that is wider on one side [m], with worn edges; mass and inertia are those of the drawing."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -70,7 +70,7 @@ def _contact_geometry(rig: Rig, magnitude: float) -> Hidden:
             mesh.uservert = corners.ravel()
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
 
-    return Hidden("contact_geometry", HiddenEffect("contact_geometry", edit=edit), {}, (rig.body,))
+    return HiddenEffectOfRig("contact_geometry", HiddenEffect("contact_geometry", edit=edit), {}, (rig.body,))
 
 
-OBJECTS: dict[str, Builder] = {f.__name__: f for f in (_mass, _center_of_mass, _inertia, _size, _contact_geometry)}
+OBJECTS: dict[str, Builder] = {f.__name__: f for f in (mass, center_of_mass, inertia, size, contact_geometry)}

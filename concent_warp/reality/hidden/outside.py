@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.hidden.contact import drawn_friction, instead
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden, drives, fixed_inertia
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, drives, fixed_inertia
 from concent_warp.reality.hidden.joints import Level, friction
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
@@ -21,7 +21,7 @@ SPOT = np.array([0.03, 0.02])
 """Place of the magnet and of the rough patch on the table [m]."""
 
 
-def _cogging(rig: Rig, magnitude: float) -> Hidden:
+def cogging(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Torque that ripples with the angle, as magnets pass teeth [N m or N]."""
     pitch = 2 * np.pi / PITCH if rig.slides else POLES
 
@@ -31,17 +31,17 @@ def _cogging(rig: Rig, magnitude: float) -> Hidden:
             phase = pitch * data.qpos[joint.qposadr[0]]
             data.qfrc_applied[joint.dofadr[0]] += magnitude * d.weight * np.sin(phase)
 
-    return Hidden("cogging", HiddenEffect("cogging", force=force))
+    return HiddenEffectOfRig("cogging", HiddenEffect("cogging", force=force))
 
 
-def _cable(rig: Rig, magnitude: float) -> Hidden:
+def cable(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A cable [N/m] that is as long as the way to where the body rests: slack on one side, and tugging on the other."""
-    rest = _data_at_rest(rig)
-    slack = np.linalg.norm(ANCHOR - _cable_end(rig, rest, rest.model.body(rig.body).id))
+    rest = data_at_rest(rig)
+    slack = np.linalg.norm(ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(rig.body).id
-        end = _cable_end(rig, data, b)
+        end = cable_end(rig, data, b)
         way = ANCHOR - end
         length = np.linalg.norm(way)
         if length > slack:
@@ -49,10 +49,10 @@ def _cable(rig: Rig, magnitude: float) -> Hidden:
             data.xfrc_applied[b, :3] += pull
             data.xfrc_applied[b, 3:] += np.cross(end - data.xipos[b], pull)
 
-    return Hidden("cable", HiddenEffect("cable", force=force))
+    return HiddenEffectOfRig("cable", HiddenEffect("cable", force=force))
 
 
-def _data_at_rest(rig: Rig) -> mujoco.MjData:
+def data_at_rest(rig: Rig) -> mujoco.MjData:
     """Return the drawing in its initial state."""
     model = rig.scene.model
     data = mujoco.MjData(model)
@@ -60,12 +60,12 @@ def _data_at_rest(rig: Rig) -> mujoco.MjData:
     return data
 
 
-def _cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
+def cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
     """Return where a cable is tied [m], shape (3,): to a body that is tracked, or to the last site."""
     return data.xipos[body] if rig.body_tracked else data.site_xpos[-1]
 
 
-def _magnet(rig: Rig, magnitude: float) -> Hidden:
+def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A magnet under the table that draws the body sideways [N] when it is near."""
     reach = 0.05
 
@@ -74,10 +74,10 @@ def _magnet(rig: Rig, magnitude: float) -> Hidden:
         way = SPOT - data.xipos[b, :2]
         data.xfrc_applied[b, :2] += magnitude * way / reach * np.exp(0.5 - 0.5 * (way @ way) / reach**2)
 
-    return Hidden("magnet", HiddenEffect("magnet", force=force))
+    return HiddenEffectOfRig("magnet", HiddenEffect("magnet", force=force))
 
 
-def _patch(rig: Rig, magnitude: float) -> Hidden:
+def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A place on the table where friction is other by a coefficient [-]."""
     mu, radius = drawn_friction(rig), 0.05
 
@@ -86,19 +86,19 @@ def _patch(rig: Rig, magnitude: float) -> Hidden:
         rough = float(np.linalg.norm(point[:2] - SPOT) < radius)
         return np.full(2, mu + magnitude * rough)
 
-    return Hidden("patch", instead(rig, "patch", coefficients))
+    return HiddenEffectOfRig("patch", instead(rig, "patch", coefficients))
 
 
-def _warming(rig: Rig, magnitude: float) -> Hidden:
+def warming(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction of a cold drive [N m or N] that is gone after a few seconds."""
     levels: dict[str, Level] = {
         d.joint: lambda _m, s, _i, w=d.weight: magnitude * w * float(np.exp(-max(s.time, 0.0) / 2.0))
         for d in drives(rig)
     }
-    return Hidden("warming", friction("warming", levels))
+    return HiddenEffectOfRig("warming", friction("warming", levels))
 
 
-def _dropout(rig: Rig, magnitude: float) -> Hidden:
+def dropout(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Drives that lose a share of their force [-] for 0.3 s, twice."""
     found = drives(rig)
 
@@ -107,10 +107,10 @@ def _dropout(rig: Rig, magnitude: float) -> Hidden:
             for d in found:
                 data.qfrc_applied[model.joint(d.joint).dofadr[0]] -= magnitude * d.error_force(model, data)
 
-    return Hidden("dropout", HiddenEffect("dropout", force=force))
+    return HiddenEffectOfRig("dropout", HiddenEffect("dropout", force=force))
 
 
-def _slosh(rig: Rig, magnitude: float) -> Hidden:
+def slosh(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A share of the body's mass [-] that swings in it on springs, at 3 Hz."""
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -129,7 +129,7 @@ def _slosh(rig: Rig, magnitude: float) -> Hidden:
                 damping=[0.1 * np.sqrt(stiffness * part), 0, 0],
             )
 
-    return Hidden("slosh", HiddenEffect("slosh", edit=edit))
+    return HiddenEffectOfRig("slosh", HiddenEffect("slosh", edit=edit))
 
 
-OUTSIDE: dict[str, Builder] = {f.__name__: f for f in (_cogging, _cable, _magnet, _patch, _warming, _dropout, _slosh)}
+OUTSIDE: dict[str, Builder] = {f.__name__: f for f in (cogging, cable, magnet, patch, warming, dropout, slosh)}

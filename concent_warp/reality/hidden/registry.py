@@ -8,7 +8,7 @@ from __future__ import annotations
 from concent_warp.reality.hidden.contact import CONTACT
 from concent_warp.reality.hidden.drives import DRIVES
 from concent_warp.reality.hidden.gears import GEARS
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.hidden.joints import JOINTS
 from concent_warp.reality.hidden.measurement import MEASUREMENT
 from concent_warp.reality.hidden.objects import OBJECTS
@@ -21,7 +21,7 @@ INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **GEARS, **OBJECTS, **CONTACT,
 EVERY: dict[str, Builder] = {**INSIDE, **OUTSIDE}
 
 
-def hidden(name: str, magnitude: float, rig: Rig) -> Hidden:
+def hidden(name: str, magnitude: float, rig: Rig) -> HiddenEffectOfRig:
     """Return an effect to be hidden in a rig.
 
     Args:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Hidden
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -17,7 +17,7 @@ AIR = 1.2
 """Density of air times a drag factor of 1 [kg/m^3]."""
 
 
-def _gravity_tilt(rig: Rig, magnitude: float) -> Hidden:
+def gravity_tilt(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """The table's normal leans against the vertical: gravity turned about x [rad], and by -0.6 of it about y."""
     turn = magnitude * np.array([1.0, -0.6, 0.0])
     down = np.array(rig.scene.model.opt.gravity)
@@ -31,10 +31,10 @@ def _gravity_tilt(rig: Rig, magnitude: float) -> Hidden:
         data.xfrc_applied[1:, :3] += (model.body_mass * compensated)[1:, None] * (turned - down)
 
     truth = {"x": float(turn[0]), "y": float(turn[1])}
-    return Hidden("gravity_tilt", HiddenEffect("gravity_tilt", force=force), truth)
+    return HiddenEffectOfRig("gravity_tilt", HiddenEffect("gravity_tilt", force=force), truth)
 
 
-def _air(density: float, wind: np.ndarray, body: str) -> HiddenEffect:
+def air(density: float, wind: np.ndarray, body: str) -> HiddenEffect:
     """Return the effect of air of a density times drag factor [kg/m^3] that moves with `wind` (3,) [m/s]."""
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -42,14 +42,14 @@ def _air(density: float, wind: np.ndarray, body: str) -> HiddenEffect:
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, b, velocity, 0)
         against = velocity[3:] - wind
-        area, volume = _shadow(model, b, data.xmat[b].reshape(3, 3).T @ against)
+        area, volume = shadow(model, b, data.xmat[b].reshape(3, 3).T @ against)
         data.xfrc_applied[b, :3] -= 0.5 * density * area * np.linalg.norm(against) * against
         data.xfrc_applied[b, :3] += 0.5 * density * volume * np.cross(velocity[:3], against)
 
     return HiddenEffect("air", force=force)
 
 
-def _shadow(model: mujoco.MjModel, body: int, direction: np.ndarray) -> tuple[float, float]:
+def shadow(model: mujoco.MjModel, body: int, direction: np.ndarray) -> tuple[float, float]:
     """Return the area [m^2] that a body's only geom shows along a direction (3,), body frame, and its volume [m^3].
 
     Raises:
@@ -66,16 +66,16 @@ def _shadow(model: mujoco.MjModel, body: int, direction: np.ndarray) -> tuple[fl
     raise ValueError(f"no shadow of geom {model.geom(geom).name!r}")
 
 
-def _air_drag(rig: Rig, magnitude: float) -> Hidden:
+def air_drag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Still air of a density times drag factor [kg/m^3]."""
-    return Hidden("air_drag", _air(magnitude, np.zeros(3), rig.body), {"density": magnitude}, (rig.body,))
+    return HiddenEffectOfRig("air_drag", air(magnitude, np.zeros(3), rig.body), {"density": magnitude}, (rig.body,))
 
 
-def _wind(rig: Rig, magnitude: float) -> Hidden:
+def wind(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Wind [m/s] along -x, and half as much along y; a drag factor of 1."""
     velocity = magnitude * np.array([-1.0, 0.5, 0.0])
     truth = dict(zip("xyz", map(float, velocity), strict=True))
-    return Hidden("wind", _air(AIR, velocity, rig.body), truth, (rig.body,))
+    return HiddenEffectOfRig("wind", air(AIR, velocity, rig.body), truth, (rig.body,))
 
 
-WORLD: dict[str, Builder] = {f.__name__: f for f in (_gravity_tilt, _air_drag, _wind)}
+WORLD: dict[str, Builder] = {f.__name__: f for f in (gravity_tilt, air_drag, wind)}

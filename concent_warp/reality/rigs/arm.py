@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, of_coarser_step
+from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
 from concent_warp.reality.rigs.signals import RATE, chirp, glide, hold
 from concent_warp.scene.robot import FINGER_TRAVEL, HOME, panda
 from concent_warp.scene.scene import Scene
@@ -28,7 +28,7 @@ def _drawing() -> Scene:
     return Scene.from_spec(spec, source="arm rig")
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Sweep every joint there and back at its own speed, swing all with rising frequency, hold in between."""
     del k
     action = {}
@@ -46,7 +46,7 @@ def _plan(rng: np.random.Generator, k: int) -> Trial:
     action["gripper"] = (time, np.full(len(time), FINGER_TRAVEL / 2))
     qpos = {f"joint{joint + 1}": [angle] for joint, angle in enumerate(HOME)}
     qpos |= {f"{side}_finger_joint": [FINGER_TRAVEL / 2] for side in ("left", "right")}
-    return Trial(DURATION, action, qpos=qpos, settle=0.5)
+    return RigTrial(DURATION, action, qpos=qpos, settle=0.5)
 
 
 SCENE = _drawing()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.scene.scene import Scene
 
 HEIGHTS = (1.0, 0.5, 1.4, 0.75)
@@ -31,13 +31,13 @@ XML = f"""
 """
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Throw the ball, hardly spinning; it bounces once or twice."""
     height = HEIGHTS[k % 4] * rng.uniform(0.95, 1.05)
     heading = rng.uniform(-np.pi, np.pi)
     speed = rng.uniform(1.0, 3.0)
     fall = np.sqrt(2 * (height - RADIUS) / 9.81)
-    return Trial(
+    return RigTrial(
         fall + 0.6,
         qpos={"ball_joint": [-0.3 * np.cos(heading), -0.3 * np.sin(heading), height, 1, 0, 0, 0]},
         qvel={

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, of_coarser_step
+from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
 from concent_warp.reality.rigs.signals import RATE, chirp, glide, hold
 from concent_warp.scene.scene import Scene
 
@@ -76,7 +76,7 @@ LOW = -0.008
 """Height of the hand in the grasp, against the drawing's [m]."""
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Close slowly, lift, shake along x and along z with rising frequency, hold, set down gently, open."""
     del k
     lift = rng.uniform(0.07, 0.1)
@@ -95,7 +95,7 @@ def _plan(rng: np.random.Generator, k: int) -> Trial:
     command["gripper"] = np.concatenate(grip)
     time = np.arange(count) / RATE
     place = rng.uniform(-0.003, 0.003, 2)
-    return Trial(
+    return RigTrial(
         count / RATE,
         {name: (time, value) for name, value in command.items()},
         qpos={

@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.reality.expert.plan import ExpertCfg
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.reality.rigs.rig import Rig, Trial, of_coarser_step
+from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
 from concent_warp.reality.sensors.sensing import SensingCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Recording
@@ -29,7 +29,7 @@ def _drawing() -> Scene:
     return Scene.from_spec(spec, source="insertion rig")
 
 
-def _unplanned(rng: np.random.Generator, k: int) -> Trial:
+def _unplanned(rng: np.random.Generator, k: int) -> RigTrial:
     """The expert plans for himself."""
     del rng, k
     raise NotImplementedError("insertions are recorded by the scripted expert")

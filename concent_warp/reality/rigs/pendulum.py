@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, of_coarser_step
+from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
 from concent_warp.reality.rigs.signals import chirp, glide, hold, joined, sweep
 from concent_warp.scene.scene import Scene
 
@@ -35,7 +35,7 @@ XML = """
 """
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Sweep at four speeds, swing with rising frequency, reverse slowly, hold at two heights."""
     del k
     reach = rng.uniform(1.1, 1.4)
@@ -50,7 +50,7 @@ def _plan(rng: np.random.Generator, k: int) -> Trial:
     parts += [sweep(centre, centre - 0.15, slow), sweep(centre - 0.15, centre, slow)]
     parts += [sweep(centre, b, 0.8), hold(b, 0.4), glide(b, 0.0, 0.5)]
     parts += [hold(0.0, max(0.1, DURATION - sum(map(len, parts)) / 100))]
-    return Trial(DURATION, {"servo": joined(parts)}, settle=0.5)
+    return RigTrial(DURATION, {"servo": joined(parts)}, settle=0.5)
 
 
 SCENE = Scene(XML, "pendulum rig")

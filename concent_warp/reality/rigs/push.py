@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, of_coarser_step
+from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
 from concent_warp.reality.rigs.signals import RATE, glide, hold
 from concent_warp.scene.scene import Scene
 
@@ -50,7 +50,7 @@ XML = f"""
 """
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Push to +x fast, slowly and fast again with stops between; go around and push to -x off the middle."""
     del k
     place = rng.uniform(-0.004, 0.004, 2)
@@ -79,7 +79,7 @@ def _plan(rng: np.random.Generator, k: int) -> Trial:
     go(far + 2 * REACH - 0.08, off, 0.4)
     column = {"drive_x": np.concatenate(x), "drive_y": np.concatenate(y)}
     time = np.arange(len(column["drive_x"])) / RATE
-    return Trial(
+    return RigTrial(
         len(time) / RATE,
         {name: (time, value) for name, value in column.items()},
         qpos={"block_joint": [*place, HALF - 3e-5, 1, 0, 0, 0]},

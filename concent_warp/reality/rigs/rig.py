@@ -24,7 +24,7 @@ START_STD = (1e-4, 1e-3, 2e-3, 1e-2)
 
 
 @dataclass(frozen=True)
-class Trial:
+class RigTrial:
     """What is done in one demonstration."""
 
     duration: float
@@ -82,7 +82,7 @@ class Rig:
     name: str
     scene: Scene
     """The drawing: plain MJCF with the sensors that are recorded."""
-    plan: Callable[[np.random.Generator, int], Trial]
+    plan: Callable[[np.random.Generator, int], RigTrial]
     """Returns the k-th motion; the source of chance is that of the demonstration."""
     physics: WorldPhysics = field(default_factory=WorldPhysics)
     instruments: Instruments = field(default_factory=Instruments)
@@ -137,7 +137,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Motion:
+class TrueMotion:
     """What truly happened, step by step."""
 
     time: np.ndarray
@@ -172,8 +172,8 @@ def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: i
 
 
 def perform(
-    model: mujoco.MjModel, trial: Trial, effects: Sequence[HiddenEffect], physics: WorldPhysics
-) -> tuple[Motion, np.ndarray, np.ndarray]:
+    model: mujoco.MjModel, trial: RigTrial, effects: Sequence[HiddenEffect], physics: WorldPhysics
+) -> tuple[TrueMotion, np.ndarray, np.ndarray]:
     """Step the world through a trial; return it with the state at time 0, qpos (nq,) and qvel (nv,)."""
     data = mujoco.MjData(model)
     _place(model, data.qpos, trial.qpos, model.jnt_qposadr)
@@ -204,10 +204,10 @@ def perform(
             readings[k - before] = data.sensordata
     if not np.isfinite(readings).all() or data.warning.number.any():
         raise RuntimeError(f"the stand-in world diverged at {data.time:.3f} s")
-    return Motion(np.arange(steps + 1) * dt, readings), qpos, qvel
+    return TrueMotion(np.arange(steps + 1) * dt, readings), qpos, qvel
 
 
-def _held_commands(model: mujoco.MjModel, trial: Trial, time: np.ndarray) -> np.ndarray:
+def _held_commands(model: mujoco.MjModel, trial: RigTrial, time: np.ndarray) -> np.ndarray:
     """Return the commands that hold at times (K,) [s], shape (K, nu)."""
     ctrl = np.zeros((len(time), model.nu))
     for i in range(model.nu):
@@ -254,7 +254,7 @@ def _estimated_start(
 
 
 def _write_down(
-    rig: Rig, model: mujoco.MjModel, motion: Motion, effects: Sequence[HiddenEffect], rng: np.random.Generator
+    rig: Rig, model: mujoco.MjModel, motion: TrueMotion, effects: Sequence[HiddenEffect], rng: np.random.Generator
 ) -> dict[str, Channel]:
     """Return the readings of every sensor of the drawing, distorted as hidden effects have it."""
     drawn = rig.scene.model

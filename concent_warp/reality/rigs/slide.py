@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.reality.sliding_friction import frictionless, rub
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import yaw_quaternion
@@ -38,7 +38,7 @@ XML = f"""
 """
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Launch the block in some direction; every second throw with a turn about the vertical."""
     speed = SPEEDS[k % 6] * rng.uniform(0.9, 1.1)
     yaw = TURNS[k % 6] + rng.normal(0, 0.05)
@@ -46,7 +46,7 @@ def _plan(rng: np.random.Generator, k: int) -> Trial:
     heading = (k % 3) * np.pi / 4 + rng.normal(0, 0.1)
     turning = 0.0 if k % 2 == 0 else rng.choice([-1, 1]) * rng.uniform(1.0, 2.5)
     start = [-0.5 * speed * np.cos(heading) / 3, -0.5 * speed * np.sin(heading) / 3, HALF[2] - 1e-5]
-    return Trial(
+    return RigTrial(
         speed / (FRICTION * 9.81) + 0.35,
         qpos={"block_joint": [*start, *yaw_quaternion(yaw)]},
         qvel={"block_joint": [speed * np.cos(heading), speed * np.sin(heading), 0, 0, 0, turning]},

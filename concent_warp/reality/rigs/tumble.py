@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from concent_warp.reality.rigs.rig import Rig, Trial, WorldPhysics
+from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.scene.scene import Scene
 
 HEIGHTS = (0.5, 0.3, 0.7, 0.4)
@@ -29,12 +29,12 @@ XML = """
 """
 
 
-def _plan(rng: np.random.Generator, k: int) -> Trial:
+def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Throw the box so that it spins and meets the mat at an angle; end soon after."""
     height = HEIGHTS[k % 4] * rng.uniform(0.95, 1.05)
     along, across = rng.uniform(0.3, 1.2), rng.uniform(-0.4, 0.4)
     turn = rng.normal(0, 1, 4)
-    return Trial(
+    return RigTrial(
         np.sqrt(2 * height / 9.81) + 0.35,
         qpos={"box_joint": [-0.3, 0, height, *(turn / np.linalg.norm(turn))]},
         qvel={"box_joint": [along, across, rng.uniform(0.1, 0.4), *rng.normal(0, 4, 3)]},

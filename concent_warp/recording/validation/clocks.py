@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.recording.recording import Demonstration
-from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.location import ErrorLocation
 
 JUDGED_SAMPLES = 10
 """Channels with fewer samples are not judged: a state before and after is a sound recording."""
@@ -25,7 +25,7 @@ SHORT_SILENCE = 1.0
 """Time without any sample [s] that is never refused."""
 
 
-def check_clocks(demonstration: Demonstration, place: Place) -> None:
+def check_clocks(demonstration: Demonstration, place: ErrorLocation) -> None:
     """Check the clocks of all channels of a demonstration, each of them already increasing.
 
     Refused are:
@@ -52,7 +52,7 @@ def check_clocks(demonstration: Demonstration, place: Place) -> None:
     _check_silence(times, place)
 
 
-def _check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndarray], place: Place) -> None:
+def _check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndarray], place: ErrorLocation) -> None:
     """Refuse sampling periods that only another unit of time explains."""
     judged = {name: time for name, time in (measured | commanded).items() if len(time) >= JUDGED_SAMPLES}
     period = {name: float(np.median(np.diff(time))) for name, time in judged.items()}
@@ -76,7 +76,7 @@ def _check_periods(measured: dict[str, np.ndarray], commanded: dict[str, np.ndar
             )
 
 
-def _check_start(times: dict[str, np.ndarray], place: Place) -> None:
+def _check_start(times: dict[str, np.ndarray], place: ErrorLocation) -> None:
     """Refuse a clock that was not set to 0 where the demonstration begins, such as seconds since 1970."""
     name = min(times, key=lambda n: times[n][0])
     start, end = times[name][0], max(time[-1] for time in times.values())
@@ -90,7 +90,7 @@ def _check_start(times: dict[str, np.ndarray], place: Place) -> None:
         )
 
 
-def _check_silence(times: dict[str, np.ndarray], place: Place) -> None:
+def _check_silence(times: dict[str, np.ndarray], place: ErrorLocation) -> None:
     """Refuse channels whose clocks lie apart."""
     judged = sorted((time[0], time[-1], name) for name, time in times.items() if len(time) >= JUDGED_SAMPLES)
     covered, gaps, end = 0.0, [], None

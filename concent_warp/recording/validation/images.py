@@ -7,14 +7,14 @@ import numpy as np
 
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.recording import ImageStream
-from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.location import ErrorLocation
 from concent_warp.recording.validation.magnitudes import check_lengths
 
 ROTATION_TOLERANCE = 1e-3
 """How far from the unit matrix R R^T may be: calibrations are printed with four digits and more."""
 
 
-def check_image(stream: ImageStream, model: mujoco.MjModel, place: Place) -> None:
+def check_image(stream: ImageStream, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check frames, depth [m], intrinsics [px] and pose of one camera; its time is checked already.
 
     Raises:
@@ -51,7 +51,7 @@ def _worst(frame: np.ndarray) -> float:
     return float(frame[~(np.isfinite(frame) & (frame >= 0))][0])
 
 
-def _check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place) -> None:
+def _check_intrinsics(matrix: np.ndarray, width: int, height: int, place: ErrorLocation) -> None:
     """Check a pinhole matrix [px], shape (3, 3), for images of `width` x `height`."""
     matrix = np.asarray(matrix)
     if matrix.shape != (3, 3) or not _usable(matrix):
@@ -66,7 +66,7 @@ def _check_intrinsics(matrix: np.ndarray, width: int, height: int, place: Place)
         raise place.error("the principal point is far outside the image", expected=f"px within {size}", found=centre)
 
 
-def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check a camera-to-world transform, shape (4, 4)."""
     pose = np.asarray(pose)
     if pose.shape != (4, 4) or not _usable(pose):

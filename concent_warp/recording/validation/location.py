@@ -8,14 +8,14 @@ from concent_warp.errors import RecordingError
 
 
 @dataclass(frozen=True)
-class Place:
+class ErrorLocation:
     """A file, and where wanted a demonstration and a channel in it."""
 
     source: str
     demonstration: str = ""
     channel: str = ""
 
-    def at(self, channel: str) -> Place:
+    def at(self, channel: str) -> ErrorLocation:
         """Return the place of a channel of the same demonstration, such as ``measured/cube_position``."""
         return replace(self, channel=channel)
 

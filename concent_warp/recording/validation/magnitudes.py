@@ -16,7 +16,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.location import ErrorLocation
 
 FAR = 20.0
 """Distance [m] that is never refused."""
@@ -46,7 +46,7 @@ def _far(model: mujoco.MjModel) -> float:
     return max(FAR, FAR_EXTENTS * float(model.stat.extent))
 
 
-def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check distances from the origin, or between things, [m], shape (n,), NaN where missing."""
     length = length[np.isfinite(length)]
     if len(length) and (quartile := float(np.quantile(length, 0.25))) > _far(model):
@@ -58,7 +58,7 @@ def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: Place) -> No
         )
 
 
-def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: Place) -> None:
+def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check the units of an initial state [m, rad], shape (nq,)."""
     for joint in range(model.njnt):
         start = model.jnt_qposadr[joint]
@@ -68,7 +68,7 @@ def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: Place) -> No
             _check_joint(qpos[start : start + 1], model, joint, place)
 
 
-def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, place: Place) -> None:
+def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, place: ErrorLocation) -> None:
     """Check the unit of a measured channel, shape (T, dim)."""
     kind = model.sensor_type[sensor]
     if kind in POSITION_SENSORS:
@@ -92,7 +92,7 @@ def check_measurement(value: np.ndarray, model: mujoco.MjModel, sensor: int, pla
             )
 
 
-def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place: Place) -> None:
+def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place: ErrorLocation) -> None:
     """Check the unit of the commands of a position servo, shape (T,); other actuators are not judged."""
     gain, bias = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
     servo = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE and gain == -bias != 0
@@ -105,14 +105,14 @@ def check_command(value: np.ndarray, model: mujoco.MjModel, actuator: int, place
         _check_tendon(value, model, target, place)
 
 
-def _check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: Place) -> None:
+def _check_joint(value: np.ndarray, model: mujoco.MjModel, joint: int, place: ErrorLocation) -> None:
     """Check positions of a hinge [rad] or slide [m], shape (T,), against its range, where it has one."""
     if model.jnt_limited[joint]:
         low, high = (float(bound) for bound in model.jnt_range[joint])
         _check_range(value, low, high, int(model.jnt_type[joint]), f"joint {model.joint(joint).name!r}", place)
 
 
-def _check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: Place) -> None:
+def _check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: ErrorLocation) -> None:
     """Check lengths of a fixed tendon, shape (T,), against what the ranges of its joints allow.
 
     The joints must all be limited and of one type.
@@ -128,7 +128,7 @@ def _check_tendon(value: np.ndarray, model: mujoco.MjModel, tendon: int, place: 
         _check_range(value, low, high, kinds.pop(), f"tendon {model.tendon(tendon).name!r}", place)
 
 
-def _check_range(value: np.ndarray, low: float, high: float, kind: int, name: str, place: Place) -> None:
+def _check_range(value: np.ndarray, low: float, high: float, kind: int, name: str, place: ErrorLocation) -> None:
     """Check positions [rad or m], shape (T,), of a hinge or slide joint, or a tendon over some, of a given range."""
     if kind == mujoco.mjtJoint.mjJNT_HINGE:
         allowed, guess, unit, fix = TURN, "degrees", "rad", "write radians"

@@ -6,13 +6,13 @@ import math
 from xml.etree import ElementTree
 
 from concent_warp.recording.bounds import MAX_SCENE_BYTES, MAX_SCENE_COPIES
-from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.location import ErrorLocation
 
 FREE_TEXT = ("name", "class", "data")
 """Attributes that hold words, so that ``nan`` is not a number in them."""
 
 
-def check_scene_text(text: str, place: Place) -> None:
+def check_scene_text(text: str, place: ErrorLocation) -> None:
     """Refuse an MJCF text that is no XML, reads other files, asks for endless copies or holds numbers that are none.
 
     Raises:
@@ -35,7 +35,7 @@ def check_scene_text(text: str, place: Place) -> None:
         stack.extend((child, copies) for child in element)
 
 
-def _check_element(element: ElementTree.Element, copies: int, place: Place) -> int:
+def _check_element(element: ElementTree.Element, copies: int, place: ErrorLocation) -> int:
     """Check one element; `copies` counts how often those around it repeat it, the result how often it does in turn."""
     if element.tag == "include" or "file" in element.attrib:
         raise place.error(

@@ -19,7 +19,7 @@ from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.recording.validation.clocks import check_clocks
 from concent_warp.recording.validation.images import check_image
-from concent_warp.recording.validation.location import Place
+from concent_warp.recording.validation.location import ErrorLocation
 from concent_warp.recording.validation.magnitudes import (
     check_command,
     check_lengths,
@@ -41,7 +41,7 @@ def validate(recording: Recording) -> None:
     Raises:
         RecordingError: The first thing that is wrong, with file, demonstration, channel and row (counted from 0).
     """
-    place = Place(recording.source)
+    place = ErrorLocation(recording.source)
     model = _compile_scene(recording)
     if not recording.demonstrations:
         raise place.error("the recording holds no demonstration", expected="at least one")
@@ -55,12 +55,12 @@ def validate(recording: Recording) -> None:
         if name in seen:
             raise place.error("two demonstrations have the same name", found=repr(name))
         seen.add(name)
-        _check_demonstration(demonstration, model, Place(recording.source, name))
+        _check_demonstration(demonstration, model, ErrorLocation(recording.source, name))
 
 
 def _compile_scene(recording: Recording) -> mujoco.MjModel:
     """Return the compiled scene of a recording, or raise `RecordingError`."""
-    place = Place(recording.source, channel="scene")
+    place = ErrorLocation(recording.source, channel="scene")
     check_scene_text(recording.scene, place)
     try:
         return Scene(recording.scene, recording.source).model
@@ -69,7 +69,7 @@ def _compile_scene(recording: Recording) -> mujoco.MjModel:
         raise place.error(reason, fix="mend the MJCF in the recording") from None
 
 
-def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check one demonstration against the compiled scene."""
     if demonstration.success is not None and not isinstance(demonstration.success, bool | np.bool_):
         raise place.error("success is not a truth value", expected="True or False", found=demonstration.success)
@@ -86,7 +86,7 @@ def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, pl
     check_clocks(demonstration, place)
 
 
-def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: Place) -> None:
+def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation) -> None:
     """Check the state at time 0: sizes, finite values, unit quaternions, units."""
     for name, value, size in (("qpos", demonstration.qpos, model.nq), ("qvel", demonstration.qvel, model.nv)):
         if value is None:
@@ -113,7 +113,7 @@ def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: P
     check_positions(qpos, model, place.at("initial/qpos"))
 
 
-def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
     """Check one commanded channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
     if row < 0:
@@ -125,7 +125,7 @@ def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Pla
     check_command(np.asarray(channel.value), model, row, place)
 
 
-def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
     """Check one measured channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
@@ -147,7 +147,7 @@ def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: P
     check_measurement(value, model, row, place)
 
 
-def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Place) -> None:
+def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
     """Check the tracked points of one body."""
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
         known = [model.body(i).name for i in range(1, model.nbody)]
@@ -170,7 +170,7 @@ def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Pl
     check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place)
 
 
-def _check_time(time: np.ndarray, place: Place) -> None:
+def _check_time(time: np.ndarray, place: ErrorLocation) -> None:
     """Check clock readings [s], shape (T,): finite, not negative, strictly increasing."""
     time = np.asarray(time)
     if time.ndim != 1 or time.dtype.kind not in "fiu":
@@ -191,7 +191,7 @@ def _check_time(time: np.ndarray, place: Place) -> None:
         )
 
 
-def _check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: str) -> None:
+def _check_shape(value: np.ndarray, shape: tuple[int, ...], place: ErrorLocation, fix: str) -> None:
     """Check that values are numbers of a given shape."""
     found = np.asarray(value)
     if found.shape != shape or found.dtype.kind not in "fiu":
@@ -199,7 +199,7 @@ def _check_shape(value: np.ndarray, shape: tuple[int, ...], place: Place, fix: s
         raise place.error("wrong shape of the values", expected=shape, found=f"{found.shape}{kind}", fix=fix)
 
 
-def _check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> None:
+def _check_finite(value: np.ndarray, place: ErrorLocation, *, missing_allowed: bool) -> None:
     """Refuse infinities, a channel without any value and, unless `missing_allowed`, every NaN."""
     value = np.asarray(value, dtype=float)
     if (bad := _first(np.abs(value) > MAX_MAGNITUDE)) is not None:
@@ -224,7 +224,7 @@ def _check_finite(value: np.ndarray, place: Place, *, missing_allowed: bool) -> 
         )
 
 
-def _check_quaternions(value: np.ndarray, place: Place) -> None:
+def _check_quaternions(value: np.ndarray, place: ErrorLocation) -> None:
     """Check quaternions, shape (T, 4): whole or missing, and of unit length."""
     missing = np.count_nonzero(np.isnan(value), axis=1)
     if (bad := _first((missing > 0) & (missing < 4))) is not None:

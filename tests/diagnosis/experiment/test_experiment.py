@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.experiment.motions import Bench, Motion
+from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.suggest import _imagined, _separations, _start_effects, suggest
 from concent_warp.effects.library.contact import SlidingFriction, TorsionalFriction
 from concent_warp.effects.library.joints import JointDamping, JointFriction
@@ -83,9 +83,9 @@ def test_frictions_alike_at_one_speed_are_told_apart_by_another():
     assert found is not None
     assert found.pair == ("joint_friction", "joint_damping")
     assert found.channel == "rail_position"
-    bench = Bench(Model(Scene(CART)), recording, channel_noises(Model(Scene(CART)), recording))
+    bench = RecordedRange(Model(Scene(CART)), recording, channel_noises(Model(Scene(CART)), recording))
     d = recording.demonstrations[0]
-    same = Motion("same", "do it again", 4.0, np.zeros(1), np.zeros(1), d.action)
+    same = ProposedMotion("same", "do it again", 4.0, np.zeros(1), np.zeros(1), d.action)
     window = _imagined(bench, same, same.duration)
     assert window is not None
     again = _separations(frictions(), same, window, "mujoco")
@@ -138,8 +138,8 @@ def test_what_an_error_of_the_start_explains_does_not_count():
     time = np.arange(0, 1, 0.01)
     channel = Channel(time, 0 * time[:, None], noise_std=NOISE)
     at_rest = Demonstration("rest", qpos=np.zeros(1), qvel=np.zeros(1), measured={"rail_position": channel})
-    bench = Bench(plain, Recording(plain.scene.xml, (at_rest,)), {"rail_position": NOISE})
-    motion = Motion("coast", "let it coast", 1.0, np.zeros(1), np.array([0.1]))
+    bench = RecordedRange(plain, Recording(plain.scene.xml, (at_rest,)), {"rail_position": NOISE})
+    motion = ProposedMotion("coast", "let it coast", 1.0, np.zeros(1), np.array([0.1]))
     window = _imagined(bench, motion, 1.0)
     assert window is not None
     models = {"plain": plain, "biased": biased}
@@ -155,8 +155,8 @@ def test_what_an_error_of_the_start_explains_does_not_count():
 def test_motion_in_which_a_model_diverges_is_left_out():
     plain = Model(Scene(CART))
     recording = one_speed()
-    bench = Bench(plain, recording, {"rail_position": NOISE})
-    motion = Motion("burst", "burst", 0.5, np.zeros(1), np.array([1e12]), recording.demonstrations[0].action)
+    bench = RecordedRange(plain, recording, {"rail_position": NOISE})
+    motion = ProposedMotion("burst", "burst", 0.5, np.zeros(1), np.array([1e12]), recording.demonstrations[0].action)
     window = _imagined(bench, motion, 0.5)
     assert window is not None
     assert _separations({"a": plain, "b": plain}, motion, window, "mujoco") is None

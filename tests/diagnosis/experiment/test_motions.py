@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
-from concent_warp.diagnosis.experiment.motions import EXTRA, Bench, heavier, slope_turned
-from concent_warp.diagnosis.experiment.object_motions import Toy, _roll, body_motions
+from concent_warp.diagnosis.experiment.motions import EXTRA, RecordedRange, heavier, slope_turned
+from concent_warp.diagnosis.experiment.object_motions import ThrowableBody, _roll, body_motions
 from concent_warp.effects.library.world import AirDrag, GravityTilt
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -29,7 +29,7 @@ BOX = 'type="box" size=".03 .02 .02"'
 TIME = np.arange(0, 2, 0.02)
 
 
-def bench(shape: str = BOX, lift: float = 0.0) -> Bench:
+def bench(shape: str = BOX, lift: float = 0.0) -> RecordedRange:
     """A hand that goes to and fro and closes, and an object that lies still."""
     model = Model(Scene(XML.format(shape=shape)))
     qpos = model.scene.model.qpos0.copy()
@@ -47,7 +47,7 @@ def bench(shape: str = BOX, lift: float = 0.0) -> Bench:
     }
     d = Demonstration("take", qpos=qpos, qvel=np.zeros(model.scene.model.nv), action=action, measured=measured)
     noise = {"reach_position": 1e-4, "block_position": 3e-4, "block_orientation": 3e-3}
-    return Bench(model, Recording(model.scene.xml, (d,)), noise)
+    return RecordedRange(model, Recording(model.scene.xml, (d,)), noise)
 
 
 def test_commands_stay_within_what_was_recorded():
@@ -110,7 +110,7 @@ def test_payload_adds_mass_at_the_centre_of_mass_and_nothing_else(body):
 
 
 def test_object_is_launched_from_where_it_rests():
-    toy = Toy(bench(lift=0.1), bench().m.body("block").id, "mujoco")
+    toy = ThrowableBody(bench(lift=0.1), bench().m.body("block").id, "mujoco")
     assert toy.rest is not None
     assert toy.rest[5] == pytest.approx(0.02, abs=1e-3)
     made = list(body_motions(bench(lift=0.1), "mujoco", tilted=False))
@@ -124,7 +124,7 @@ def test_object_is_launched_from_where_it_rests():
 def test_spin_is_about_the_vertical_however_the_object_lies():
     known = bench()
     qpos = known.starts[0][0]
-    toy = Toy(known, known.m.body("block").id, "mujoco")
+    toy = ThrowableBody(known, known.m.body("block").id, "mujoco")
     lying = toy.pose(qpos, np.zeros(3), np.array([np.pi / 2, 0, 0]))
     motion = toy.motion("spin", "spin", 1.0, lying, spin=(0, 0, 3.0))
     np.testing.assert_allclose(motion.qvel[6:9], [0, 3.0, 0], atol=1e-9)
@@ -142,7 +142,7 @@ def test_spin_is_about_the_vertical_however_the_object_lies():
 )
 def test_round_objects_roll_across_their_axis(shape, direction):
     known = bench(shape)
-    rolling = _roll(Toy(known, known.m.body("block").id, "mujoco"), known.starts[0][0])
+    rolling = _roll(ThrowableBody(known, known.m.body("block").id, "mujoco"), known.starts[0][0])
     if direction is None:
         assert rolling is None
     else:
@@ -154,7 +154,7 @@ def test_round_objects_roll_across_their_axis(shape, direction):
 def test_falling_object_without_a_table_is_only_thrown():
     xml = XML.format(shape=BOX).replace('<geom name="table" type="plane" size="2 2 .1"/>', "")
     known = bench(lift=0.3)
-    loose = Bench(Model(Scene(xml)), known.recording, known.noise)
+    loose = RecordedRange(Model(Scene(xml)), known.recording, known.noise)
     names = {m.name for m in body_motions(loose, "mujoco", tilted=False)}
     assert "throw" in names
     assert not names & {"slide", "spin in place", "roll", "drop"}

@@ -3,9 +3,9 @@ import pytest
 
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects import fading
-from concent_warp.fit.effects.fading import AFTER, FADED, Known, _has_faded, is_long, residuals_near
+from concent_warp.fit.effects.fading import AFTER, FADED, ReferenceSimulation, _has_faded, is_long, residuals_near
 from concent_warp.fit.effects.initial_states import StartSearch
-from concent_warp.fit.effects.prediction import Prediction, Trial
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from tests.scenes.swinging import swing_scene, swung, windows_of
@@ -28,9 +28,14 @@ def prediction_of(windows, damping):
 def near(prediction, *, hoped=True):
     """Return residuals from a slightly different start, and whether the difference has faded."""
     none, offset = np.zeros(0), 0.3 * prediction.windows[0].spread
-    (residual,) = prediction.residuals([Trial(0, none)])
-    found, faded = residuals_near(prediction, {0: Known(Trial(0, none), residual)}, [Trial(0, none, offset)], [hoped])
-    return found[0], faded[0], residual, Trial(0, none, offset)
+    (residual,) = prediction.residuals([SimulationRequest(0, none)])
+    found, faded = residuals_near(
+        prediction,
+        {0: ReferenceSimulation(SimulationRequest(0, none), residual)},
+        [SimulationRequest(0, none, offset)],
+        [hoped],
+    )
+    return found[0], faded[0], residual, SimulationRequest(0, none, offset)
 
 
 def test_where_an_error_of_the_start_fades_only_a_moment_is_simulated(windows):
@@ -61,10 +66,10 @@ def test_what_is_not_hoped_for_is_not_tried(windows):
 
 def test_a_simulation_that_diverged_has_not_faded(windows):
     prediction = prediction_of(windows, STRONG)
-    (course,) = prediction.courses([Trial(0, np.zeros(0))], AFTER)
+    (course,) = prediction.courses([SimulationRequest(0, np.zeros(0))], AFTER)
     course.qvel[-1] = np.nan
-    trial = Trial(0, np.zeros(0), windows[0].spread)
-    assert not _has_faded(prediction, trial, Trial(0, np.zeros(0)), course, course)
+    trial = SimulationRequest(0, np.zeros(0), windows[0].spread)
+    assert not _has_faded(prediction, trial, SimulationRequest(0, np.zeros(0)), course, course)
 
 
 def test_short_windows_are_simulated_to_their_end():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import RATE_TIME, START_NOISE, Source, start_spread
+from concent_warp.fit.effects.observation import RATE_TIME, START_NOISE, ObservedRecording, start_spread
 from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -64,7 +64,7 @@ def test_motion_from_the_top_keeps_close_to_its_start_for_a_shorter_time():
             measured={"angle": Channel(time, 0 * time[:, None])},
         )
         model = Model(Scene(xml))
-        source = Source(model, Recording(xml, (d,)), {"angle": NOISE})
+        source = ObservedRecording(model, Recording(xml, (d,)), {"angle": NOISE})
         reach.append(keeps_close(source, d, 0.0, 1.99, "mujoco", 0))
     assert reach[0] == pytest.approx(1.99)
     assert reach[1] < 1.5

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.prediction import BEYOND, Prediction, SensorReader, Trial, turn
+from concent_warp.fit.effects.prediction import BEYOND, Prediction, SensorReader, SimulationRequest, turn
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
 
@@ -26,10 +26,10 @@ def damped(recording, windows):
 
 def test_residuals_at_the_truth_are_the_noise(recording, windows):
     prediction = damped(recording, windows[:1])
-    (residual,) = prediction.residuals([Trial(0, np.array([DAMPING]))])
+    (residual,) = prediction.residuals([SimulationRequest(0, np.array([DAMPING]))])
     assert len(residual) == windows[0].count
     assert np.std(residual) == pytest.approx(1.0, abs=0.2)
-    (off,) = prediction.residuals([Trial(0, np.array([0.0]))])
+    (off,) = prediction.residuals([SimulationRequest(0, np.array([0.0]))])
     assert np.std(off) > 5
 
 
@@ -37,7 +37,7 @@ def test_an_effect_at_its_null_value_predicts_what_the_plain_model_does(recordin
     prediction = damped(recording, windows)
     plain = Prediction(drawing(recording), (), windows)
     assert prediction.start.tolist() == [0.0]
-    trials = [Trial(w, prediction.start) for w in range(len(windows))]
+    trials = [SimulationRequest(w, prediction.start) for w in range(len(windows))]
     bare = [replace(t, values=np.zeros(0)) for t in trials]
     for mine, other in zip(prediction.residuals(trials), plain.residuals(bare), strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-6)
@@ -58,19 +58,19 @@ def test_effects_of_the_model_come_first_and_take_part(recording, windows):
 
 def test_what_was_simulated_lately_is_not_simulated_again(recording, windows):
     prediction = damped(recording, windows)
-    first = prediction.residuals([Trial(0, np.array([DAMPING])), Trial(1, np.array([DAMPING]))])
+    first = prediction.residuals([SimulationRequest(0, np.array([DAMPING])), SimulationRequest(1, np.array([DAMPING]))])
     once = prediction.simulated
-    again = prediction.residuals([Trial(1, np.array([DAMPING])), Trial(0, np.array([DAMPING]))])
+    again = prediction.residuals([SimulationRequest(1, np.array([DAMPING])), SimulationRequest(0, np.array([DAMPING]))])
     assert prediction.simulated == once
     for mine, other in zip(again, first[::-1], strict=True):
         np.testing.assert_array_equal(mine, other)
-    prediction.residuals([Trial(0, np.array([DAMPING]), np.array([0.0, 1e-9]))])
+    prediction.residuals([SimulationRequest(0, np.array([DAMPING]), np.array([0.0, 1e-9]))])
     assert prediction.simulated > once
 
 
 def test_one_simulation_serves_all_values_of_an_effect_of_measurement(recording, windows):
     prediction = Prediction(drawing(recording), (effect_class("latency")("angle"),), windows[:1])
-    first, later = (prediction.residuals([Trial(0, np.array([delay]))])[0] for delay in (0.0, 0.01))
+    first, later = (prediction.residuals([SimulationRequest(0, np.array([delay]))])[0] for delay in (0.0, 0.01))
     assert prediction.simulated == pytest.approx(windows[0].end - windows[0].start, abs=0.01)
     assert np.std(later - first) > 1
 
@@ -80,13 +80,15 @@ def test_no_more_simulations_are_kept_than_memory_allows(recording, windows, mon
     prediction = damped(recording, windows[:1])
     for _ in range(2):
         before = prediction.simulated
-        prediction.residuals([Trial(0, np.array([value])) for value in np.linspace(0.0, 0.1, 20)])
+        prediction.residuals([SimulationRequest(0, np.array([value])) for value in np.linspace(0.0, 0.1, 20)])
         assert prediction.simulated - before > 15 * (windows[0].end - windows[0].start)
 
 
 def test_an_offset_moves_the_start_of_the_simulation(recording, windows):
     prediction = damped(recording, windows[:1])
-    at_rest, moved = prediction.readers([Trial(0, prediction.start), Trial(0, prediction.start, np.array([0.02, 0.5]))])
+    at_rest, moved = prediction.readers(
+        [SimulationRequest(0, prediction.start), SimulationRequest(0, prediction.start, np.array([0.02, 0.5]))]
+    )
     first = np.array([0.0, 0.005])
     difference = (moved("angle", first) - at_rest("angle", first))[:, 0]
     assert difference[0] == pytest.approx(0.02, abs=1e-9)
@@ -97,7 +99,9 @@ def test_effects_of_measurement_alone_shift_readings_without_a_simulation_of_the
     prediction = Prediction(drawing(recording), (effect_class("sensor_bias")("angle"),), windows[:1])
     assert prediction.measured_only.tolist() == [True]
     assert not damped(recording, windows).measured_only.any()
-    at_null, shifted = prediction.residuals([Trial(0, np.array([0.0])), Trial(0, np.array([0.005]))])
+    at_null, shifted = prediction.residuals(
+        [SimulationRequest(0, np.array([0.0])), SimulationRequest(0, np.array([0.005]))]
+    )
     np.testing.assert_allclose(at_null - shifted, 0.005 / NOISE, rtol=1e-9)
 
 
@@ -107,7 +111,7 @@ def test_an_orientation_has_three_residuals_in_units_of_its_noise():
     sizes = {r.channel: r.rows.stop - r.rows.start for r in window.readings}
     assert sizes["turned"] == 3 * sizes["angle"]
     prediction = Prediction(drawing(recording), (effect_class("joint_damping")("hinge"),), [window])
-    (residual,) = prediction.residuals([Trial(0, np.array([DAMPING]))])
+    (residual,) = prediction.residuals([SimulationRequest(0, np.array([DAMPING]))])
     for r in window.readings:
         assert np.std(residual[r.rows]) == pytest.approx(1.0, abs=0.25)
 

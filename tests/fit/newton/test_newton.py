@@ -13,7 +13,7 @@ from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.newton.descent import GradientCfg
 from concent_warp.fit.newton.horizon import HorizonCfg, _tilt, gradient_segments
 from concent_warp.fit.newton.loss import NewtonLoss, recording_gradient
-from concent_warp.fit.newton.physics import DAMPER, SPRING, Inertia, NewtonCfg, choose_physics, coupling
+from concent_warp.fit.newton.physics import DAMPER, SPRING, BodyInertia, NewtonCfg, choose_physics, coupling
 from concent_warp.fit.newton.scene import newton_scene
 from concent_warp.fit.newton.worlds import Parameters
 from concent_warp.model import Model
@@ -193,7 +193,7 @@ def test_gradients_on_cuda_are_those_on_the_cpu(pushed, thick):
 
 
 def test_numbers_keep_the_rules_of_stability():
-    body = Inertia("block", 0.08, np.diag([2.1e-5] * 3), np.zeros(3))
+    body = BodyInertia("block", 0.08, np.diag([2.1e-5] * 3), np.zeros(3))
     corners = np.array(np.meshgrid([-0.02, 0.02], [-0.02, 0.02], [-0.02])).reshape(3, -1).T
     strength = coupling(body, corners)
     assert strength > 4 / 0.08
