@@ -22,10 +22,10 @@ _HOMES = {
     "deploy.evaluate": ("evaluate",),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
-    "diagnosis.cfg": ("DiagnosisCfg",),
+    "diagnosis.cfg": ("DiagnoseCfg",),
     "diagnosis.diagnose": ("diagnose",),
     "diagnosis.forces.locate": ("locate_forces",),
-    "diagnosis.forces.window_forces": ("WindowCfg",),
+    "diagnosis.forces.window_forces": ("LocateForcesCfg",),
     "diagnosis.result": ("Diagnosis", "Finding"),
     "effects.effect": ("Effect", "Parameter"),
     "effects.registry": ("effect_class", "effect_classes"),
@@ -68,10 +68,10 @@ if TYPE_CHECKING:
     from concent_warp.deploy.evaluate import evaluate
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
-    from concent_warp.diagnosis.cfg import DiagnosisCfg
+    from concent_warp.diagnosis.cfg import DiagnoseCfg
     from concent_warp.diagnosis.diagnose import diagnose
     from concent_warp.diagnosis.forces.locate import locate_forces
-    from concent_warp.diagnosis.forces.window_forces import WindowCfg
+    from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
     from concent_warp.diagnosis.result import Diagnosis, Finding
     from concent_warp.effects.effect import Effect, Parameter
     from concent_warp.effects.registry import effect_class, effect_classes

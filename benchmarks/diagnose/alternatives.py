@@ -45,7 +45,7 @@ from benchmarks.diagnose.real_report import NAME as REAL
 from benchmarks.diagnose.sysid_toolbox import fit_toolbox
 from benchmarks.fit.held_out import noise_errors, spans_of
 from benchmarks.pages import ROOT, machine, read_data, write_data
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -107,7 +107,7 @@ def way(name: str) -> Callable[[Callable[[Model, Recording], Fitted]], Callable[
 @way("diagnosis")
 def diagnosed(model: Model, recording: Recording) -> Fitted:
     """Diagnose, and take all that is accepted."""
-    found = diagnose(model, recording, DiagnosisCfg(jobs=1, explain=False))
+    found = diagnose(model, recording, DiagnoseCfg(jobs=1, explain=False))
     groups = [*found.groups, *((f.name,) for f in found.accepted[len(found.groups) :])]
     blamed = [
         Blame(f.name.split("(")[0], tuple(n.split("(")[0] for n in group))

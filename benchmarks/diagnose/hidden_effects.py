@@ -27,7 +27,7 @@ import tyro
 from benchmarks.diagnose.hidden_effects_data import DataSet, Kind, cases, make
 from benchmarks.diagnose.hidden_effects_report import write_again, write_report
 from benchmarks.pages import machine, machine_line
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
@@ -118,7 +118,7 @@ def study(case: DataSet, out: Path, jobs: int = 1) -> dict[str, Any]:
     }
     begun = time.perf_counter()
     try:
-        cfg = DiagnosisCfg(jobs=jobs, seed=case.seed, explain=False)
+        cfg = DiagnoseCfg(jobs=jobs, seed=case.seed, explain=False)
         found = diagnose(Model(data.scene), data.recording, cfg, out=out / "pieces" / case.name)
         result |= found.to_json()
     except ConcentError as error:

@@ -19,7 +19,7 @@ import tyro
 
 from benchmarks.diagnose.hidden_effects_data import cases, make
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.model import Model
@@ -88,7 +88,7 @@ def scenes(args: Args) -> Any:
     """Yield how long the diagnosis of each scene takes."""
     for name in args.names:
         recording, model = data_of(name)
-        yield timed(name, model, recording, DiagnosisCfg(jobs=args.jobs, explain=False))
+        yield timed(name, model, recording, DiagnoseCfg(jobs=args.jobs, explain=False))
 
 
 def by_candidates(args: Args) -> Any:
@@ -99,7 +99,7 @@ def by_candidates(args: Args) -> Any:
     names.sort(key=lambda n: n != "joint_friction")
     for count in COUNTS:
         chosen = tuple(names[:count]) if count else tuple(names)
-        row = timed(GROWING, model, recording, DiagnosisCfg(jobs=args.jobs, explain=False, effects=chosen))
+        row = timed(GROWING, model, recording, DiagnoseCfg(jobs=args.jobs, explain=False, effects=chosen))
         yield {**row, "key": f"{len(chosen)}", "candidates": len(chosen)}
 
 
@@ -107,7 +107,7 @@ def by_length(args: Args) -> Any:
     """Yield how long it takes for the first seconds of a recording."""
     recording, model = data_of(GROWING)
     for seconds in LENGTHS:
-        row = timed(GROWING, model, first(recording, seconds), DiagnosisCfg(jobs=args.jobs, explain=False))
+        row = timed(GROWING, model, first(recording, seconds), DiagnoseCfg(jobs=args.jobs, explain=False))
         yield {**row, "key": f"{seconds:g}"}
 
 
@@ -118,7 +118,7 @@ def data_of(name: str) -> tuple[Recording, Model]:
     return data.recording, Model(data.scene)
 
 
-def timed(key: str, model: Model, recording: Recording, cfg: DiagnosisCfg) -> dict[str, Any]:
+def timed(key: str, model: Model, recording: Recording, cfg: DiagnoseCfg) -> dict[str, Any]:
     """Return how long a diagnosis takes, and what it says."""
     begin = time.perf_counter()
     found = diagnose(model, recording, cfg)

@@ -3,7 +3,7 @@
 Three scenes of boxes, each with another thing wrong in the model: a block that slides to rest (friction), one that runs
 into another (the other's mass), one that drops flat (softness of contacts). The truth is an exact box in C MuJoCo with
 half the time step; poses are measured at 100 Hz with 0.1 mm and 1 mrad of noise. Diagnosed with the candidates sliding
-friction, mass, inertia and softness of contacts, without and with `DiagnosisCfg.gradient`.
+friction, mass, inertia and softness of contacts, without and with `DiagnoseCfg.gradient`.
 
     python -m benchmarks.fit.gradient_warm_start --out runs/gradient_warm_start.jsonl            # resumable
     python -m benchmarks.fit.gradient_warm_start --out runs/gradient_warm_start.jsonl --report   # page, in docs
@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_data, write_page
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.fit.newton.scale_factors import FactorCfg, factors
@@ -135,7 +135,7 @@ def run(args: Args, scene: SceneName, seed: int) -> dict[str, Any]:
         "simulated_s": found.simulated,
     }  # fmt: skip
     for way, gradient in (("plain", False), ("led", True)):
-        cfg = DiagnosisCfg(effects=CANDIDATES, additions=1, jobs=1, explain=False, gradient=gradient, seed=seed)
+        cfg = DiagnoseCfg(effects=CANDIDATES, additions=1, jobs=1, explain=False, gradient=gradient, seed=seed)
         begun = time.perf_counter()
         with counted() as steps:
             diagnosis = diagnose(model, recording, cfg)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class DiagnosisCfg:
+class DiagnoseCfg:
     """Settings of a diagnosis.
 
     Example:
         >>> import concent_warp as cw
-        >>> cw.DiagnosisCfg(effects=("joint_friction", "joint_damping"), additions=1).additions
+        >>> cw.DiagnoseCfg(effects=("joint_friction", "joint_damping"), additions=1).additions
         1
     """
 

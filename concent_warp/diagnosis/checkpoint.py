@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure, Progress
 from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint
 from concent_warp.diagnosis.search.steps import Candidate, FittedModel, Screened
@@ -36,7 +36,7 @@ KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums
 
 
 def checkpointed_procedure(
-    model: Model, recording: Recording, cfg: DiagnosisCfg, progress: Progress, engine: EngineName, folder: Path
+    model: Model, recording: Recording, cfg: DiagnoseCfg, progress: Progress, engine: EngineName, folder: Path
 ) -> Procedure:
     """Return a diagnosis that keeps what is done in a folder; parts of other diagnoses in it are left alone.
 
@@ -55,7 +55,7 @@ class CheckpointedProcedure(Procedure):
         self,
         model: Model,
         recording: Recording,
-        cfg: DiagnosisCfg,
+        cfg: DiagnoseCfg,
         progress: Progress,
         folder: Path,
         key: str,
@@ -85,7 +85,7 @@ class CheckpointedProcedure(Procedure):
         return digest.hexdigest()[:32]
 
 
-def _fingerprint(model: Model, recording: Recording, cfg: DiagnosisCfg, versions: Mapping[str, str]) -> str:
+def _fingerprint(model: Model, recording: Recording, cfg: DiagnoseCfg, versions: Mapping[str, str]) -> str:
     """Return a hash of a model, a recording, the settings that results depend on, and versions."""
     digest = hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode())
     _add(digest, replace(cfg, jobs=1))

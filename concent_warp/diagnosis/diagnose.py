@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import checkpointed_procedure
 from concent_warp.diagnosis.procedure import Procedure, Progress, silent
 from concent_warp.diagnosis.result import Diagnosis
@@ -18,7 +18,7 @@ from concent_warp.simulate.select import EngineName
 def diagnose(
     model: Model,
     recording: Recording,
-    cfg: DiagnosisCfg | None = None,
+    cfg: DiagnoseCfg | None = None,
     *,
     engine: EngineName = "mujoco",
     out: str | Path | None = None,
@@ -43,13 +43,13 @@ def diagnose(
     Example:
         >>> import concent_warp as cw
         >>> recording = cw.load_recording(cw.example("servo"))
-        >>> cfg = cw.DiagnosisCfg(effects=("joint_friction", "joint_damping"), jobs=1, explain=False)
+        >>> cfg = cw.DiagnoseCfg(effects=("joint_friction", "joint_damping"), jobs=1, explain=False)
         >>> diagnosis = cw.diagnose(cw.Model.from_recording(recording), recording, cfg)
         >>> diagnosis.verdict, diagnosis.groups
         ('effect', (('joint_friction',),))
     """
     model.check_recording(recording)
-    cfg, progress = cfg or DiagnosisCfg(), progress or silent
+    cfg, progress = cfg or DiagnoseCfg(), progress or silent
     if out is None:
         procedure = Procedure(model, recording, cfg, progress, engine)
     else:

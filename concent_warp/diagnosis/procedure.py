@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data
 from concent_warp.diagnosis.experiment.suggest import suggest
 from concent_warp.diagnosis.failures import where
@@ -66,7 +66,7 @@ class Procedure:
     """One diagnosis on its way."""
 
     def __init__(
-        self, model: Model, recording: Recording, cfg: DiagnosisCfg, progress: Progress, engine: EngineName = "mujoco"
+        self, model: Model, recording: Recording, cfg: DiagnoseCfg, progress: Progress, engine: EngineName = "mujoco"
     ) -> None:
         self.model, self.recording, self.cfg, self.progress = model, recording, cfg, progress
         self.engine: EngineName = engine

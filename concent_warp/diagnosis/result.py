@@ -28,7 +28,7 @@ class Finding:
     Example:
         >>> import concent_warp as cw
         >>> recording = cw.load_recording(cw.example("servo"))
-        >>> cfg = cw.DiagnosisCfg(effects=("joint_friction",), jobs=1, explain=False)
+        >>> cfg = cw.DiagnoseCfg(effects=("joint_friction",), jobs=1, explain=False)
         >>> finding = cw.diagnose(cw.Model.from_recording(recording), recording, cfg).effects[0]
         >>> finding.name, finding.accepted, finding.gain > 0.9
         ('joint_friction', True, True)
@@ -130,7 +130,7 @@ class Diagnosis:
     Example:
         >>> import concent_warp as cw
         >>> recording = cw.load_recording(cw.example("servo"))
-        >>> cfg = cw.DiagnosisCfg(effects=("joint_friction",), jobs=1, explain=False)
+        >>> cfg = cw.DiagnoseCfg(effects=("joint_friction",), jobs=1, explain=False)
         >>> diagnosis = cw.diagnose(cw.Model.from_recording(recording), recording, cfg)
         >>> [effect.name for effect in diagnosis.accepted], diagnosis.model.effects[0].effect.name
         (['joint_friction'], 'joint_friction')

@@ -2,7 +2,7 @@
 
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.model import Model
 
@@ -24,7 +24,7 @@ def named(data, name):
 def diagnosed(data, case, effects=()):
     """Return what is hidden in a data set, and the diagnosis."""
     made = data.make(case)
-    cfg = DiagnosisCfg(effects=effects, jobs=1, seed=case.seed, explain=False)
+    cfg = DiagnoseCfg(effects=effects, jobs=1, seed=case.seed, explain=False)
     return made.truth, diagnose(Model(made.scene), made.recording, cfg)
 
 

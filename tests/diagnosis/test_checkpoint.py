@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search.steps import Screened
@@ -13,7 +13,7 @@ from concent_warp.errors import ConcentError
 from tests.diagnosis.same_results import assert_same
 from tests.scenes.swinging import drawing, swung
 
-CFG = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
+CFG = DiagnoseCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
 
 
 @pytest.fixture(scope="module")

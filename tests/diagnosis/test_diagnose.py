@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError, RecordingError
@@ -14,7 +14,7 @@ from tests.diagnosis.same_results import assert_same
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swing_scene, swung
 
 FEW = ("joint_damping", "joint_friction", "armature", "actuator_gain", "sensor_bias")
-CFG = DiagnosisCfg(effects=FEW, jobs=1, explain=False)
+CFG = DiagnoseCfg(effects=FEW, jobs=1, explain=False)
 
 
 @pytest.fixture(scope="module")

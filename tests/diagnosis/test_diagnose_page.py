@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import VERDICTS
 from tests.scenes.swinging import drawing, swung
@@ -26,7 +26,7 @@ def keys(heading):
 @pytest.fixture(scope="module")
 def found():
     recording = swung(seconds=1.0)
-    cfg = DiagnosisCfg(effects=("joint_damping", "armature"), jobs=1)
+    cfg = DiagnoseCfg(effects=("joint_damping", "armature"), jobs=1)
     return diagnose(drawing(recording), recording, cfg)
 
 
@@ -54,7 +54,7 @@ def test_every_verdict_is_explained():
 
 
 def test_figures_of_the_procedure_are_those_of_the_settings():
-    cfg = DiagnosisCfg()
+    cfg = DiagnoseCfg()
     assert f"found on {cfg.draws} data sets" in PAGE
     assert f"p ≤ {cfg.level:g} that takes away at least {100 * cfg.least_gain:.0f} %" in PAGE
     assert cfg.additions == 3

@@ -15,7 +15,7 @@ from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare_replays
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
@@ -133,7 +133,7 @@ def _check_effects(model: Model, recording: Recording, names: Sequence[str]) -> 
 
 def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diagnosis:
     """Return the diagnosis; an interruption says how to continue."""
-    cfg = DiagnosisCfg(
+    cfg = DiagnoseCfg(
         effects=arguments.effects,
         window=arguments.window,
         additions=arguments.additions,

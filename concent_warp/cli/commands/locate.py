@@ -13,7 +13,7 @@ from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
-from concent_warp.diagnosis.forces.window_forces import WindowCfg
+from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> UnexplainedForces:
     for path in (arguments.html, arguments.png):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
-    found = locate_forces(model, recording, WindowCfg(arguments.window), engine=arguments.engine)
+    found = locate_forces(model, recording, LocateForcesCfg(arguments.window), engine=arguments.engine)
     if arguments.json:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     else:

@@ -14,7 +14,7 @@ from concent_warp.diagnosis.forces.dependence import LEAST_SHARE, LEAST_SHARE_IN
 from concent_warp.diagnosis.forces.features import CONTACT, joint_features
 from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
 from concent_warp.diagnosis.forces.result import DETECTABLE, UnexplainedForces
-from concent_warp.diagnosis.forces.window_forces import WindowCfg, Windows, window_forces, window_length
+from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, Windows, window_forces, window_length
 from concent_warp.estimation.measured_motion import MeasuredMotion, measured_motion
 from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
@@ -33,7 +33,7 @@ contacts change within windows."""
 def locate_forces(
     model: Model,
     recording: Recording,
-    cfg: WindowCfg | None = None,
+    cfg: LocateForcesCfg | None = None,
     *,
     engine: EngineName = "mujoco",
     out: str | Path | None = None,
@@ -60,7 +60,7 @@ def locate_forces(
         >>> [joint.joint for joint in forces.joints if joint.significant]
         ['hinge']
     """
-    cfg = cfg or WindowCfg()
+    cfg = cfg or LocateForcesCfg()
     simulator = make_engine(engine, model)
     chosen = recording.demonstrations
     motions = [measured_motion(model, d, simulator) for d in chosen]
@@ -113,7 +113,7 @@ def _joint_force(
     dof: int,
     windows: Sequence[Windows],
     features: Sequence[Mapping[str, Mapping[str, np.ndarray]]],
-    cfg: WindowCfg,
+    cfg: LocateForcesCfg,
 ) -> JointForce:
     """Return the unexplained force of a joint, its features in each demonstration given."""
     parts = [(w, f[name]) for w, f in zip(windows, features, strict=True) if name in f]

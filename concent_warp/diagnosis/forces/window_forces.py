@@ -32,12 +32,12 @@ WEIGHTS = 30 * SHARES**2 * (1 - SHARES) ** 2 / np.sum(30 * SHARES**2 * (1 - SHAR
 
 
 @dataclass(frozen=True)
-class WindowCfg:
+class LocateForcesCfg:
     """How a demonstration is cut.
 
     Example:
         >>> import concent_warp as cw
-        >>> cw.WindowCfg(0.1).length
+        >>> cw.LocateForcesCfg(0.1).length
         0.1
     """
 
@@ -90,7 +90,7 @@ def window_length(motion: MeasuredMotion) -> float:
     return float(min(max(0.12 if motion.bodies else 0.1, 8 * motion.period), 0.3))
 
 
-def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: WindowCfg) -> Windows:
+def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: LocateForcesCfg) -> Windows:
     """Simulate all windows of a demonstration, by its name, and return the unexplained forces.
 
     Raises:

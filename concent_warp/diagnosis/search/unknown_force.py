@@ -49,7 +49,7 @@ ARM = 0.05
 
 
 class Settings(Protocol):
-    """What of the settings of a diagnosis matters here, see `concent_warp.diagnosis.diagnose.DiagnosisCfg`."""
+    """What of the settings of a diagnosis matters here, see `concent_warp.diagnosis.diagnose.DiagnoseCfg`."""
 
     @property
     def level(self) -> float:

@@ -5,14 +5,14 @@ import pytest
 
 from concent_warp.diagnosis.forces import features
 from concent_warp.diagnosis.forces.locate import locate_forces
-from concent_warp.diagnosis.forces.window_forces import WindowCfg
+from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
 from tests.diagnosis.forces.locate_scenes import PENDULUM, swing, throw
 
-QUICK = WindowCfg(draws=2)
+QUICK = LocateForcesCfg(draws=2)
 FORCE, POINT = np.array([0.0, -0.5, 0.2]), np.array([0.02, 0.03, -0.01])
 
 
@@ -98,7 +98,7 @@ def test_arrows_are_in_the_frame_of_the_body(pushed_in_flight):
 
 
 def test_push_on_a_sliding_block_is_found_on_its_face_and_its_height_is_not_told():
-    phase = of(located(throw((-0.4, 0, 0), (0.045, 0.012, 0.0), speed=1.2), WindowCfg()).bodies[0], "slide")
+    phase = of(located(throw((-0.4, 0, 0), (0.045, 0.012, 0.0), speed=1.2), LocateForcesCfg()).bodies[0], "slide")
     assert phase.significant
     assert phase.frame == "block"
     assert angle_between(phase.vector, np.array([-1.0, 0, 0])) < 8
@@ -109,7 +109,7 @@ def test_push_on_a_sliding_block_is_found_on_its_face_and_its_height_is_not_told
 
 
 def test_friction_of_a_sliding_block_is_at_its_contact_and_against_the_sliding():
-    body = located(throw(friction=0.4, speed=1.2), WindowCfg()).bodies[0]
+    body = located(throw(friction=0.4, speed=1.2), LocateForcesCfg()).bodies[0]
     phase = of(body, "slide")
     assert phase.significant
     assert phase.frame == "sliding"

@@ -6,7 +6,7 @@ from concent_warp.diagnosis.forces.body_forces import _body_parts
 from concent_warp.diagnosis.forces.contact_state import _free_motions, _lasting_share
 from concent_warp.diagnosis.forces.describe import _direction_words
 from concent_warp.diagnosis.forces.point_of_action import _face_words, _lever
-from concent_warp.diagnosis.forces.window_forces import WindowCfg, window_forces
+from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, window_forces
 from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -19,7 +19,7 @@ def parts(recording):
     engine = MujocoEngine(model, threads=1)
     motions = [measured_motion(model, d, engine) for d in recording.demonstrations]
     pairs = zip(recording.demonstrations, motions, strict=True)
-    windows = [window_forces(d.name, engine, motion, WindowCfg(draws=0)) for d, motion in pairs]
+    windows = [window_forces(d.name, engine, motion, LocateForcesCfg(draws=0)) for d, motion in pairs]
     return _body_parts("block", motions, windows)
 
 

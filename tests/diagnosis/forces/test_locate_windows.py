@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.forces.features import DIRECTION, joint_features
-from concent_warp.diagnosis.forces.window_forces import WindowCfg, window_forces
+from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, window_forces
 from concent_warp.diagnosis.forces.window_solver import _misfit, _response
 from concent_warp.estimation.measured_motion import _turning, measured_motion
 from concent_warp.estimation.smoothing_spline import smooth
@@ -18,7 +18,7 @@ def windows_of(recording, cfg=None, which=0):
     model = Model(Scene(recording.scene))
     engine = MujocoEngine(model, threads=1)
     motion = measured_motion(model, recording[which], engine)
-    return window_forces(recording[which].name, engine, motion, cfg or WindowCfg(draws=1)), motion
+    return window_forces(recording[which].name, engine, motion, cfg or LocateForcesCfg(draws=1)), motion
 
 
 def wave(seed, count=600, noise=1e-3):
@@ -97,7 +97,7 @@ def test_a_constant_torque_on_a_driven_joint_is_found_without_bias_and_with_its_
 
 def test_wider_windows_see_smaller_forces():
     recording = swing(lambda _: 0.0, duration=2)
-    short, long = (np.median(windows_of(recording, WindowCfg(w, draws=0))[0].std) for w in (0.08, 0.16))
+    short, long = (np.median(windows_of(recording, LocateForcesCfg(w, draws=0))[0].std) for w in (0.08, 0.16))
     assert long < 0.4 * short
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _moved
@@ -65,7 +65,7 @@ def slid():
 @pytest.fixture(scope="module")
 def base(slid):
     model, recording = slid
-    return Procedure(model, recording, DiagnosisCfg(jobs=1), silent).baseline()
+    return Procedure(model, recording, DiagnoseCfg(jobs=1), silent).baseline()
 
 
 def one_by_one(work, tasks, _text, _span):
@@ -113,4 +113,4 @@ def test_what_gradients_cannot_do_is_said_before_anything_is_fitted(slid):
         raise AssertionError(said)
 
     with pytest.raises(ModelError, match="contact geometry of spheres"):
-        diagnose(replace(model, geometry=None), recording, DiagnosisCfg(jobs=1, gradient=True), progress=never)
+        diagnose(replace(model, geometry=None), recording, DiagnoseCfg(jobs=1, gradient=True), progress=never)

@@ -1,6 +1,6 @@
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import CheckpointedProcedure
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, polish_candidate, screen, without
@@ -23,7 +23,7 @@ def nodes():
 
 
 def procedure(recording, nodes, folder=None):
-    cfg = DiagnosisCfg(jobs=1)
+    cfg = DiagnoseCfg(jobs=1)
     made = Procedure(nodes[0].model, recording, cfg, silent)
     if folder is not None:
         made = CheckpointedProcedure(nodes[0].model, recording, cfg, silent, folder, "key")

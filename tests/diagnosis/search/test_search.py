@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.evidence import alike
@@ -163,7 +163,7 @@ def test_a_rival_gets_on_from_the_leaders_initial_states_and_goes_on_as_long_as_
     stuck = replace(right, fit=replace(right.fit, values=values, offsets=astray, cost=cost, linear=linear))
     stuck = replace(stuck, errors=1.5 * right.errors)
     found = [right, stuck]
-    procedure = Procedure(lacking.model, swung(), DiagnosisCfg(jobs=1), silent)
+    procedure = Procedure(lacking.model, swung(), DiagnoseCfg(jobs=1), silent)
     procedure.level(lacking, found, np.array([right.share(lacking)] * 2))
     assert found[0].fit.cost <= right.fit.cost
     assert found[1].fit.cost < 1.01 * right.fit.cost
@@ -173,7 +173,7 @@ def test_a_rival_gets_on_from_the_leaders_initial_states_and_goes_on_as_long_as_
 def test_what_is_nearly_alike_is_looked_around_and_what_comes_first_is_polished(lacking):
     best = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
     other = replace(fit_candidate(lacking, screen(lacking, effect("armature"))), errors=1.022 * best.errors)
-    procedure = Procedure(lacking.model, swung(), DiagnosisCfg(jobs=1), silent)
+    procedure = Procedure(lacking.model, swung(), DiagnoseCfg(jobs=1), silent)
     looked = []
     settling = procedure.settling
 

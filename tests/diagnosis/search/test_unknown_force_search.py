@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnosisCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure, silent
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, screen
@@ -21,7 +21,7 @@ from concent_warp.scene.scene import Scene
 
 NOISE = 5e-4
 FRICTION = 0.6
-CFG = DiagnosisCfg(effects=("joint_damping", "joint_friction", "actuator_gain"), jobs=1, explain=False)
+CFG = DiagnoseCfg(effects=("joint_damping", "joint_friction", "actuator_gain"), jobs=1, explain=False)
 
 
 def rail(friction=0.0, damping=0.0):
