@@ -11,7 +11,7 @@ import pytest
 
 HEAVY = {
     *("torch", "warp", "mujoco_warp", "newton", "rsl_rl"),
-    *("open3d", "trimesh", "kornia", "cv2", "matplotlib", "plotly"),
+    *("open3d", "trimesh", "kornia", "cv2", "matplotlib"),
 }
 """Packages that are slow to import or that a host may lack."""
 ABOUT_WARP = (

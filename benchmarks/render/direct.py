@@ -12,6 +12,7 @@ back. A line of JSON for each way and number of steps is appended to --out; each
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -63,22 +64,21 @@ def learn(training: RenderTraining, name: str, seconds: float) -> dict[str, floa
     one, device = training.trainings[name], training.device
     one.network.train()
     begun, limit = time.perf_counter(), one.cfg.steps
+    value = math.nan
     every = 20 if device.type == "cuda" else 1
     while one.done < limit:
         with torch.autocast(device.type, torch.bfloat16, enabled=training.cfg.half):
             loss = training.loss(name)
         one.step(loss)
-        if one.done % every == 0:
-            _ = float(loss.detach())  # waits for the device
+        if one.done % every == 0 or one.done >= limit:
+            value = float(loss.detach())  # waits for the device
             spent = time.perf_counter() - begun
             if spent > seconds:
                 break
             # So many steps it will be, at this pace; the rate falls along them.
             one.cfg = replace(one.cfg, steps=min(limit, max(one.done + 1, int(one.done * seconds / spent))))
-    print(
-        f"{name}: {one.done} steps in {time.perf_counter() - begun:.0f} s, loss {float(loss.detach()):.4f}", flush=True
-    )
-    return {"steps": one.done, "seconds": time.perf_counter() - begun, "loss": float(loss.detach())}
+    print(f"{name}: {one.done} steps in {time.perf_counter() - begun:.0f} s, loss {value:.4f}", flush=True)
+    return {"steps": one.done, "seconds": time.perf_counter() - begun, "loss": value}
 
 
 def painting(training: RenderTraining, camera: str) -> Draw:

@@ -76,11 +76,12 @@ def pairs_of(
     demonstrations = recording.demonstrations
     common = [name for name in demonstrations[0].image if all(name in d.image for d in demonstrations)]
     names = list(cameras) or common
-    if not names or (missing := sorted(set(names) - set(common))):
+    missing = sorted(set(names) - set(common))
+    if not names or missing:
         raise RenderError(
             "the recording lacks images to learn from",
             where=recording.source,
-            expected=f"the cameras {sorted(missing)} in every demonstration" if names else "an image channel",
+            expected=f"the cameras {missing} in every demonstration" if names else "an image channel",
             found=common,
         )
     scene = Scene(recording.scene, source=recording.source)

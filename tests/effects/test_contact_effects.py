@@ -84,8 +84,8 @@ def bounce(time_constant: float, damping: float, speed: float) -> float:
     def leaves(_, state):
         return state[0]
 
-    lifts.terminal = leaves.terminal = True
-    lifts.direction, leaves.direction = -1, 1
+    for event, direction in ((lifts, -1), (leaves, 1)):
+        vars(event).update(terminal=True, direction=direction)
     found = solve_ivp(motion, (0, 1), [0, -speed], events=[lifts, leaves], max_step=1e-4, rtol=1e-9)
     depth, rebound = found.y[:, -1]
     return depth + rebound**2 / (2 * G)

@@ -230,5 +230,7 @@ def test_what_cannot_be_is_refused():
 
 
 def test_cuda_kernels_compile_without_a_gpu(tmp_path):
-    (code,) = wp.compile_aot_module(contact_pairs.slot_kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    kernel = contact_pairs.slot_kernel
+    assert isinstance(kernel, wp.Kernel)
+    (code,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert "reach_kernel" in code.read_text()

@@ -303,6 +303,7 @@ def test_what_cannot_be_is_refused():
 
 
 def test_cuda_kernels_compile_without_a_gpu(tmp_path):
-    module = virtual_collision_kernel.collision_kernel.module
-    (code,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    kernel = virtual_collision_kernel.collision_kernel
+    assert isinstance(kernel, wp.Kernel)
+    (code,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert code.stat().st_size > 0

@@ -113,7 +113,6 @@ def test_hybrid_images_of_a_gpu_are_those_of_the_cpu():
             Scene(XML).model, ["base", "wrist"], SIZE, 2, objects=["ball"], splats={"ball": ball().to(device)},
             shadows=ShadowCfg(), device=device,
         )  # fmt: skip
-        for t in range(3):
-            layers = camera.shoot(states(t, 2))
-        found.append(layers.image.cpu())
+        layers = [camera.shoot(states(t, 2)) for t in range(3)]
+        found.append(layers[-1].image.cpu())
     assert (found[0] - found[1]).abs().mean() < 0.003
