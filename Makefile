@@ -6,34 +6,62 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 LAYOUT := build/layout/concent_warp
 BROWSERS := chromium chromium-browser google-chrome
 
-.PHONY: help demo test check format layout system clean
+.PHONY: help demo setup test check lint types imports tests docs format hooks layout system clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo    record, fit, events, compare, report: the whole of it on a simulated stand-in, in runs/demo"
-	@echo "make test    set up for development and run all checks"
-	@echo "make check   run all checks: format, lint, types, imports, tests"
-	@echo "make format  format the code"
-	@echo "make system  install Debian packages that some tests want (root only)"
-	@echo "make clean   remove .venv and what was built"
+	@echo "make demo     record, fit, events, compare, report: the whole pipeline in Reality, in runs/demo"
+	@echo "make test     set up for development and run all checks"
+	@echo "make setup    set up for development"
+	@echo "make check    run all checks: lint, types, imports, tests"
+	@echo "make lint     check format and lint"
+	@echo "make types    check types"
+	@echo "make imports  check who imports whom"
+	@echo "make tests    run the tests, which also build the documentation site and run notebook and examples"
+	@echo "make docs     build the documentation site, in build/site"
+	@echo "make format   format the code"
+	@echo "make hooks    check each commit before it is made"
+	@echo "make layout   link the folders together as they are installed, for an editor's type checker"
+	@echo "make system   install a Debian package that some tests want (root only)"
+	@echo "make clean    remove .venv and what was built"
 
 demo: .venv/installed
 	$(BIN)/concent demo --out runs/demo --overwrite
+
+setup: .venv/installed-dev
 
 test: system .venv/installed-dev
 	@$(MAKE) --no-print-directory check
 
 # The checks run one after the other, so that the tests come last and their summary ends the output.
-check: .venv/installed-dev layout
+check:
+	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory types
+	@$(MAKE) --no-print-directory imports
+	@$(MAKE) --no-print-directory tests
+
+lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+
+types: .venv/installed-dev layout
 	$(BIN)/pyright --project pyproject.toml
+
+imports: .venv/installed-dev layout
 	cd $(dir $(LAYOUT)) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml --no-cache
+
+tests: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+docs: .venv/installed-dev layout
+	$(BIN)/mkdocs build --strict --quiet --site-dir build/site
 
 format: .venv/installed-dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+hooks: .venv/installed-dev
+	$(BIN)/pre-commit install
 
 # The top-level folders, linked together as they are installed: for tools that read files and import nothing.
 layout:
