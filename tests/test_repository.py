@@ -35,8 +35,8 @@ def test_help_lists_every_target_and_every_target_has_a_rule(root, targets):
 def test_workflow_calls_targets_on_every_python_that_the_package_allows(root, targets):
     workflow = load(root / ".github" / "workflows" / "checks.yml")
     lines = [step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"]]
-    called = {word for line in lines if line.startswith("make ") for word in line.split()[1:] if "=" not in word}
-    assert {"lint", "types", "imports", "tests", "docs"} <= called <= targets
+    called = {word for line in lines for word in re.sub(r"\S+=.*", "", line).split() if line.startswith("make ")}
+    assert {"lint", "types", "imports", "tests", "docs"} <= called - {"make"} <= targets
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     assert project["requires-python"] == ">=3.11,<3.14"
     assert workflow["jobs"]["tests"]["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
