@@ -31,5 +31,5 @@ def test_stages_last_from_the_files_of_one_to_those_of_the_next(main_job, tmp_pa
 
 
 def test_a_bound_that_is_not_kept_shows(main_job):
-    assert main_job.judged(301, main_job.SECONDS) == "**not kept**"
-    assert main_job.judged(299, main_job.SECONDS) == "kept"
+    assert main_job.judged(181, main_job.SECONDS) == "**not kept**"
+    assert main_job.judged(179, main_job.SECONDS) == "kept"

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError, RecordingError
-from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, cut, fit_geometry
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.evolution import EvolutionCfg
-from concent_warp.fit.geometry.search import FitResult, Progress
+from concent_warp.fit.geometry.search import FitResult, Progress, Search, Survey
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
@@ -115,8 +115,24 @@ def test_settings_survive_the_checkpoint_as_json():
 def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
     cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), patience=2)
     result = fit_geometry(swollen, drop, cfg, engine="mujoco")
-    assert "no better estimate" in result.stopped
-    assert len(result.history) < CFG.generations
+    assert result.stopped == "error fell by less than 0.05 of itself in 2 generations"
+    assert len(result.history) == 3
+
+
+def test_small_gains_add_up_before_the_fit_ends(drop, swollen):
+    search = Search(swollen, cut(swollen, [drop[0]], CFG), replace(CFG, patience=3, least_gain=0.05), "mujoco")
+
+    def seen(generation: int, loss: float, held_out: float) -> int:
+        search.evolution.generation = generation
+        search.note(Survey(np.ones(1, bool), np.ones(1, bool), loss, held_out))
+        return search.last_gain
+
+    assert seen(1, 1.0, 1.0) == 1
+    assert seen(2, 0.97, 1.0) == 1
+    assert seen(3, 0.94, 1.0) == 3
+    assert seen(4, 0.94, 0.96) == 3
+    assert seen(5, 1.2, 0.949) == 5
+    assert (search.best, search.lowest) == (0.949, 0.94)
 
 
 def test_radii_move_when_asked(drop, swollen):
