@@ -28,7 +28,7 @@ from concent_warp.errors import ConcentError
 from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.policy.evaluate import PolicyFunction
+from concent_warp.train.policy.episodes import Episodes, PolicyFunction
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.run import TrainingRun
@@ -121,14 +121,11 @@ def outcomes(environment: Environment, policy: PolicyFunction) -> tuple[np.ndarr
 
     Returns where object 1 is in place at that time, and where the episode had failed before, shape (N,) bool each.
     """
-    environment.start_from(range(environment.num_envs))
-    observation = environment.get_observations()
-    failed = torch.zeros(environment.num_envs, dtype=torch.bool)
+    episodes = Episodes(environment, policy, range(environment.num_envs))
     for _ in range(int(environment.max_episode_length) - 1):
-        with torch.inference_mode():
-            observation, _, done, _ = environment.step(policy(observation))
-        failed |= done
-    return (environment.success & ~failed).numpy(), failed.numpy()
+        episodes.step()
+    failed = ~episodes.running
+    return environment.success.numpy() & ~failed, failed
 
 
 def page(data: dict[str, dict[str, Any]]) -> str:

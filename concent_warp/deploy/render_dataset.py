@@ -145,7 +145,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     import torch
 
     from concent_warp.train.environment.worlds import make_environment
-    from concent_warp.train.policy.episodes import start, steps
+    from concent_warp.train.policy.episodes import SUCCESS, Episodes
 
     cfg, run = to.cfg, policy.run
     task = run.task()
@@ -167,17 +167,17 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     with _leaving(filming):
         for first in range(0, len(left), worlds):
             rows = left[first : first + worlds]
-            start(environment, rows)
+            episodes = Episodes(environment, act, rows)
             filming.begin([*rows, *[None] * (worlds - len(rows))])
             filming.shoot(physics.qpos, physics.mocap)
             state = physics.qpos.cpu().numpy()[:, joints]
-            for k, step in enumerate(steps(environment, act)):
+            for step in episodes:
                 for world in filming.running:
                     filming.add(world, state[world], step.command[world])
-                    if step.ended[world]:
-                        success = bool(step.success[world])
+                    if world in step.outcome:
+                        success = step.outcome[world] == SUCCESS
                         filming.end(world, keep=cfg.keep == "all" or success, success=success)
-                progress((first + len(rows) * (k + 1) / length) / len(left))
+                progress((first + len(rows) * episodes.length / length) / len(left))
                 if not filming.running:
                     break
                 filming.shoot(physics.qpos, physics.mocap)

@@ -1,55 +1,91 @@
-"""Episodes of a policy, step by step, for those who look on: images, say, for a data set."""
+"""Episodes of a policy, step by step: what evaluation, live view, data sets and benchmarks have in common."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.evaluate import PolicyFunction
+
+PolicyFunction = Callable[[TensorDict], torch.Tensor]
+"""From observations to actions, shape (N, A), without exploration."""
+SUCCESS, MISSED = "success", "missed"
+"""Outcomes of an episode that ended with object 1 in place, and of one whose time was over without."""
+FAILURES = ("dropped", "severe", "diverged")
+"""Outcomes of failed episodes, in the order of `Environment.failure`."""
 
 
 @dataclass(frozen=True)
-class Step:
-    """What has happened in N worlds since they were looked at."""
+class EpisodeStep:
+    """What one control step did in N worlds."""
 
     command: np.ndarray
-    """What was commanded, shape (N, nu)."""
-    ended: np.ndarray
-    """Whether the episode ended by it, shape (N,) bool."""
-    success: np.ndarray
-    """Whether it ended in success, shape (N,) bool."""
+    """Commands that the step applied, shape (N, nu); of an episode that it ended, those of the step before."""
+    outcome: Mapping[int, str]
+    """Outcomes of the episodes that ended by this step, by world: `SUCCESS`, `MISSED` or one of `FAILURES`."""
 
 
-def start(environment: Environment, rows: Sequence[int]) -> None:
-    """Start an episode in every world from the initial states of these rows, as many as are needed of them in turn."""
-    worlds = environment.num_envs
-    environment.start_from([rows[k % len(rows)] for k in range(worlds)])
+class Episodes:
+    """One episode in each of N worlds, under a policy; iterates over the control steps until all have ended.
 
-
-def steps(environment: Environment, policy: PolicyFunction) -> Iterator[Step]:
-    """Act for as long as the longest episode lasts; look at the worlds' states before each step is asked for.
-
-    A world whose episode has ended begins another one, which is nobody's.
+    The state before a step is in the environment's physics. A world whose episode has ended begins another one there,
+    which does not count.
     """
-    worlds = environment.num_envs
-    before = environment.physics.ctrl.detach().cpu().numpy().copy()
-    open_ = np.ones(worlds, dtype=bool)
-    for k in range(int(environment.max_episode_length)):
+
+    def __init__(self, environment: Environment, policy: PolicyFunction, rows: Sequence[int]) -> None:
+        """Start an episode in every world.
+
+        Args:
+            environment: The worlds.
+            policy: From observations to actions, without exploration.
+            rows: Initial states of the environment, of which each world takes the next one; from the first again where
+                they are fewer than N.
+        """
+        self._environment, self._policy = environment, policy
+        environment.start_from([rows[k % len(rows)] for k in range(environment.num_envs)])
+        self.running = np.ones(environment.num_envs, dtype=bool)
+        """Whether the episode of a world is still running, shape (N,) bool."""
+        self.length = 0
+        """Control steps so far."""
+        self._observation = environment.get_observations()
+        self._command = self._commands()
+
+    def __iter__(self) -> Iterator[EpisodeStep]:
+        """Step until all episodes have ended."""
+        while self.running.any():
+            yield self.step()
+
+    def step(self) -> EpisodeStep:
+        """Act once in every world."""
+        environment = self._environment
         with torch.inference_mode():
-            _, _, done, _ = environment.step(policy(environment.get_observations()))
-        ended = done.cpu().numpy().astype(bool) & open_
-        if k == int(environment.max_episode_length) - 1:
-            ended = open_.copy()
-        failed = environment.failure.cpu().numpy().any(axis=1)
-        command = environment.physics.ctrl.detach().cpu().numpy().copy()
-        # The commands of a world that has begun anew are those of its next episode.
-        command[ended] = before[ended]
-        yield Step(command, ended, ended & environment.success.cpu().numpy().astype(bool) & ~failed)
-        before = command
-        open_ &= ~ended
-        if not open_.any():
-            return
+            self._observation, _, done, _ = environment.step(self._policy(self._observation))
+        self.length += 1
+        ended = done.cpu().numpy().astype(bool) & self.running
+        command = self._commands()
+        command[ended] = self._command[ended]  # those of the world are already of its next episode
+        self._command, self.running = command, self.running & ~ended
+        return EpisodeStep(command, self._outcomes(ended))
+
+    def _commands(self) -> np.ndarray:
+        """Return the present commands, shape (N, nu)."""
+        return self._environment.physics.ctrl.detach().cpu().numpy().copy()
+
+    def _outcomes(self, ended: np.ndarray) -> dict[int, str]:
+        """Return the outcomes of the episodes of a mask (N,) bool, by world."""
+        if not ended.any():
+            return {}
+        failure = self._environment.failure.cpu().numpy()
+        success = self._environment.success.cpu().numpy()
+        return {int(world): _outcome(success[world], failure[world]) for world in np.flatnonzero(ended)}
+
+
+def _outcome(success: bool, failure: np.ndarray) -> str:
+    """Return the outcome of an episode from what `Environment` says of its last step; `failure` has shape (3,)."""
+    if failure.any():
+        return FAILURES[int(failure.argmax())]
+    return SUCCESS if success else MISSED

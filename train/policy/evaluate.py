@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from tensordict import TensorDict
 
 from concent_warp.train.environment.environment import Environment
+from concent_warp.train.policy.episodes import MISSED, SUCCESS, Episodes, PolicyFunction
 from concent_warp.train.resets.sample import ResetStates
 
-PolicyFunction = Callable[[TensorDict], torch.Tensor]
-"""From observations to actions, shape (N, A), without exploration."""
 Watch = Callable[[np.ndarray, np.ndarray], None]
 """Takes the episodes that are running, ids (R,) int, and their positions (R, nq)."""
-FAILURES = ("dropped", "severe", "diverged")
 
 
 @dataclass(frozen=True)
@@ -106,34 +102,22 @@ def run_episodes(
     """
     count, worlds = len(states.qpos), environment.num_envs
     success, length = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
-    outcome, reached = ["missed"] * count, np.zeros(count, dtype=int)
-    steps = int(environment.max_episode_length)
+    outcome, reached = [MISSED] * count, np.zeros(count, dtype=int)
+    longest = int(environment.max_episode_length)
     for first in range(0, count, worlds):
-        rows = np.arange(first, first + worlds) % count
-        environment.start_from(rows.tolist())
-        observation = environment.get_observations()
-        open_ = np.ones(worlds, dtype=bool)
-        for k in range(steps):
+        counted = first + np.arange(worlds) < count
+        episodes = Episodes(environment, policy, (first + np.arange(worlds)) % count)
+        while episodes.running.any():
             if watch is not None:
-                worlds_open = np.flatnonzero(open_ & (first + np.arange(worlds) < count))
-                watch(first + worlds_open, environment.physics.qpos.cpu().numpy()[worlds_open])
-            with torch.inference_mode():
-                observation, _, done, _ = environment.step(policy(observation))
-            ended = done.cpu().numpy() & open_
-            for world in np.flatnonzero(ended):
-                if first + world >= count:
-                    continue
-                row = first + world
-                failed = environment.failure[world].cpu().numpy()
-                success[row] = bool(environment.success[world]) and not failed.any()
-                outcome[row] = FAILURES[int(failed.argmax())] if failed.any() else outcome[row]
-                outcome[row] = "success" if success[row] else outcome[row]
-                length[row], reached[row] = k + 1, int(environment.reached[world])
-            open_ &= ~ended
+                watched = np.flatnonzero(episodes.running & counted)
+                watch(first + watched, environment.physics.qpos.cpu().numpy()[watched])
+            for world, how in episodes.step().outcome.items():
+                if counted[world]:
+                    row = first + world
+                    success[row], outcome[row] = how == SUCCESS, how
+                    length[row], reached[row] = episodes.length, int(environment.reached[world])
             if progress is not None:
-                progress((first + worlds * (k + 1) / steps) / (math.ceil(count / worlds) * worlds))
-            if not open_.any():
-                break
+                progress((first + worlds * episodes.length / longest) / (math.ceil(count / worlds) * worlds))
     task = environment.task
     stages = tuple(task.events.stages[s].name for s in task.chained) if len(task.chained) > 1 else ()
     return Evaluation(success, tuple(outcome), length, stages, reached)

@@ -10,7 +10,7 @@ from typing import Any
 from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
-from concent_warp.train.policy.evaluate import PolicyFunction
+from concent_warp.train.policy.episodes import PolicyFunction
 from concent_warp.train.policy.pretrained import FOLDER, names, pretrained_checkpoint
 from concent_warp.train.run import TrainingRun
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import torch
 
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.evaluate import FAILURES, PolicyFunction
+from concent_warp.train.policy.episodes import Episodes, PolicyFunction
 from concent_warp.train.task.task import Task
 
 TOUCH = 5e-4
@@ -45,29 +44,20 @@ class Player:
         self.ended: list[str] = []
         """Outcomes of the episodes that have ended."""
         self._states, self._next = episodes, 0
-        self._length = 0
         self.begin()
 
     def begin(self) -> None:
         """Begin an episode from the next initial state."""
-        worlds = self.environment.num_envs
-        self.environment.start_from([(self._next + k) % self._states for k in range(worlds)])
+        rows = [(self._next + k) % self._states for k in range(self._states)]
+        self._episodes = Episodes(self.environment, self.policy, rows)
         self._next = (self._next + 1) % self._states
-        self._length = 0
 
     def step(self) -> str | None:
-        """Act once; return the outcome of the episode where it ends by that, and begin the next one."""
-        environment = self.environment
-        with torch.inference_mode():
-            _, _, done, _ = environment.step(self.policy(environment.get_observations()))
-        self._length += 1
-        if not bool(done[0]):
-            return None
-        failed = environment.failure[0].cpu().numpy()
-        outcome = FAILURES[int(failed.argmax())] if failed.any() else "missed"
-        outcome = "success" if bool(environment.success[0]) and not failed.any() else outcome
-        self.ended.append(outcome)
-        self.begin()
+        """Act once; return the outcome of the episode if it ends by that, and begin the next one."""
+        outcome = self._episodes.step().outcome.get(0)
+        if outcome is not None:
+            self.ended.append(outcome)
+            self.begin()
         return outcome
 
     def moment(self) -> PlayedState:
@@ -82,7 +72,7 @@ class Player:
             touching=self.touches.of(environment.physics.qpos[0].cpu().numpy(), position, quaternion),
             stage=task.events.stages[stage].name,
             pairs=_pairs(task, stage, position, quaternion),
-            time=self._length * environment.control_step,
+            time=self._episodes.length * environment.control_step,
         )
 
 
