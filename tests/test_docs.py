@@ -57,7 +57,7 @@ def commands() -> list[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of the stand-in world."""
+    """Return a recording of Reality."""
     path = tmp_path_factory.mktemp("docs") / "demo.h5"
     write_hdf5(record(RealityCfg(), [0])[0], path)
     return path
@@ -85,9 +85,14 @@ def test_command_in_the_pages_is_understood(line):
         tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.FlagCreatePairsOff,))
 
 
-def test_readme_has_every_command():
-    text = (ROOT / "README.md").read_text()
+def test_the_page_of_commands_has_every_command():
+    text = (ROOT / "docs" / "commands.md").read_text()
     assert all(f"`concent {command}`" in text for command in COMMANDS)
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 700
+    assert len((ROOT / "docs" / "train.md").read_text().split()) <= 1600
 
 
 @pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs" / "benchmarks").glob("*.md"))], ids=lambda p: p.name)

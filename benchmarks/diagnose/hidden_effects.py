@@ -25,8 +25,8 @@ from typing import Any
 import tyro
 
 from benchmarks.diagnose.hidden_effects_data import DataSet, Kind, cases, make
-from benchmarks.diagnose.hidden_effects_report import write_again, write_report
-from benchmarks.pages import machine, machine_line
+from benchmarks.diagnose.hidden_effects_report import NAME, write_again, write_kept, write_report
+from benchmarks.pages import machine, machine_line, read_data
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.errors import ConcentError
@@ -81,7 +81,9 @@ def main(args: Args) -> None:
                 left = (time.monotonic() - begun) * (len(pending) - k - 1) / (k + 1)
                 print(f"{k + 1:3d}/{len(pending)}  {line(result)}  ({left / 60:.0f} min left)", flush=True)
     rows = [json.loads(path(args.out, c).read_text()) for c in chosen if path(args.out, c).is_file()]
-    if args.report or not (args.rigs or args.effects or args.names or args.shift != SHIFT or len(args.kinds) < 4):
+    if args.report and not rows:
+        write_kept(read_data(NAME), len(cases()))
+    elif args.report or not (args.rigs or args.effects or args.names or args.shift != SHIFT or len(args.kinds) < 4):
         write = write_again if args.again else write_report
         write(rows, len(cases()), args.host or machine_line(machine()))
 

@@ -16,6 +16,8 @@ from concent_warp.files import write_text
 NAME = "hidden_effects"
 FLOOR = 1.3
 """Residual over noise at which a model has reached the noise."""
+EQUAL_RIGS = ("drop", "tumble")
+"""Rigs in which Reality, with nothing hidden, is the nominal model to the bit: no drives, the same step and options."""
 Row = dict[str, Any]
 
 
@@ -45,7 +47,7 @@ def write_kept(kept: dict[str, Any], total: int) -> None:
 def other_seeds(rows: Sequence[Row], total: int, host: str) -> str:
     """Return what another run found."""
     wrong = [
-        [f"`{r['name']}`", r.get("verdict", "error"), told(r)]
+        [f"`{r['name']}`", r.get("verdict", "error"), named(r)]
         for r in sorted(rows, key=lambda r: r["name"])
         if r["kind"] == "single" and not first_right(r)
     ]
@@ -98,13 +100,18 @@ def accepted(row: Row) -> list[str]:
 
 
 def groups(row: Row) -> list[set[str]]:
-    """Return the groups of names that were not told apart."""
+    """Return the groups of names that the data do not distinguish."""
     return [{base(name) for name in group} for group in row.get("groups", ())]
 
 
 def first_right(row: Row) -> bool:
     """Return whether the hidden effect is the first that is named."""
     return accepted(row)[:1] == [row["truth"][0]["name"]]
+
+
+def exactly_right(row: Row) -> bool:
+    """Return whether the hidden effect is named, alone and without alternatives."""
+    return first_right(row) and groups(row) == [{row["truth"][0]["name"]}]
 
 
 def in_group(row: Row) -> bool:
@@ -183,8 +190,15 @@ def all_shares(rows: Sequence[Row]) -> list[list[str]]:
     def over(of: Sequence[Row], hit: Callable[[Row], bool]) -> list[bool]:
         return [hit(r) for r in of]
 
+    equal = [r for r in single if r["rig"] in EQUAL_RIGS]
+    others = [r for r in single if r["rig"] not in EQUAL_RIGS]
     return [
         figure("right effect named first", ">= 90 %", over(single, first_right)),
+        figure(
+            f"- rigs whose Reality equals the nominal model ({', '.join(EQUAL_RIGS)})", "", over(equal, first_right)
+        ),
+        figure("- other rigs", "", over(others, first_right)),
+        figure("exactly the right effect named and nothing else", "", over(single, exactly_right)),
         figure("right effect in the group named first", ">= 97 %", over(single, in_group)),
         figure("false alarm, nothing hidden", "<= 5 %", over(null, alarm)),
         figure('"none of these", effect outside the library', ">= 80 %", over(outside, none_of_these)),
@@ -218,7 +232,7 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
             ]
         )
     other = [
-        [f"`{r['name']}`", r.get("verdict", "error"), told(r), " -> ".join(f"{x:.2f}" for x in r.get("ratio", ()))]
+        [f"`{r['name']}`", r.get("verdict", "error"), named(r), " -> ".join(f"{x:.2f}" for x in r.get("ratio", ()))]
         for r in sorted(rows, key=lambda r: (r["kind"], r["name"]))
         if r["kind"] in ("outside", "pair") or (r["kind"] == "null" and alarm(r))
     ]
@@ -230,16 +244,17 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
     ]
     return f"""# Hidden effects
 
-How often `concent diagnose` names the effect that is hidden in a recording. The recordings are made in the stand-in
-world, whose own implementation of each effect is not that of the library;
+How often `concent diagnose` names the effect that is hidden in a recording. The recordings are made in
+Reality, whose implementation of each effect is not the library's;
 `benchmarks/diagnose/hidden_effects_data.py` lists them.
 
 ```
-python -m benchmarks.diagnose.hidden_effects            # {total} data sets, resumable, in an order of chance
+python -m benchmarks.diagnose.hidden_effects            # {total} data sets, resumable, in random order
 python -m benchmarks.diagnose.hidden_effects --report   # this page
 ```
 
-{host} {len(rows)} of {total} data sets done, {len(failed)} ended in an error;
+{host} {len(rows)} of {total} data sets done, {len(failed)} ended in an error; the
+{total - len(rows)} others were not finished in the time and are in no share below.
 {seconds.sum() / 3600:.1f} hours of one core in all.
 
 {table(["", "bar", "share", "95 % interval", "data sets"], all_shares(rows))}
@@ -253,15 +268,15 @@ the noise, the large one two to three times that.
 
 ## Outside the library, two at once, false alarms
 
-The hidden effects are in the name of the data. Groups are what the data could not tell apart, in the order of the
-additions; the ratio is that of the residual to the noise, of the model as drawn and after each addition.
+The hidden effects are in the name of the data. Groups are effects that the data do not distinguish, in the order
+of the additions; the ratio is that of the residual to the noise, of the nominal model and after each addition.
 
 {table(["data", "verdict", "named", "ratio"], other)}
-## What would have been seen
+## Smallest sizes that are found
 
 The smallest size of each effect that the search would have named in half of all cases, on the rig that it is tried on:
 the median over the data sets of that rig in which nothing is hidden. `detectable` in the output of `concent diagnose`
-tells it for any recording.
+has it for any recording.
 
 {table(["effect", "rig", "smallest size"], smallest)}
 ## Time
@@ -272,7 +287,7 @@ machine.
 {table(["rig", "data sets", "median [s]", "longest [s]"], by_rig)}"""
 
 
-def told(row: Row) -> str:
+def named(row: Row) -> str:
     """Return the groups that were named, in words."""
     return ", then ".join(" or ".join(sorted(group)) for group in groups(row)) or "-"
 

@@ -43,18 +43,18 @@ def add_cameras(spec: mujoco.MjSpec, objects: Sequence[str], *, tool_site: str =
         mujoco.mj_kinematics(compiled, data)
         middle = np.mean([data.body(name).xpos for name in objects], axis=0)
         place = middle + np.array(BASE_OFFSET)
-        _add_camera(spec.worldbody, BASE, place, middle + np.array(BASE_TARGET), (0, 0, 1), BASE_FOVY)
+        add_camera(spec.worldbody, BASE, place, middle + np.array(BASE_TARGET), (0, 0, 1), BASE_FOVY)
     site = spec.site(tool_site)
     if WRIST not in there and site is not None:
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, np.array(site.quat))
         turned = rotation.reshape(3, 3)
         place, target = (np.array(site.pos) + turned @ np.array(p) for p in (WRIST_OFFSET, WRIST_TARGET))
-        _add_camera(site.parent, WRIST, place, target, turned @ np.array([1.0, 0, 0]), WRIST_FOVY)
+        add_camera(site.parent, WRIST, place, target, turned @ np.array([1.0, 0, 0]), WRIST_FOVY)
     return tuple(camera.name for camera in spec.cameras)
 
 
-def _add_camera(
+def add_camera(
     body: mujoco.MjsBody,
     name: str,
     position: Sequence[float] | np.ndarray,
