@@ -45,7 +45,7 @@ the diagnosis, where it is accepted (a group is right if what is hidden is in it
 
 ## Data with a known truth
 
-{len(known)} data sets of the stand-in world, each with a second recording by which all are judged.
+{len(known)} data sets of Reality, each with a second recording by which all are judged.
 """
     head = ["", *WAYS]
     text += "\n" + table(head, summary(known)) if known else ""

@@ -1,4 +1,4 @@
-"""Data sets with a hidden effect: small experiments in the stand-in world, by name and seed, made in seconds each.
+"""Data sets with a hidden effect: small experiments in Reality, by name and seed, made in seconds each.
 
 python -m benchmarks.diagnose.hidden_effects_data  # how far each is from its drawing, against the noise
 python -m benchmarks.diagnose.hidden_effects_data --kinds null pair  # some of them: single, null, outside, pair

@@ -4,8 +4,8 @@
     python -m benchmarks.diagnose.speed --parts scenes     # some of them; the page keeps the other figures
     python -m benchmarks.diagnose.speed --table            # the page again, from the figures
 
-Each diagnosis runs in this process and in `--jobs` of its workers, with the default settings, on recordings of the
-stand-in world that hide one effect. Figures of several machines stand side by side, under `--host`.
+Each diagnosis runs in this process and in `--jobs` of its workers, with the default settings, on recordings of
+Reality that hide one effect. Figures of several machines stand side by side, under `--host`.
 """
 
 from __future__ import annotations

@@ -272,10 +272,10 @@ def page(results: dict[str, Any]) -> str:
     """Return the page."""
     text = """# Contact events: shape sorter
 
-Demonstrations of the stand-in world, one a seed, replayed through a model; see [contact events](../events.md). Beside
+Demonstrations of Reality, one a seed, replayed through a model; see [contact events](../events.md). Beside
 each start of a stage is how much later it comes than in truth: for pick the first contact of a finger and the block,
-for align that of block and box, for insert that of the block with a wall of the hole. The model steps by 5 ms, the
-stand-in world by 1 ms. *Contact overlap*: IoU of the frames in which block and box touch with those of the truth.
+for align that of block and box, for insert that of the block with a wall of the hole. The model steps by 5 ms,
+Reality by 1 ms. *Contact overlap*: IoU of the frames in which block and box touch with those of the truth.
 
 Insert comes when the replayed block slips off the rim, which depends on the geometry and not on how stages are found:
 *block 2 mm below the rim* says how much earlier or later that is in the motion itself.

@@ -166,7 +166,7 @@ def report(args: Args) -> None:
         "# Fit of contact geometry: shape sorter",
         "",
         "Mean block position error over align and insert [mm], from the first contact of block and box to the end,",
-        "against the stand-in world's truth. *fitted*: the demonstration that the fit saw; *unseen*: two others of the",
+        "against Reality's truth. *fitted*: the demonstration that the fit saw; *unseen*: two others of the",
         "same objects. *null*: a model whose block never meets the box. *exact*: the true boxes in place of spheres,",
         "which is as near as a replay of these commands comes: grasp and tracking differ a little between the worlds.",
         "*flat*: the start with its faces flattened, where the fit begins: what this gains comes from no",

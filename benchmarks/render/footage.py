@@ -1,4 +1,4 @@
-"""What the stand-in's cameras saw, for benchmarks of rendering: recorded once, and packed for hosts that cannot.
+"""What Reality's cameras saw, for benchmarks of rendering: recorded once, and packed for hosts that cannot.
 
     python -m benchmarks.render.footage --folder runs/render_gap                       record, on a CPU
     python -m benchmarks.render.footage --folder runs/render_gap --pack runs/packed    and pack

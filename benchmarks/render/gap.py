@@ -1,9 +1,9 @@
-"""How far hybrid images are from the camera's, and what each layer does for that, in the stand-in world.
+"""How far hybrid images are from the camera's, and what each layer does for that, in Reality.
 
     python -m benchmarks.render.gap --out render_gap.jsonl                     # small networks, on a CPU
     python -m benchmarks.render.gap --full --device cuda:0 --train-seconds 540 --out render_gap.jsonl
 
-The stand-in's laboratory plays the real one: other textures, lights, shadows and noise than the simulation's image. It
+Reality's laboratory plays the real one: other textures, lights, shadows and noise than the simulation's image. It
 is filmed without objects to train the networks, and with them on trajectories that training never saw; the objects are
 photographed under the laboratory's lights to fit their splats. What is made is kept in --folder and not made again; a
 training that was cut short goes on. The folder may be a packed one (render_footage.py). A line of JSON for each way of

@@ -1,11 +1,11 @@
-"""Splats fitted to photographs of the stand-in's objects, judged by photographs that were not fitted.
+"""Splats fitted to photographs of Reality's objects, judged by photographs that were not fitted.
 
     python -m benchmarks.render.splat_fit  measure on the CPU; writes the data, the page and the picture
     python -m benchmarks.render.splat_fit --photographs runs/photos --make      only make the photographs of all cases
     python -m benchmarks.render.splat_fit --device cuda:0 --photographs runs/photos --out F.jsonl    the same on a GPU
     python -m benchmarks.render.splat_fit --table                 the page from the stored data, without runs
 
-Block and box of the shape sorter as the stand-in's camera sees them, with their printed pattern, are photographed from
+Block and box of the shape sorter as Reality's camera sees them, with their printed pattern, are photographed from
 all sides without anything around them, three by three rays a pixel; every eighth photograph is held out. `concent
 splat-fit` does the same with a folder of photographs. *Before black* is the peak signal-to-noise ratio of whole images,
 most of which is empty; *object* is that over the pixels that mask or splats cover. With noise, each colour of each

@@ -2,7 +2,7 @@
 
     python -m benchmarks.train.cases --out runs/table1 --processes 8    # 4-6 minutes of a core for each fit
 
-A seed is a demonstration of its own, recorded in the stand-in world, and everything that follows from it. In some cases
+A seed is a demonstration of its own, recorded in Reality, and everything that follows from it. In some cases
 a physical effect is hidden in that world. What is made already is not made again.
 """
 
@@ -33,7 +33,7 @@ from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 
 HIDDEN = "actuator_delay=0.1"
-"""What is hidden in the stand-in world of some cases: commands that act a tenth of a second late. Demonstrations still
+"""What is hidden in Reality of some cases: commands that act a tenth of a second late. Demonstrations still
 succeed under it, policies that do not know of it fail more often."""
 FIT = FitCfg(evolution=EvolutionCfg(population=40), patience=20, least_gain=1e-3)
 """Settings of the fits that the page on Table 1 was made from: more candidates and generations than by default."""
@@ -85,7 +85,7 @@ class Args:
 
 
 def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
-    """Return a demonstration of the stand-in world, with these effects hidden in it."""
+    """Return a demonstration of Reality, with these effects hidden in it."""
     cfg = RealityCfg()
     effects = ()
     if hidden:

@@ -1,9 +1,9 @@
-"""Is it the quicker physics of the training that keeps a policy from succeeding in the stand-in world, or the model?
+"""Is it the quicker physics of the training that keeps a policy from succeeding in Reality, or the model?
 
     python -m benchmarks.train.stuck runs/a/policy runs/b/policy ...    # run folders of one stage, then the page
 
 Each policy is run from the same initial states in the physics that it was trained in, in the model's own (elliptic
-cones, its time step) and in the stand-in world. Then the states in which it failed there are put into both simulations,
+cones, its time step) and in Reality. Then the states in which it failed there are put into both simulations,
 at rest, and it is run on from them for as long as an episode lasts. Nothing is drawn at random between the worlds. Of
 the states in which it got stuck the page tells how far object 1 has turned and slid in the hand, in the median.
 """
@@ -35,7 +35,7 @@ from concent_warp.train.run import TrainingRun
 
 NAME = "train_stuck"
 LOST = 0.05
-"""Distance of a contact pair with the robot at which the block counts as lost [m]; in the stand-in world it is held
+"""Distance of a contact pair with the robot at which the block counts as lost [m]; in Reality it is held
 elsewhere."""
 
 
@@ -131,7 +131,7 @@ def outcomes(environment: Environment, policy: PolicyFunction) -> tuple[np.ndarr
 def page(data: dict[str, dict[str, Any]]) -> str:
     """Return the page."""
     head = [
-        "policy", "episodes", "in the physics of its training", "in the model's own", "in the stand-in world",
+        "policy", "episodes", "in the physics of its training", "in the model's own", "in Reality",
         "stuck there", "turned in the hand", "slid", "from these: in the physics of its training", "in the model's own",
     ]  # fmt: skip
     names = ("episodes", "training", "own", "reality", "stuck")
@@ -146,7 +146,7 @@ def page(data: dict[str, dict[str, Any]]) -> str:
     about = __doc__.split("\n\n")
     first = next(iter(data.values()))
     return "\n\n".join([
-        "# What keeps policies from succeeding in the stand-in world",
+        "# What keeps policies from succeeding in Reality",
         "Written by `benchmarks/train/stuck.py`; do not edit.",
         about[0],
         about[2].strip(),

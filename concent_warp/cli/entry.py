@@ -13,8 +13,8 @@ from concent_warp.run_folder import processes
 from concent_warp.version import __version__
 
 COMMANDS = {
-    "demo": "the main job on a simulated stand-in of the real world, from recording to report",
-    "record": "record demonstrations in the stand-in world",
+    "demo": "the main job in Reality, a simulated world, from recording to report",
+    "record": "record demonstrations in Reality",
     "geometry": "lay contact spheres on the objects of a scene; export a model as MJCF",
     "fit": "fit the contact geometry to a recording; contact events and a report come with it",
     "replay": "replay a recording in a model and save what the model predicts",
@@ -23,7 +23,7 @@ COMMANDS = {
     "locate": "find where a model lacks forces: by joint, and on which place of which object",
     "diagnose": "find which physical effect a model lacks, with the evidence, or why none can be named",
     "train": "train a policy to bring about the contact events of a demonstration",
-    "evaluate": "count how often a trained policy succeeds, in simulation and in the stand-in world",
+    "evaluate": "count how often a trained policy succeeds, in simulation and in Reality",
     "play": "show a trained policy at work, live in the browser",
     "export": "write a trained policy as ONNX or TorchScript",
     "splat-fit": "fit Gaussian splats, the looks of an object, to posed images",

@@ -1,4 +1,4 @@
-"""``concent demo``: the main job where no robot is at hand, with the stand-in of the real world."""
+"""``concent demo``: the main job where no robot is at hand, in Reality, a simulated world."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from concent_warp.simulate.select import EngineName
 
 @dataclass(frozen=True)
 class Arguments:
-    """Record demonstrations of the shape sorter in the stand-in world, fit the contact geometry, extract the contact
+    """Record demonstrations of the shape sorter in Reality, fit the contact geometry, extract the contact
     events, compare, and write a report. The fit starts from the paper's geometry: spheres centred on the surface.
     """
 

@@ -1,4 +1,4 @@
-"""``concent record``: demonstrations of the shape sorter in the stand-in world."""
+"""``concent record``: demonstrations of the shape sorter in Reality."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from concent_warp.scene.robot import RobotCfg
 
 @dataclass(frozen=True)
 class Arguments:
-    """Record demonstrations of the shape sorter, shown by a scripted expert in the stand-in world."""
+    """Record demonstrations of the shape sorter, shown by a scripted expert in Reality."""
 
     out: Path = Path("demo.h5")
     """Recording file to write."""
@@ -37,7 +37,7 @@ class Arguments:
     reality: RealityCfg = field(default_factory=RealityCfg)
 
     def reality_with_robot(self) -> RealityCfg:
-        """Return the settings of the stand-in world with the robot asked for."""
+        """Return the settings of Reality with the robot asked for."""
         if self.robot is None:
             return self.reality
         robot = RobotCfg(self.robot, self.tcp_site, self.gripper_actuators)
