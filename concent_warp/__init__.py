@@ -25,7 +25,10 @@ _HOMES = {
     "diagnosis.cfg": ("DiagnoseCfg",),
     "diagnosis.diagnose": ("diagnose",),
     "diagnosis.forces.locate": ("locate_forces",),
-    "diagnosis.forces.window_forces": ("LocateForcesCfg",),
+    "diagnosis.experiment.cfg": ("SuggestExperimentCfg",),
+    "diagnosis.experiment.suggest": ("suggest_experiment",),
+    "diagnosis.experiment.suggested": ("SuggestedExperiment",),
+    "diagnosis.forces.cfg": ("LocateForcesCfg",),
     "diagnosis.result": ("Diagnosis", "Finding"),
     "effects.effect": ("Effect", "Parameter"),
     "effects.registry": ("effect_class", "effect_classes"),
@@ -70,8 +73,11 @@ if TYPE_CHECKING:
     from concent_warp.deploy.render_dataset import Dataset, render
     from concent_warp.diagnosis.cfg import DiagnoseCfg
     from concent_warp.diagnosis.diagnose import diagnose
+    from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
+    from concent_warp.diagnosis.experiment.suggest import suggest_experiment
+    from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
+    from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
     from concent_warp.diagnosis.forces.locate import locate_forces
-    from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
     from concent_warp.diagnosis.result import Diagnosis, Finding
     from concent_warp.effects.effect import Effect, Parameter
     from concent_warp.effects.registry import effect_class, effect_classes

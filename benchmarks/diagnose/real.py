@@ -36,7 +36,7 @@ from benchmarks.fit.held_out import Spans, by_demonstration, change, cut_spans, 
 from benchmarks.pages import ROOT, machine, read_data, write_data
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.procedure import Procedure, silent
+from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
@@ -191,7 +191,7 @@ def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
     """Diagnose a recording and judge every step, and the decoys on top of the last."""
     title, model, seen, judges = case.title, case.model, case.seen, case.judges
     begin = time.perf_counter()
-    cfg = DiagnoseCfg(additions=ADDITIONS[part], jobs=args.jobs, explain=False)
+    cfg = DiagnoseCfg(max_additions=ADDITIONS[part], jobs=args.jobs, explain=False)
     diagnosis = diagnose(
         model, seen, cfg, out=args.pieces, progress=lambda share, text: progress(title, begin, share, text)
     )
@@ -211,7 +211,7 @@ def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
 
 def contrasted(found: dict[str, Any], case: Case, part: Part) -> dict[str, Any]:
     """Return a study with decoys added to its final model, and for servos with a ladder of effects, fitted anew."""
-    windows = Procedure(case.model, case.seen, DiagnoseCfg(), silent).baseline().windows
+    windows = Procedure(case.model, case.seen, DiagnoseCfg()).baseline().windows
     final = rebuilt(case.model, found)
     held = {a.effect.name for a in final.effects}
     decoys = []

@@ -135,7 +135,7 @@ def run(args: Args, scene: SceneName, seed: int) -> dict[str, Any]:
         "simulated_s": found.simulated,
     }  # fmt: skip
     for way, gradient in (("plain", False), ("led", True)):
-        cfg = DiagnoseCfg(effects=CANDIDATES, additions=1, jobs=1, explain=False, gradient=gradient, seed=seed)
+        cfg = DiagnoseCfg(effects=CANDIDATES, max_additions=1, jobs=1, explain=False, gradient=gradient, seed=seed)
         begun = time.perf_counter()
         with counted() as steps:
             diagnosis = diagnose(model, recording, cfg)

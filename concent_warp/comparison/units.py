@@ -38,3 +38,14 @@ def times(ratio: float) -> str:
 def words(channel: str) -> str:
     """Return a channel's name as words: ``block_position`` is "block position"."""
     return channel.replace("_", " ")
+
+
+def p_value_text(p: float, smallest: float = 0.0) -> str:
+    """Return a p-value as text, such as "p = 0.03", or "p <= 0.0025" at the smallest that its test can give.
+
+    Args:
+        p: The p-value.
+        smallest: 1 / (n + 1) of a test with n random samples; 0 for a test without such a bound.
+    """
+    sign = "<=" if p <= smallest * (1 + 1e-9) else "="
+    return f"p {sign} {p:.2g}"

@@ -1,8 +1,171 @@
-"""Settings of a diagnosis."""
+"""Settings of a diagnosis.
+
+"Empirical" values were set on the scenes of the hidden-effect benchmark (docs/benchmarks/hidden_effects.md).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
+
+
+@dataclass(frozen=True)
+class CheckDataCfg:
+    """Thresholds of the check of a recording's channels."""
+
+    gap_ratio: float = 10.0
+    """Pause between two samples, over the median sampling interval, from which on it is a gap [-]. Empirical."""
+    max_missing_share: float = 0.2
+    """Share of missing samples above which it is reported [-]. Empirical."""
+    white_noise_ratio: float = 0.8
+    """Mean squared step between samples over twice the variance, above which a channel looks like white noise [-]: 1
+    for white noise, near 0 for motion (von Neumann, "Distribution of the ratio of the mean square successive difference
+    to the variance", Ann. Math. Stat. 12, 1941)."""
+    min_samples: int = 30
+    """Samples below which that ratio is not computed: its standard deviation is then about 0.2 under white noise."""
+    max_scatter_ratio: float = 3.0
+    """Standard deviation of a channel over its stated noise up to which it may stand still [-]: 3 sigma."""
+
+
+@dataclass(frozen=True)
+class SearchCfg:
+    """Thresholds of the search for one missing effect.
+
+    "Gain" is the share of the baseline's held-out error that a candidate removes [-]; "noise ratio" is the RMS residual
+    over the noise standard deviation [-].
+    """
+
+    quiet_quantile: float = 0.25
+    """Quantile of the blocks' RMS residuals that bounds an estimated noise from below [-]. Empirical."""
+    quiet_state_iterations: int = 3
+    """Iterations of the initial states in the fit from which that quantile is taken; 12 in other fits. Empirical."""
+    max_state_offset: float = 1.0
+    """Largest fitted error of an initial state, in units of its standard deviation, up to which sensitivities are taken
+    at the fitted states alone and not at the measured ones too: 1 sigma."""
+    min_expected_gain: float = 0.5
+    """Expected gain over the critical one, above which a screened candidate is fitted [-]: linear extrapolation is
+    taken to be right to a factor of 2."""
+    batch_size: int = 3
+    """Candidates fitted before the search decides whether others are worth a fit. The truth is among the first three in
+    most scenes. Empirical."""
+    explained_ratio: float = 1.1
+    """Noise ratio below which a fitted candidate leaves little to others [-]. Empirical."""
+    noise_level_ratio: float = 1.03
+    """Noise ratio below which a fit has reached the noise [-]: about one standard error of it over 1000 samples."""
+    explained_min_gain: float = 0.3
+    """Expected gain over the best one below which a candidate is skipped after `explained_ratio` is reached [-].
+    Empirical."""
+    noise_level_min_gain: float = 0.5
+    """The same after `noise_level_ratio` is reached [-]. Empirical."""
+    restart_min_gain: float = 0.5
+    """Gain over the best one above which a candidate that lags behind an `explained_ratio` fit is restarted from the
+    initial states of the best [-]. Empirical."""
+    polish_min_gain: float = 0.7
+    """Gain over the best one above which a candidate's initial states are fitted again [-]. Empirical."""
+    close_min_gain: float = 0.85
+    """Gain over the best one above which a candidate may equal the best [-]. Empirical."""
+    max_rounds: int = 3
+    """Rounds in which the best candidate and those close to it are refitted. Empirical."""
+    min_cost_fall: float = 0.01
+    """Relative fall of a cost that makes another round, or another refit, worth its time [-]. Empirical."""
+    shooting_window: float = 0.4
+    """Length of the windows of the multiple-shooting initialisation [s]. Empirical: impacts need 0.1-0.3 s, free motion
+    allows more."""
+    shooting_min_gain: float = 0.5
+    """Gain over the best one above which a candidate is initialised by multiple shooting, if no candidate explains the
+    data [-]. Empirical."""
+    shooting_fits: int = 3
+    """Most candidates initialised that way. Empirical."""
+    doubtful_gain: float = 0.4
+    """Best gain below which the baseline is refitted from its rivals' initial states, so that the gain is not owed to
+    those alone [-]. Empirical."""
+    rivals: int = 3
+    """Rivals whose initial states are tried on the baseline. Empirical."""
+    min_fold_share: float = 0.8
+    """Share of the folds in which an accepted effect must gain [-]: 4 of 5."""
+    equal_error: float = 0.02
+    """Relative difference of held-out errors below which candidates count as equal [-]. Empirical."""
+    equal_standard_errors: float = 2.0
+    """Standard errors of that difference below which candidates count as equal: 95 % of a normal distribution."""
+    near_equal_factor: float = 1.25
+    """Factor on both bounds within which candidates are compared by profile likelihood before they are separated [-].
+    Empirical."""
+    profiled: int = 3
+    """Most candidates compared that way. Empirical."""
+
+
+@dataclass(frozen=True)
+class ProfileLikelihoodCfg:
+    """Settings of the profile likelihood of an accepted effect's parameters.
+
+    Costs are half sums of squares in units of the noise; distances are in standard deviations of the linear fit.
+    """
+
+    first_step: float = 2.0
+    """Distance of the first points on each side [standard deviations]: the ends of a 95 % interval."""
+    step_growth: float = 3.0
+    """Factor from one distance to the next [-]. Empirical."""
+    max_extensions: int = 3
+    """Most further distances; the last is then 54 standard deviations away. Empirical."""
+    state_iterations: int = 4
+    """Iterations of the initial states at each point. Empirical."""
+    min_cost_fall: float = 1.0
+    """Fall of the cost at a point that restarts the fit from there [cost]: log likelihood ratio 1."""
+    max_restarts: int = 3
+    """Most restarts. Empirical."""
+    max_step_doublings: int = 4
+    """Most doublings of the distance before a restart, as long as the cost falls. Empirical."""
+    min_rise_over_roughness: float = 4.0
+    """Rise of the cost over its roughness, from which on a parabola can be fitted through it [-]. Empirical."""
+    min_rise: float = 1.0
+    """Rise of the cost that this takes at least [cost]: log likelihood ratio 1."""
+    max_widening: float = 100.0
+    """Largest factor on the linear standard deviation, also where the cost rises nowhere [-]."""
+    roughness_variance: float = 0.5
+    """Variance added for roughness, over the squared distance at which the parabola rises by as much [-]. Empirical."""
+
+
+@dataclass(frozen=True)
+class UnknownForceCfg:
+    """Settings of the test for a force of no known form: radial basis functions over positions or velocities."""
+
+    basis_functions: int = 8
+    """Over the range of a joint's position or velocity. Empirical."""
+    basis_functions_many: int = 5
+    """The same for more than `few_joints` joints, and over the range of a body's speed. Empirical."""
+    few_joints: int = 3
+    """Joints up to which `basis_functions` apply. Empirical."""
+    basis_points: int = 12
+    """Most centres over the positions that a free body visits. Empirical."""
+    min_gain: float = 0.03
+    """Share of the held-out error that the force must remove [-]; it stays near 0.01 on data without one. Empirical."""
+    min_share: float = 0.01
+    """Share of the discrepancy of the first model that the force must explain [-]: the formula of an effect is right to
+    about a tenth, a hundredth in squares."""
+    expected_shares: tuple[float, ...] = (0.02, 0.1, 0.5)
+    """Shares of the error that the prior of the force expects, tried in turn [-]. Empirical."""
+    force_scale: float = 0.1
+    """Typical force on a free body over its weight [-]. Empirical."""
+    lever: float = 0.05
+    """Lever of the typical torque on a free body [m]: half the size of a hand-held object."""
+    percentile: float = 0.5
+    """Percentile of the visited positions or velocities left out at each end [%]: excursions of single samples."""
+
+
+@dataclass(frozen=True)
+class FailureCfg:
+    """Settings of the list of spans and forces in which the model as given fails."""
+
+    max_spans: int = 5
+    """Most spans of time that are listed."""
+    max_forces: int = 3
+    """Most unexplained forces that are listed."""
+    max_seconds: float = 60.0
+    """Longest search for unexplained forces [s]; never longer than the diagnosis itself took."""
+    forces: LocateForcesCfg = field(default_factory=LocateForcesCfg)
+    """Settings of the search for unexplained forces."""
 
 
 @dataclass(frozen=True)
@@ -11,32 +174,45 @@ class DiagnoseCfg:
 
     Example:
         >>> import concent_warp as cw
-        >>> cw.DiagnoseCfg(effects=("joint_friction", "joint_damping"), additions=1).additions
+        >>> cw.DiagnoseCfg(effects=("joint_friction", "joint_damping"), max_additions=1).max_additions
         1
     """
 
-    level: float = 0.05
-    """Probability of naming an effect where nothing is missing."""
-    least_gain: float = 0.05
-    """An effect must take away at least this share of the held-out error: less is seen in long recordings, and means
+    significance_level: float = 0.05
+    """Probability of naming an effect where nothing is missing [-]."""
+    min_gain: float = 0.05
+    """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""
-    survivors: int = 8
-    """Candidates that are fitted, of all that are screened."""
-    additions: int = 3
+    max_fits: int = 8
+    """Most screened candidates that are fitted. Empirical: the truth is among the first eight in nearly all scenes."""
+    max_additions: int = 3
     """Most effects that are added."""
-    adequate: float = 1.25
-    """Residual over noise up to which a model counts as explaining the data."""
-    draws: int = 400
-    """Data sets without an effect that tell what chance reaches."""
+    adequate_ratio: float = 1.25
+    """RMS residual over noise up to which a model explains the data [-]. Empirical."""
+    null_samples: int = 400
+    """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
+    p-value is 1 / (null_samples + 1)."""
     effects: tuple[str, ...] = ()
     """Names of the effects to consider; all where empty."""
     window: float | None = None
     """Length of a window [s]; by default as long as the motion allows."""
     jobs: int = -1
-    """Processes at a time; -1: one a CPU. Others than joblib's own run them with `joblib.parallel_config`."""
+    """Processes at a time; -1: one per CPU. `joblib.parallel_config` selects another backend."""
     seed: int = 0
-    """Seed of all that is drawn."""
+    """Seed of all random numbers."""
     explain: bool = True
-    """Whether to say where the model fails and which experiment would tell more; it takes a while."""
+    """Whether to list where the model fails and to suggest an experiment, which takes additional time."""
     gradient: bool = False
-    """Whether fits of friction, mass and contact stiffness may start from where gradients through Newton lead."""
+    """Whether fits of friction, mass and contact stiffness may start from values found by gradients through Newton."""
+    data: CheckDataCfg = field(default_factory=CheckDataCfg)
+    """Check of the recording."""
+    search: SearchCfg = field(default_factory=SearchCfg)
+    """Search for one missing effect."""
+    profile: ProfileLikelihoodCfg = field(default_factory=ProfileLikelihoodCfg)
+    """Profile likelihood of accepted parameters."""
+    unknown_force: UnknownForceCfg = field(default_factory=UnknownForceCfg)
+    """Test for a force of no known form."""
+    failures: FailureCfg = field(default_factory=FailureCfg)
+    """Where the model as given fails."""
+    experiment: SuggestExperimentCfg = field(default_factory=SuggestExperimentCfg)
+    """The suggested experiment."""

@@ -1,7 +1,7 @@
-"""Finished pieces of a diagnosis in a folder, so that one that was stopped goes on from them.
+"""Results of finished tasks of a diagnosis in a folder, so that an interrupted one continues from them.
 
-Each screened or fitted candidate is one ``.npz`` file of plain arrays and a JSON text, no pickle. Its name is a hash of
-all that the result depends on: recording, model, settings, versions, and which candidate on which model it was.
+Each result is one ``.npz`` file of plain arrays and a JSON text, no pickle. Its name is a hash of all that the result
+depends on: recording, model, settings, versions, the task and its arguments.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.procedure import Procedure, Progress
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint
-from concent_warp.diagnosis.search.steps import Candidate, FittedModel, Screened
+from concent_warp.diagnosis.tasks import Progress, TaskRunner
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import Sums
@@ -31,44 +31,44 @@ from concent_warp.run_folder import make_folder, versions
 from concent_warp.simulate.select import EngineName
 
 T = TypeVar("T")
-KINDS = {kind.__name__: kind for kind in (Screened, Candidate, Fit, Linear, Sums, ProfilePoint)}
-"""What results are made of, besides effects and models."""
+KINDS = {kind.__name__: kind for kind in (ScreenedCandidate, FittedCandidate, Fit, Linear, Sums, ProfilePoint)}
+"""Classes that a result consists of, besides effects and models."""
 
 
-def checkpointed_procedure(
+def checkpointed_runner(
     model: Model, recording: Recording, cfg: DiagnoseCfg, progress: Progress, engine: EngineName, folder: Path
-) -> Procedure:
-    """Return a diagnosis that keeps what is done in a folder; parts of other diagnoses in it are left alone.
+) -> TaskRunner:
+    """Return a runner that keeps the results of a diagnosis's tasks in a folder, beside those of other diagnoses.
 
     Raises:
         ConcentError: The folder cannot be made.
     """
     make_folder(folder)
     key = _fingerprint(model, recording, cfg, versions() | {"engine": engine})
-    return CheckpointedProcedure(model, recording, cfg, progress, folder, key, engine)
+    return CheckpointedRunner(cfg.jobs, progress, model, folder, key)
 
 
-class CheckpointedProcedure(Procedure):
-    """A diagnosis whose finished pieces are kept in a folder."""
+class CheckpointedRunner(TaskRunner):
+    """Runs tasks whose results are not in a folder yet, and keeps them there."""
 
-    def __init__(
-        self,
-        model: Model,
-        recording: Recording,
-        cfg: DiagnoseCfg,
-        progress: Progress,
-        folder: Path,
-        key: str,
-        engine: EngineName = "mujoco",
-    ) -> None:
-        super().__init__(model, recording, cfg, progress, engine)
-        self.folder, self.key = folder, key
+    def __init__(self, jobs: int, progress: Progress, model: Model, folder: Path, key: str) -> None:
+        """Prepare to run tasks.
 
-    def results(self, work: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
-        """Yield results in the tasks' order: those in the folder from there, and others as they are done."""
-        paths = [self.folder / f"{self.piece(work, task)}.npz" for task in tasks]
+        Args:
+            jobs: Processes at a time.
+            progress: Called with the share done and what is being done.
+            model: The diagnosed model, on whose scene and geometry those in results are.
+            folder: Where results are kept.
+            key: Hash of all that every result depends on.
+        """
+        super().__init__(jobs, progress)
+        self.model, self.folder, self.key = model, folder, key
+
+    def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T]:
+        """Yield results in order: those in the folder from there, others as they are known."""
+        paths = [self.folder / f"{self.name(task, each)}.npz" for each in arguments]
         known = {i: found for i, path in enumerate(paths) if (found := _load(path, self.model)) is not None}
-        fresh = iter(super().results(work, [task for i, task in enumerate(tasks) if i not in known]))
+        fresh = iter(super().results(task, [each for i, each in enumerate(arguments) if i not in known]))
         for i, path in enumerate(paths):
             if i in known:
                 yield known[i]
@@ -77,10 +77,10 @@ class CheckpointedProcedure(Procedure):
             _save(path, result)
             yield result
 
-    def piece(self, work: Callable[..., Any], task: Sequence[Any]) -> str:
-        """Return the name of a piece of work: a hash of the diagnosis, the work, and all that it is given."""
-        digest = hashlib.sha256(f"{self.key} {work.__name__}".encode())
-        for item in task:
+    def name(self, task: Callable[..., Any], arguments: Sequence[Any]) -> str:
+        """Return the name of a result: a hash of the diagnosis, the task and its arguments."""
+        digest = hashlib.sha256(f"{self.key} {task.__name__}".encode())
+        for item in arguments:
             _add(digest, item)
         return digest.hexdigest()[:32]
 
@@ -102,7 +102,7 @@ def _fingerprint(model: Model, recording: Recording, cfg: DiagnoseCfg, versions:
 
 
 def _add(digest: Any, item: Any) -> None:
-    """Add a value to a hash; of a node, the model's effects and the initial states."""
+    """Add a value to a hash; of a fitted model its effects, initial states and held-out errors."""
     if isinstance(item, FittedModel):
         _add(digest, [item.model, item.fit.values, list(item.fit.offsets), item.limit, item.errors])
     elif isinstance(item, Model):
@@ -125,9 +125,9 @@ def _add(digest: Any, item: Any) -> None:
 
 
 def _save(path: Path, result: Any) -> None:
-    """Write a result, in one piece or not at all."""
+    """Write a result atomically."""
     arrays: dict[str, np.ndarray] = {}
-    text = json.dumps(_taken_apart(result, arrays))
+    text = json.dumps(_to_tree(result, arrays))
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with partial.open("wb") as file:
         np.savez(file, tree=np.array(text), **arrays)  # pyright: ignore[reportArgumentType]
@@ -135,18 +135,18 @@ def _save(path: Path, result: Any) -> None:
 
 
 def _load(path: Path, base: Model) -> Any:
-    """Return a result that was written, None where there is none or it is damaged."""
+    """Return a result from its file, None where there is none or it is damaged."""
     if not path.is_file():
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            return _put_together(json.loads(str(file["tree"])), file, base)
+            return _from_tree(json.loads(str(file["tree"])), file, base)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def _taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a value as JSON holds it, its arrays aside."""
+def _to_tree(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """Return a value as a JSON tree; its arrays are put into `arrays`."""
     if isinstance(value, np.ndarray):
         name = f"a{len(arrays)}"
         arrays[name] = value
@@ -154,27 +154,27 @@ def _taken_apart(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, Effect):
         return {"effect": value.name, "target": list(value.target)}
     if isinstance(value, Model):
-        return {"model": [_taken_apart(a, arrays) for a in value.effects]}
+        return {"model": [_to_tree(a, arrays) for a in value.effects]}
     if isinstance(value, AddedEffect):
-        return {"added": _taken_apart(value.effect, arrays), "values": list(value.values)}
+        return {"added": _to_tree(value.effect, arrays), "values": list(value.values)}
     if type(value).__name__ in KINDS:
         return {
             "kind": type(value).__name__,
-            "fields": {f.name: _taken_apart(getattr(value, f.name), arrays) for f in fields(value)},
+            "fields": {f.name: _to_tree(getattr(value, f.name), arrays) for f in fields(value)},
         }
     if isinstance(value, tuple | list):
-        return [_taken_apart(item, arrays) for item in value]
+        return [_to_tree(item, arrays) for item in value]
     if isinstance(value, np.generic):
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    raise TypeError(f"no way to keep a {type(value).__name__}")
+    raise TypeError(f"a {type(value).__name__} cannot be kept in a file")
 
 
-def _put_together(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> Any:
-    """Return what `_taken_apart` was given; models are on the scene and the geometry of `base`."""
+def _from_tree(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> Any:
+    """Return the value of a tree of `_to_tree`; models are on the scene and the geometry of `base`."""
     if isinstance(tree, list):
-        return tuple(_put_together(item, arrays, base) for item in tree)
+        return tuple(_from_tree(item, arrays, base) for item in tree)
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
@@ -182,8 +182,8 @@ def _put_together(tree: Any, arrays: Mapping[str, np.ndarray], base: Model) -> A
     if "effect" in tree:
         return effect_class(tree["effect"])(*tree["target"])
     if "model" in tree:
-        return replace(base, effects=tuple(_put_together(item, arrays, base) for item in tree["model"]))
+        return replace(base, effects=tuple(_from_tree(item, arrays, base) for item in tree["model"]))
     if "added" in tree:
-        return AddedEffect(_put_together(tree["added"], arrays, base), tuple(tree["values"]))
-    parts = {name: _put_together(item, arrays, base) for name, item in tree["fields"].items()}
+        return AddedEffect(_from_tree(tree["added"], arrays, base), tuple(tree["values"]))
+    parts = {name: _from_tree(item, arrays, base) for name, item in tree["fields"].items()}
     return KINDS[tree["kind"]](**parts)

@@ -6,13 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.checkpoint import checkpointed_procedure
-from concent_warp.diagnosis.procedure import Procedure, Progress, silent
+from concent_warp.diagnosis.checkpoint import checkpointed_runner
+from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.tasks import Progress, TaskRunner, silent
+from concent_warp.files import write_json
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import versions
 from concent_warp.simulate.select import EngineName
+
+EXPERIMENT_FILE = "next_experiment.json"
+"""File of the suggested experiment in the output folder."""
 
 
 def diagnose(
@@ -24,19 +29,20 @@ def diagnose(
     out: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Find which physical effect a model lacks to follow a recording, or why none can be named.
+    """Return which physical effect a model lacks to follow a recording, or why none can be named.
 
     Args:
-        model: The model; the parameters of the effects that it has are fitted too.
+        model: The model; the parameters of its effects are fitted too.
         recording: What was commanded and measured.
         cfg: Settings.
         engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device; C MuJoCo is the faster one for
             the many short simulations of a diagnosis.
-        out: Folder in which finished parts are kept: the same call continues from there after an interruption.
+        out: Folder for finished tasks, from which the same call continues after an interruption, and for the suggested
+            experiment with its arrays, ``next_experiment.json``.
         progress: Called with the share done, 0..1, and what is being done.
 
     Raises:
-        RecordingError: The recording says too little, or does not fit the model.
+        RecordingError: The recording has too few readings, or does not match the model.
         ModelError: The model diverges on all of the recording.
         EngineError: The model cannot be simulated.
 
@@ -51,7 +57,10 @@ def diagnose(
     model.check_recording(recording)
     cfg, progress = cfg or DiagnoseCfg(), progress or silent
     if out is None:
-        procedure = Procedure(model, recording, cfg, progress, engine)
+        runner = TaskRunner(cfg.jobs, progress)
     else:
-        procedure = checkpointed_procedure(model, recording, cfg, progress, engine, Path(out))
-    return replace(procedure.run(), versions=versions())
+        runner = checkpointed_runner(model, recording, cfg, progress, engine, Path(out))
+    found = replace(Procedure(model, recording, cfg, runner, engine).run(), versions=versions())
+    if out is not None and found.next_experiment is not None:
+        write_json(Path(out) / EXPERIMENT_FILE, found.next_experiment.to_json())
+    return found

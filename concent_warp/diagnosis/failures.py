@@ -1,9 +1,9 @@
-"""Where a diagnosed model fails: the worst places of its replay, and forces that it lacks."""
+"""Where a diagnosed model fails: the spans of its replay with the largest errors, and unexplained forces."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import TimeoutError as TooLong
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
 from concent_warp.comparison.worst_spans import WorstSpan, alike
+from concent_warp.diagnosis.cfg import FailureCfg
 from concent_warp.diagnosis.forces.describe import body_sentence, joint_sentence
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
@@ -25,48 +26,44 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 
-MOST_PLACES = 5
-"""Places that are named."""
-MOST_FORCES = 3
-"""Forces that are named."""
 
-
-def where(
+def locate_failures(
     model: Model,
     recording: Recording,
-    engine: EngineName = "mujoco",
+    cfg: FailureCfg | None = None,
     *,
+    engine: EngineName = "mujoco",
     windows: Sequence[Window] = (),
     offsets: Sequence[np.ndarray] = (),
-    seconds: float = 0.0,
 ) -> list[dict[str, Any]]:
-    """Return where a model is farthest off, then where it lacks forces.
+    """Return the spans of time in which a model's error is largest, then the forces that it lacks.
 
-    A place has `demonstration`, `channel`, `phase`, `start`, `end` [s], `body`, `direction`, `ratio` (error over noise)
-    and `sentence`; a force the same, with the joint's name as `channel`, `ratio` (force over what noise leaves of it),
-    and without a time. What does not apply is None.
+    A span has `demonstration`, `channel`, `phase`, `start`, `end` [s], `body`, `direction`, `ratio` (RMS error over
+    noise) and `sentence`; a force the same, with the joint's name as `channel`, `ratio` (RMS force over what noise
+    leaves of it), and without a time. What does not apply is None.
 
     Args:
         model: The model.
         recording: What was commanded and measured.
+        cfg: Settings; forces are left out where they take longer than `max_seconds`, or fail.
         engine: Which engine simulates.
-        windows: Windows whose initial states were fitted; replays start where those of time 0 do.
-        offsets: Errors of the windows' initial states in units of their spread, one (2 nv,) a window.
-        seconds: Longest that the search for forces may take; they are left out where it takes longer or fails.
+        windows: Windows whose initial states were fitted; replays start from those at time 0.
+        offsets: Errors of the windows' initial states in units of their standard deviation, one (2 nv,) a window.
     """
+    cfg = cfg or FailureCfg()
     started = _with_starts(model, recording, windows, offsets)
     try:
-        found = compare_replays({"model": model}, started, engine).places
+        spans = compare_replays({"model": model}, started, engine).places
     except ConcentError:
-        found = ()
-    kept: dict[tuple, WorstSpan] = {}
-    for place in found:
-        kept.setdefault(alike(place), place)
+        spans = ()
+    distinct: dict[tuple, WorstSpan] = {}
+    for span in spans:
+        distinct.setdefault(alike(span), span)
     several = len(recording.demonstrations) > 1
-    said = [_place_entry(p, several) for p in list(kept.values())[:MOST_PLACES]]
-    if seconds > 0 and (location := _located(model, recording, engine, seconds)) is not None:
-        said += _force_entries(location)[:MOST_FORCES]
-    return finite(said)
+    found = [_span_entry(span, several) for span in list(distinct.values())[: cfg.max_spans]]
+    if cfg.max_seconds > 0 and (forces := _unexplained_forces(model, recording, engine, cfg)) is not None:
+        found += _force_entries(forces)[: cfg.max_forces]
+    return finite(found)
 
 
 def _with_starts(
@@ -88,23 +85,25 @@ def _with_starts(
     return replace(recording, demonstrations=tuple(moved))
 
 
-def _place_entry(place: WorstSpan, several: bool) -> dict[str, Any]:
-    """Return a place of the error; the sentence names the demonstration where there are `several`."""
+def _span_entry(span: WorstSpan, several: bool) -> dict[str, Any]:
+    """Return the entry of a span; the sentence names the demonstration where there are `several`."""
     return {
-        "demonstration": place.demonstration,
-        "channel": place.channels[0],
-        "phase": place.phase,
-        "start": place.start,
-        "end": place.end,
-        "body": place.body,
-        "direction": place.direction or None,
-        "ratio": place.ratio,
-        "sentence": place.sentence(demonstration=several),
+        "demonstration": span.demonstration,
+        "channel": span.channels[0],
+        "phase": span.phase,
+        "start": span.start,
+        "end": span.end,
+        "body": span.body,
+        "direction": span.direction or None,
+        "ratio": span.ratio,
+        "sentence": span.sentence(demonstration=several),
     }
 
 
-def _located(model: Model, recording: Recording, engine: EngineName, seconds: float) -> UnexplainedForces | None:
-    """Return where forces are missing, None where that cannot be told or takes longer than `seconds`.
+def _unexplained_forces(
+    model: Model, recording: Recording, engine: EngineName, cfg: FailureCfg
+) -> UnexplainedForces | None:
+    """Return the forces that a model lacks, None where they cannot be estimated or take too long.
 
     In a process of its own, so that it can be stopped.
     """
@@ -112,23 +111,23 @@ def _located(model: Model, recording: Recording, engine: EngineName, seconds: fl
 
     pool = ProcessPoolExecutor(max_workers=1)
     try:
-        return pool.submit(locate_forces, model, recording, engine=engine).result(timeout=seconds)
-    except (ConcentError, BrokenProcessPool, TooLong, ValueError, np.linalg.LinAlgError, mujoco.FatalError):
+        return pool.submit(locate_forces, model, recording, cfg.forces, engine=engine).result(cfg.max_seconds)
+    except (ConcentError, BrokenProcessPool, FutureTimeoutError, ValueError, np.linalg.LinAlgError, mujoco.FatalError):
         return None
     finally:
         pool.shutdown(wait=False, kill_workers=True)
 
 
-def _force_entries(location: UnexplainedForces) -> list[dict[str, Any]]:
-    """Return the forces that stand out, those farthest above noise first."""
+def _force_entries(forces: UnexplainedForces) -> list[dict[str, Any]]:
+    """Return the significant forces, those farthest above noise first."""
     blank = dict.fromkeys(("demonstration", "channel", "phase", "start", "end", "body", "direction"))
     found = []
-    for joint in location.joints:
+    for joint in forces.joints:
         if joint.significant:
             found.append({**blank, "channel": joint.joint, "ratio": joint.ratio, "sentence": joint_sentence(joint)})
-    for body in location.bodies:
+    for body in forces.bodies:
         for phase in body.phases:
             if phase.significant:
-                said = {"body": body.body, "phase": phase.phase, "ratio": body.ratio}
-                found.append({**blank, **said, "sentence": body_sentence(body.body, phase)})
+                entry = {"body": body.body, "phase": phase.phase, "ratio": body.ratio}
+                found.append({**blank, **entry, "sentence": body_sentence(body.body, phase)})
     return sorted(found, key=lambda entry: -entry["ratio"])

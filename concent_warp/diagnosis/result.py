@@ -1,4 +1,4 @@
-"""What a diagnosis answers: which effect is missing, how sure that is, where it shows, or why none can be named."""
+"""The result of a diagnosis: which effect is missing with its evidence, or why none can be named."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from concent_warp.comparison.units import p_value_text
+from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment
+from concent_warp.diagnosis.result_html import diagnosis_html
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
 Verdict = Literal["effect", "group", "none_needed", "none_of_these"]
 VERDICTS: dict[Verdict, str] = {
-    "effect": "an effect is missing, and the data say which",
-    "group": "an effect is missing; the data cannot tell which of a few",
+    "effect": "an effect is missing, and the data identify it",
+    "group": "an effect is missing; the data cannot distinguish between a few",
     "none_needed": "no discrepancy detected",
     "none_of_these": "something is missing that no effect in the library explains",
 }
@@ -39,22 +42,29 @@ class Finding:
     family: str
     parameters: tuple[FittedParameter, ...]
     gain: float
-    """Share of the held-out error that it takes away [-]."""
+    """Share of the held-out error that it removes [-]."""
     low: float
     """Lower end of the 95 % interval of the gain."""
     high: float
     """Upper end."""
     p: float
-    """Probability that the best of all candidates gains as much where nothing is missing."""
+    """Probability that the best of all candidates gains as much where nothing is missing [-]."""
     sign_p: float
-    """Probability of a gain of this size if the sign of each block's gain were chance; of this effect alone."""
+    """p-value of this effect's gain alone, by sign flips of the blocks' gains [-]."""
     accepted: bool
     step: int
-    """Which addition it is a candidate for: 0 the first, 1 the second after the first was added."""
+    """Index of the addition that it is a candidate for."""
     removes: tuple[tuple[str, float], ...]
-    """Channels whose residual falls, with the share of the channel's squared residual that goes, most first."""
+    """Channels whose residual falls, with the fall as a share of the squared residual [-], largest first."""
     reason: str = ""
     """Why it was not accepted, where it was not."""
+    smallest_p: float = 0.0
+    """Smallest `p` that the null distribution can give [-]."""
+
+    @property
+    def p_text(self) -> str:
+        """`p` as text: "p = 0.03", or "p <= 0.0025" at the smallest that the null distribution can give."""
+        return p_value_text(self.p, self.smallest_p)
 
     def to_json(self) -> dict[str, Any]:
         """Return the finding in plain types."""
@@ -74,6 +84,7 @@ class Finding:
             ],
             "gain": {"value": self.gain, "interval": [self.low, self.high]},
             "p": self.p,
+            "p_smallest": self.smallest_p,
             "p_sign_flip": self.sign_p,
             "accepted": self.accepted,
             "step": self.step,
@@ -84,23 +95,23 @@ class Finding:
 
 @dataclass(frozen=True)
 class UnknownForceFound:
-    """What a force of no known form explains of what the last model leaves."""
+    """A force of no known form that explains part of the last model's residual."""
 
     words: str
-    """What it acts on and depends on."""
+    """The coordinate or body that it acts on, and what it depends on."""
     gain: float
-    """Share of the held-out error that it takes away."""
+    """Share of the held-out error that it removes [-]."""
     p: float
-    """Probability that the best of such forces gains as much where nothing is missing."""
+    """Probability that the best of such forces gains as much where nothing is missing [-]."""
     share: float
-    """What it takes away, more than an effect does, of all that the first model left beyond the noise."""
+    """Share of the discrepancy of the model as given that it explains, beyond what an effect does [-]."""
     instead: float | None = None
-    """Share of the held-out error that the effect takes away that was added where the force explains more; None where
-    it is what the last model leaves."""
+    """Share of the held-out error that the effect removes which was added instead [-]; None where the force acts beside
+    all effects."""
 
     @property
     def sentence(self) -> str:
-        """What was seen, in words."""
+        """A sentence on what the force explains."""
         words, gain = f"{self.words[0].upper()}{self.words[1:]}", 100 * self.gain
         if self.instead is None:
             return f"{words} explains another {gain:.0f} % of the error."
@@ -108,18 +119,18 @@ class UnknownForceFound:
         return f"{words} explains {gain:.0f} % of an error of which {added}."
 
     def to_json(self) -> dict[str, Any]:
-        """Return it in plain types."""
+        """Return the force in plain types."""
         return {"words": self.words, "gain": self.gain, "p": self.p, "share": self.share, "instead": self.instead}
 
 
 @dataclass(frozen=True)
 class Detectable:
-    """The smallest size of an effect that this recording would have shown."""
+    """The smallest size of an effect that this recording would reveal."""
 
     name: str
     parameter: str
     size: float
-    """Difference from the null value."""
+    """Difference from the null value, in `unit`."""
     unit: str
 
 
@@ -138,29 +149,31 @@ class Diagnosis:
 
     verdict: Verdict
     effects: tuple[Finding, ...]
-    """What was accepted, then what else was fitted, best first."""
+    """Accepted effects, then rejected ones, best first."""
     groups: tuple[tuple[str, ...], ...]
-    """Names that the data cannot tell apart, one tuple an addition; the likeliest first."""
+    """Names that the data cannot distinguish, one tuple an addition; the likeliest first."""
     where: tuple[Mapping[str, Any], ...]
-    """Where the model that was given is farthest off: channel, phase, start and end [s], body, direction, ratio."""
+    """Where the model as given fails: channel, phase, start and end [s], body, direction, ratio, sentence."""
     unexplained: float
-    """Share of the squared residual beyond the noise that the final model leaves, of that of the first."""
+    """Squared residual of the final model beyond the noise, over that of the model as given [-]."""
     ratio: tuple[float, ...]
-    """Residual over noise of the model as given, and after each addition."""
+    """RMS residual over noise of the model as given and after each addition [-]."""
     detectable: tuple[Detectable, ...]
-    next_experiment: str | None
+    """Smallest size of each effect that this recording would reveal."""
+    next_experiment: SuggestedExperiment | None
+    """Motion that would distinguish the effects of the first group; None where there is no such group."""
     issues: tuple[str, ...]
-    """What is wrong or doubtful with the data themselves."""
+    """Sentences on what is wrong or doubtful with the data themselves."""
     models: tuple[Model, ...] = field(repr=False)
     """The model as given, its own parameters fitted, and after each addition."""
     versions: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
     unknown_force: UnknownForceFound | None = None
-    """A force of no known form that explains part of what the last model leaves; None where there is none."""
+    """A force of no known form that explains part of the last model's residual; None where there is none."""
 
     @property
     def model(self) -> Model:
-        """The model with all that was accepted."""
+        """The model with all accepted effects."""
         return self.models[-1]
 
     @property
@@ -170,9 +183,9 @@ class Diagnosis:
 
     @property
     def headline(self) -> str:
-        """The verdict in words; where effects were accepted and more is left, it says both, not that they are right."""
+        """The verdict in words; where effects were accepted and a discrepancy is left, it says both."""
         if self.verdict == "none_of_these" and self.accepted:
-            return "the library explains a part; something is missing that no effect in it explains"
+            return "the library explains a part; something is missing that none of its effects explains"
         return VERDICTS[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
@@ -189,20 +202,25 @@ class Diagnosis:
                 {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
                 for d in self.detectable
             ],
-            "next_experiment": self.next_experiment,
+            "next_experiment": None if self.next_experiment is None else self.next_experiment.summary(),
             "issues": list(self.issues),
             "versions": dict(self.versions),
             "seed": self.seed,
         }
 
+    def _repr_html_(self) -> str:
+        """Return the verdict and the accepted effects as HTML, for notebooks."""
+        headline = f"{self.headline[0].upper()}{self.headline[1:]}"
+        return diagnosis_html(headline, [row for f in self.accepted for row in _table_rows(f)], self.sentences())
+
     def sentences(self) -> list[str]:
-        """Return the answer in words."""
+        """Return the result in sentences."""
         said = []
         if self.verdict == "none_needed":
             said.append(f"No discrepancy detected: residuals are {self.ratio[-1]:.2f} x noise.")
             if self.detectable:
                 shown = "; ".join(f"{d.name} {d.size:.2g} {d.unit}" for d in self.detectable[:6])
-                said.append(f"Smallest that would have been seen: {shown}.")
+                said.append(f"Smallest detectable sizes: {shown}.")
         for k, finding in enumerate(self.accepted):
             group = self.groups[k] if k < len(self.groups) else (finding.name,)
             values = ", ".join(
@@ -211,10 +229,10 @@ class Diagnosis:
             lead = "Missing" if k == 0 else "Then missing"
             said.append(
                 f"{lead}: {finding.name} ({values}). Held-out error falls by {100 * finding.gain:.0f} % "
-                f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], p {finding.p:.2g}."
+                f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
             )
             if len(group) > 1:
-                said.append(f"The data cannot tell it from {_joined(group[1:])}.")
+                said.append(f"The data cannot distinguish it from {_joined(group[1:])}.")
         if self.verdict == "none_of_these":
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
@@ -222,8 +240,25 @@ class Diagnosis:
         if self.unknown_force is not None:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:
-            said.append(f"Next: {self.next_experiment}")
+            said.append(f"Next experiment: {self.next_experiment.sentence}")
         return [*self.issues, *said]
+
+
+def _table_rows(finding: Finding) -> list[tuple[str, ...]]:
+    """Return a row of the HTML table for each parameter; effect, gain and p-value stand in the first."""
+    gain = f"{100 * finding.gain:.0f} % [{100 * finding.low:.0f}, {100 * finding.high:.0f}]"
+    return [
+        (
+            finding.name if k == 0 else "",
+            p.name,
+            f"{p.value:.3g}",
+            f"{p.low:.3g} to {p.high:.3g}",
+            p.unit,
+            gain if k == 0 else "",
+            finding.p_text if k == 0 else "",
+        )
+        for k, p in enumerate(finding.parameters)
+    ]
 
 
 def _number(value: float) -> float | None:

@@ -52,7 +52,7 @@ def angle():
 def test_the_verdict_is_said_in_sentences_with_a_table(swing, capsys):
     assert diagnose(swing / "demo.h5", "--model", str(swing / "scene.xml")) == 0
     said = capsys.readouterr().out
-    assert "An effect is missing, and the data say which" in said
+    assert "An effect is missing, and the data identify it" in said
     assert "Missing: joint_damping (damping[hinge] 0.0" in said
     assert "Where the model as given fails" in said
     assert "accepted" in said
@@ -84,7 +84,7 @@ def test_where_nothing_is_missing_nothing_is_saved(swing, tmp_path, capsys):
     assert diagnose(swing / "null.h5", "--apply", str(out)) == 0
     said = capsys.readouterr().out
     assert "No discrepancy detected" in said
-    assert "Smallest that would have been seen" in said
+    assert "Smallest detectable sizes" in said
     assert "was not written" in said
     assert not out.exists()
 
@@ -98,21 +98,21 @@ def test_a_report_shows_the_diagnosis_before_and_after(swing, tmp_path):
 
 
 def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, capsys, monkeypatch):
-    from concent_warp.diagnosis.checkpoint import CheckpointedProcedure
+    from concent_warp.diagnosis.search.fit_promising import CandidateFits
 
-    finish = CheckpointedProcedure.fitted
+    finish = CandidateFits.fit
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(CheckpointedProcedure, "fitted", interrupted)
+    monkeypatch.setattr(CandidateFits, "fit", interrupted)
     arguments = ["--out", str(tmp_path / "kept")]
     assert diagnose(swing / "demo.h5", *arguments) == 130
     error = capsys.readouterr().err
     assert f"continue with: concent diagnose {swing / 'demo.h5'}" in error
     assert "Traceback" not in error
     assert list((tmp_path / "kept").glob("*.npz"))
-    monkeypatch.setattr(CheckpointedProcedure, "fitted", finish)
+    monkeypatch.setattr(CandidateFits, "fit", finish)
     assert diagnose(swing / "demo.h5", *arguments) == 0
     assert "Missing: joint_damping" in capsys.readouterr().out
 

@@ -46,7 +46,7 @@ def test_clean_data_are_not_remarked_on():
         (lost, "demo_0, angle: 42 % of the samples are missing."),
         (stuck, "demo_0, angle: the reading never changes."),
         (scattered, "demo_0, angle: the readings scatter like noise, no motion shows in them."),
-        (alone, "demo_0, angle: only 1 sample, which says nothing."),
+        (alone, "demo_0, angle: only 1 sample, which carries no information."),
     ],
 )
 def test_what_looks_wrong_is_said_with_where_it_is(change, words):

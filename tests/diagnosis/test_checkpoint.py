@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure
-from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis import tasks as task_module
+from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg
 from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.search.steps import Screened
+from concent_warp.diagnosis.search.candidate import ScreenedCandidate
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
 from tests.diagnosis.same_results import assert_same
@@ -30,13 +31,14 @@ def done(recording, tmp_path_factory):
 def counted(monkeypatch):
     """Count the pieces of work that are done and not read."""
     tasks = []
-    run_all = procedure._run_all
+    run_tasks = task_module.run_tasks
 
     def watched(work, given, jobs):
         tasks.extend(work.__name__ for _ in given)
-        return run_all(work, given, jobs)
+        return run_tasks(work, given, jobs)
 
-    monkeypatch.setattr(procedure, "_run_all", watched)
+    monkeypatch.setattr(task_module, "run_tasks", watched)
+    monkeypatch.setattr(procedure, "run_tasks", watched)
     return tasks
 
 
@@ -78,12 +80,14 @@ def test_damaged_pieces_are_done_again(recording, done, monkeypatch):
     assert_same(again.to_json(), first.to_json())
 
 
-@pytest.mark.parametrize("other", ["seed", "data", "model"])
+@pytest.mark.parametrize("other", ["seed", "threshold", "data", "model"])
 def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monkeypatch):
     folder, _ = done
     cfg, model, used = CFG, drawing(recording), recording
     if other == "seed":
         cfg = replace(CFG, seed=1)
+    elif other == "threshold":
+        cfg = replace(CFG, profile=ProfileLikelihoodCfg(max_restarts=2))
     elif other == "data":
         used = swung(seconds=1.0, seed=1)
     else:
@@ -97,11 +101,11 @@ def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monke
 
 def test_what_is_kept_comes_back_as_it_was(recording, tmp_path):
     effect = effect_class("joint_damping")("hinge")
-    kept = Screened(effect, 0.5, float("-inf"), np.array([1.0, np.inf]), (), 2.5)
+    kept = ScreenedCandidate(effect, 0.5, float("-inf"), np.array([1.0, np.inf]), (), measured=True)
     _save(tmp_path / "a.npz", kept)
     found = _load(tmp_path / "a.npz", drawing(recording))
     assert (found.effect.name, found.effect.target) == ("joint_damping", ("hinge",))
-    assert (found.gain, found.scanned, found.pieces, found.simulated) == (0.5, float("-inf"), (), 2.5)
+    assert (found.linear_gain, found.scanned_gain, found.pieces, found.measured) == (0.5, float("-inf"), (), True)
     assert found.start.tolist() == [1.0, np.inf]
     assert _load(tmp_path / "b.npz", drawing(recording)) is None
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]

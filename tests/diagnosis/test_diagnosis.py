@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment, SuggestedMotion, TimeSeries
 from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, _joined, _number
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
@@ -11,13 +12,17 @@ from concent_warp.scene.scene import Scene
 from tests.scenes.swinging import swing_scene
 
 FRICTION = FittedParameter("torque[hinge]", 0.03, 0.029, 0.031, "N m", 0.0)
+EXPERIMENT = SuggestedExperiment(
+    "chirp", "swing faster: a and b then differ by 4.0 x noise (angle).", 4.0, ("a", "b"), "angle", {("a", "b"): 4.0},
+    SuggestedMotion(1.0, {"servo": TimeSeries(np.arange(2.0), np.arange(2.0), "rad")}, {}, {}), {},
+)  # fmt: skip
 LIMIT = FittedParameter("limit", 2.0, 1.9, np.inf, "N m", np.inf)
 
 
-def finding(name, gain, *, accepted=True, step=0, reason="", parameters=(FRICTION,)):
+def finding(name, gain, *, accepted=True, step=0, reason="", parameters=(FRICTION,), p=0.01):
     return Finding(
-        name, ("hinge",), "joints", parameters, gain, gain - 0.1, gain + 0.1, 0.01, 0.002, accepted, step,
-        (("angle", 0.9),), reason,
+        name, ("hinge",), "joints", parameters, gain, gain - 0.1, gain + 0.1, p, 0.002, accepted, step,
+        (("angle", 0.9),), reason, 1 / 401,
     )  # fmt: skip
 
 
@@ -42,13 +47,13 @@ def test_an_effect_is_named_with_value_interval_gain_and_chance():
     (sentence,) = diagnosis().sentences()
     assert sentence == (
         "Missing: joint_friction (torque[hinge] 0.03 [0.029, 0.031] N m). "
-        "Held-out error falls by 80 % [70, 90], p 0.01."
+        "Held-out error falls by 80 % [70, 90], p = 0.01."
     )
 
 
-def test_effects_that_cannot_be_told_apart_are_named_together():
+def test_indistinguishable_effects_are_named_together():
     found = diagnosis(verdict="group", groups=(("joint_friction", "joint_damping", "backlash"),))
-    assert found.sentences()[1] == "The data cannot tell it from joint_damping or backlash."
+    assert found.sentences()[1] == "The data cannot distinguish it from joint_damping or backlash."
 
 
 def test_a_second_effect_follows_the_first():
@@ -65,16 +70,16 @@ def test_nothing_found_comes_with_what_would_have_been_seen():
 
 
 def test_what_no_effect_explains_is_said_with_its_share():
-    said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment="swing faster").sentences()
+    said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment=EXPERIMENT).sentences()
     assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
-    assert said[-1] == "Next: swing faster"
+    assert said[-1] == "Next experiment: swing faster: a and b then differ by 4.0 x noise (angle)."
 
 
 def test_the_headline_tells_of_effects_beside_what_none_explains():
     assert diagnosis().headline == VERDICTS["effect"]
     assert diagnosis(verdict="none_of_these", effects=()).headline == VERDICTS["none_of_these"]
     partly = diagnosis(verdict="none_of_these").headline
-    assert partly == "the library explains a part; something is missing that no effect in it explains"
+    assert partly == "the library explains a part; something is missing that none of its effects explains"
 
 
 def test_doubts_about_the_data_come_first():
@@ -90,6 +95,30 @@ def test_json_holds_plain_types_and_no_infinity():
     assert document["effects"][0]["removes"] == [{"channel": "angle", "share": 0.9}]
     assert document["versions"] == {"concent": "1"}
     assert "reason" not in document["effects"][0]
+
+
+def test_the_smallest_p_value_of_the_test_is_shown_as_a_bound():
+    assert finding("joint_friction", 0.8, p=1 / 401).p_text == "p <= 0.0025"
+    assert finding("joint_friction", 0.8, p=2 / 401).p_text == "p = 0.005"
+    smallest = diagnosis(effects=(finding("joint_friction", 0.8, p=1 / 401),))
+    assert smallest.sentences()[0].endswith("p <= 0.0025.")
+
+
+def test_json_has_the_experiment_without_its_arrays():
+    found = diagnosis(next_experiment=EXPERIMENT).to_json()["next_experiment"]
+    assert found["separations"] == [{"pair": ["a", "b"], "separation": 4.0}]
+    assert "motion" not in found
+    motion = json.loads(json.dumps(EXPERIMENT.to_json()))["motion"]
+    assert motion["commands"]["servo"] == {"time": [0.0, 1.0], "value": [0.0, 1.0], "unit": "rad"}
+
+
+def test_html_shows_verdict_and_accepted_effects_and_escapes_them():
+    shown = diagnosis(effects=(finding("<joint>", 0.8, p=1 / 401),), groups=(("<joint>",),))._repr_html_()
+    assert shown.startswith("<div><p><b>An effect is missing, and the data identify it</b></p><table>")
+    for cell in ("&lt;joint&gt;", "0.03", "0.029 to 0.031", "N m", "80 % [70, 90]", "p &lt;= 0.0025"):
+        assert f"<td>{cell}</td>" in shown
+    assert "<joint>" not in shown
+    assert "<table>" not in diagnosis(verdict="none_needed", effects=())._repr_html_()
 
 
 def test_every_verdict_has_words():

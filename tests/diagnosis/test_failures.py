@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import failures as module
-from concent_warp.diagnosis.failures import _located, _with_starts, where
+from concent_warp.diagnosis.cfg import FailureCfg
+from concent_warp.diagnosis.failures import _unexplained_forces, _with_starts, locate_failures
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observe import observe
@@ -25,6 +26,7 @@ XML = """
 """
 TIME = np.arange(0, 2, 0.01)
 NOISE = 1e-4
+NO_FORCES = FailureCfg(max_seconds=0.0)
 
 
 def recorded(damping: float, start: float = 0.0) -> Recording:
@@ -49,8 +51,8 @@ def model() -> Model:
     return Model(Scene(XML.format(damping=0.5)))
 
 
-def test_places_of_a_wrong_model_name_channel_time_and_size():
-    found = where(model(), recorded(3.0))
+def test_spans_of_a_wrong_model_name_channel_time_and_size():
+    found = locate_failures(model(), recorded(3.0), NO_FORCES)
     assert 1 <= len(found) <= 5
     worst = found[0]
     assert (worst["channel"], worst["body"]) == ("rail_position", "cart")
@@ -59,13 +61,13 @@ def test_places_of_a_wrong_model_name_channel_time_and_size():
     assert "x noise" in worst["sentence"]
 
 
-def test_right_model_has_no_place():
-    assert where(model(), recorded(0.5)) == []
+def test_right_model_has_no_span():
+    assert locate_failures(model(), recorded(0.5), NO_FORCES) == []
 
 
-def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "_located", lambda *args: locate_forces(*args[:2], engine=args[2]))
-    found = where(model(), recorded(3.0), seconds=60)
+def test_missing_force_is_named_after_the_spans(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "_unexplained_forces", lambda *args: locate_forces(*args[:2], engine=args[2]))
+    found = locate_failures(model(), recorded(3.0))
     assert found[0]["start"] is not None
     assert found[-1]["channel"] == "rail"
     assert found[-1]["start"] is None
@@ -74,16 +76,16 @@ def test_missing_force_is_named_after_the_places(monkeypatch: pytest.MonkeyPatch
 
 def test_search_for_forces_that_takes_too_long_is_given_up():
     before = time.monotonic()
-    assert _located(model(), recorded(3.0), "mujoco", seconds=0.01) is None
+    assert _unexplained_forces(model(), recorded(3.0), "mujoco", FailureCfg(max_seconds=0.01)) is None
     assert time.monotonic() - before < 5
 
 
-def test_recording_that_cannot_be_compared_has_no_places(monkeypatch: pytest.MonkeyPatch):
+def test_recording_that_cannot_be_compared_has_no_spans(monkeypatch: pytest.MonkeyPatch):
     def refuse(*_, **__):
         raise RecordingError("nothing was measured")
 
     monkeypatch.setattr(module, "compare_replays", refuse)
-    assert where(model(), recorded(3.0)) == []
+    assert locate_failures(model(), recorded(3.0), NO_FORCES) == []
 
 
 def test_replay_starts_where_the_window_was_fitted_to_start():
@@ -92,5 +94,5 @@ def test_replay_starts_where_the_window_was_fitted_to_start():
     offset = np.array([0.004, 0.0]) / windows[0].spread
     moved = _with_starts(model(), started_off, windows, [offset] * len(windows))
     np.testing.assert_allclose(np.asarray(moved.demonstrations[0].qpos, dtype=float), [0.004])
-    assert where(model(), started_off) != []
-    assert where(model(), started_off, windows=windows, offsets=[offset] * len(windows)) == []
+    assert locate_failures(model(), started_off, NO_FORCES) != []
+    assert locate_failures(model(), started_off, NO_FORCES, windows=windows, offsets=[offset] * len(windows)) == []

@@ -16,7 +16,7 @@ from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.diagnose import EXPERIMENT_FILE, diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
@@ -65,7 +65,8 @@ class Arguments:
     seed: int = 0
     """Seed of all that is drawn."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder in which finished parts are kept: the same command continues from there after an interruption."""
+    """Folder for finished parts, from which the same command continues after an interruption, and for the motion of the
+    suggested experiment."""
     overwrite: bool = False
     """Replace what --html and --apply name if it is there."""
 
@@ -84,6 +85,8 @@ def run(arguments: Arguments) -> Diagnosis:
         print(json.dumps(found.to_json(), indent=1, allow_nan=False))
     else:
         _say_diagnosis(found)
+    if arguments.out is not None and found.next_experiment is not None and not arguments.json:
+        say_written(arguments.out / EXPERIMENT_FILE)
     if arguments.apply is not None:
         _save_accepted(arguments, found, recording)
     if arguments.html is not None:
@@ -136,7 +139,7 @@ def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diag
     cfg = DiagnoseCfg(
         effects=arguments.effects,
         window=arguments.window,
-        additions=arguments.additions,
+        max_additions=arguments.additions,
         gradient=arguments.gradient,
         jobs=arguments.jobs,
         seed=arguments.seed,
@@ -182,7 +185,7 @@ def _say_effects(effects: Sequence[Finding]) -> None:
             str(f.step + 1) if first else "",
             f.name,
             f"{100 * f.gain:.1f} % [{100 * f.low:.1f}, {100 * f.high:.1f}]",
-            f"{f.p:.2g}",
+            f.p_text.removeprefix("p ").removeprefix("= "),
             shown + more,
             "accepted" if f.accepted else f.reason,
         ]

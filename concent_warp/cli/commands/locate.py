@@ -11,9 +11,9 @@ from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.terminal import say, say_written
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
-from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions

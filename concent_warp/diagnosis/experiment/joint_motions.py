@@ -1,4 +1,4 @@
-"""Motions of drives: sweeps, chirps, reversals, steps, holds, and what was commanded at another pace."""
+"""Motions of drives: sweeps, chirps, reversals, steps, holds, and recorded commands at another speed."""
 
 from __future__ import annotations
 
@@ -9,61 +9,42 @@ import mujoco
 import numpy as np
 
 from concent_warp.comparison.units import words
-from concent_warp.diagnosis.experiment.motions import (
-    EXTRA,
-    LONGEST,
-    RATE,
-    ProposedMotion,
-    RecordedRange,
-    heavier,
-    slope_turned,
-)
+from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, heavier, slope_turned
 from concent_warp.effects.select import driven_joints, gripper_actuators, last_links, servo_gain
 from concent_warp.recording.recording import Channel
-
-PACES = (0.1, 0.4, 1.0)
-"""Speeds of the sweeps, as shares of the highest."""
-FASTER, SLOWER = 1.5, 0.5
-"""Paces at which recorded commands are repeated."""
-WINDOW = 0.1
-"""Time over which the speed of a command is taken [s]."""
-QUICKEST = 0.25
-"""No sweep over the whole range is quicker [s]."""
-AWAY = 5.0
-"""How far off the objects are put that are out of the way [m]."""
-LIGHTER = 0.7
-"""Share of the way from the first command of a gripper to the others that is gone when it is to press less."""
 
 
 @dataclass(frozen=True)
 class Drives:
-    """Position drives that may be moved, D of them, with what the recording asked of them."""
+    """Position drives that may be moved, D of them, with the range of their recorded commands."""
 
     ids: tuple[int, ...]
-    """Actuators."""
+    """Ids of the actuators."""
     first: np.ndarray
-    """First command, shape (D,)."""
+    """First command [rad or m], shape (D,)."""
     low: np.ndarray
-    """Smallest, shape (D,)."""
+    """Smallest command, shape (D,)."""
     high: np.ndarray
-    """Largest, shape (D,)."""
+    """Largest command, shape (D,)."""
     speed: np.ndarray
-    """Highest speed [1/s], shape (D,)."""
+    """Highest speed of the command [rad/s or m/s], shape (D,)."""
 
     @staticmethod
-    def of(bench: RecordedRange) -> Drives | None:
-        """Return the position drives that are no grippers and were moved; None where there is none."""
-        m = bench.m
+    def of(recorded: RecordedRange) -> Drives | None:
+        """Return the position drives, grippers excepted, whose commands vary; None where there is none."""
+        m = recorded.m
         gripping = set(gripper_actuators(m))
         wanted = [a for a in range(m.nu) if servo_gain(m, a) > 0 and a not in gripping and driven_joints(m, a)]
         found = []
         for a in wanted:
-            rows = [d.action[m.actuator(a).name] for d in bench.recording.demonstrations]
+            rows = [d.action[m.actuator(a).name] for d in recorded.recording.demonstrations]
             low, high = min(r.value.min() for r in rows), max(r.value.max() for r in rows)
             if high - low < 1e-6:
                 continue
-            speed = min(max(map(_top_speed, rows)), (high - low) / QUICKEST)
-            found.append((a, float(bench.longest.action[m.actuator(a).name].value[0]), low, high, speed))
+            cfg = recorded.cfg
+            speed = max(_top_speed(row, cfg.speed_window) for row in rows)
+            speed = min(speed, (high - low) / cfg.min_sweep_time)
+            found.append((a, float(recorded.longest.action[m.actuator(a).name].value[0]), low, high, speed))
         if not found:
             return None
         ids, *columns = zip(*found, strict=True)
@@ -85,40 +66,41 @@ class Drives:
         return float((self.half / self.speed).max())
 
 
-def _top_speed(channel: Channel) -> float:
-    """Return the highest speed of commands over `WINDOW` [1/s]."""
-    time = np.arange(channel.time[0], channel.time[-1] + WINDOW, 0.1 * WINDOW)
+def _top_speed(channel: Channel, window: float) -> float:
+    """Return the highest speed of commands [1/s], averaged over a window [s]."""
+    time = np.arange(channel.time[0], channel.time[-1] + window, 0.1 * window)
     row = np.maximum(np.searchsorted(channel.time, time + 1e-9, side="right") - 1, 0)
     value = channel.value[row]
-    return float(np.abs(value[10:] - value[:-10]).max() / WINDOW) if len(value) > 10 else 0.0
+    return float(np.abs(value[10:] - value[:-10]).max() / window) if len(value) > 10 else 0.0
 
 
-def drive_motions(bench: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
-    """Yield what drives could do; where the table or base may be `tilted`, with it turned too."""
-    if not bench.m.nu:
+def drive_motions(recorded: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
+    """Yield motions of drives; where the table or base may be `tilted`, with it turned too."""
+    if not recorded.m.nu:
         return
-    yield from _repeats(bench, tilted)
-    drives = Drives.of(bench)
+    yield from _repeats(recorded, tilted)
+    drives = Drives.of(recorded)
     if drives is None:
         return
-    made = list(_courses(bench, drives))
+    made = list(_trajectories(recorded, drives))
     yield from made
-    for link in _payload_links(bench, drives):
+    for link in _payload_links(recorded, drives):
         for motion in made:
             if motion.name != "steps":
-                text = f"with {100 * EXTRA:.0f} % more mass on {words(link)}, {motion.text}"
-                yield replace(motion, name=f"{motion.name} with payload", text=text, change=heavier(link))
+                text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {words(link)}, {motion.text}"
+                change = heavier(link, recorded.cfg)
+                yield replace(motion, name=f"{motion.name} with payload", text=text, change=change)
 
 
-def _payload_links(bench: RecordedRange, drives: Drives) -> list[str]:
-    """Return the names of the last links that the drives carry and that something can be fastened to."""
-    m = bench.m
+def _payload_links(recorded: RecordedRange, drives: Drives) -> list[str]:
+    """Return the names of the last links that the drives carry and that can carry a payload."""
+    m = recorded.m
     moved = {int(m.jnt_bodyid[j]) for a in drives.ids for j in driven_joints(m, a)}
     return [m.body(b).name for b in last_links(m) if m.body(b).name and m.body_mass[b] > 0 and _above(m, b) & moved]
 
 
 def _above(m: mujoco.MjModel, body: int) -> set[int]:
-    """Return a body and those that carry it."""
+    """Return the ids of a body and of those that carry it."""
     found = {0}
     while body:
         found.add(body)
@@ -126,9 +108,9 @@ def _above(m: mujoco.MjModel, body: int) -> set[int]:
     return found
 
 
-def _courses(bench: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:
-    """Yield the motions that drives are asked for together, each in its own range, with objects out of the way."""
-    m = bench.m
+def _trajectories(recorded: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:
+    """Yield motions of all drives together, each in its own range, with objects out of the way."""
+    m, cfg = recorded.m, recorded.cfg
     who = words(m.actuator(drives.ids[0]).name) if len(drives.ids) == 1 else "all drives together"
     linear = all(m.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in drives.ids for j in driven_joints(m, a))
     unit = "m" if linear else "rad"
@@ -136,94 +118,98 @@ def _courses(bench: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:
     entry = (drives.first - drives.middle) / drives.half
     quick = drives.slowest
 
-    def course(parts: Sequence[np.ndarray]) -> np.ndarray:
+    def ramp(a: float, b: float, duration: float) -> np.ndarray:
+        """Return a straight line of commands from `a` to `b` over `duration` [s], shape (K,)."""
+        return np.linspace(a, b, max(int(duration * cfg.rate), 2))
+
+    def trajectory(parts: Sequence[np.ndarray]) -> np.ndarray:
         """Return commands (K, D): from the first ones to where the parts begin, then the parts in units of `half`."""
         begin = drives.middle + drives.half * parts[0][0]
-        there = _ramp(0.0, 1.0, max(quick * float(np.abs(entry - parts[0][0]).max()), 0.3))
+        there = ramp(0.0, 1.0, max(quick * float(np.abs(entry - parts[0][0]).max()), 0.3))
         lead = drives.first + (begin - drives.first) * there[:, None]
         return np.concatenate([lead, drives.middle + drives.half * np.concatenate(parts)[:, None]])
 
     def motion(name: str, text: str, parts: Sequence[np.ndarray]) -> ProposedMotion:
-        return _commanded(bench, drives, name, f"{text}{_cleared_text(bench)}", course(parts))
+        return _commanded(recorded, drives, name, f"{text}{_cleared_text(recorded)}", trajectory(parts))
 
     if len(drives.ids) == 1:
         span = f"between {drives.low[0]:.2g} and {drives.high[0]:.2g} {unit}"
-        speeds = ", ".join(f"{p * drives.speed[0]:.2g}" for p in PACES) + f" {unit}/s"
+        speeds = ", ".join(f"{p * drives.speed[0]:.2g}" for p in cfg.sweep_speeds) + f" {unit}/s"
     else:
-        span, speeds = "over their ranges", ", ".join(f"{p:g}" for p in PACES) + " times the highest speed"
+        span, speeds = "over their ranges", ", ".join(f"{p:g}" for p in cfg.sweep_speeds) + " times the highest speed"
     ways = [(-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)]
-    legs = [_ramp(a, b, min(2 * quick / p, LONGEST / 2)) for (a, b), p in zip(ways, PACES, strict=True)]
+    legs = [
+        ramp(a, b, min(2 * quick / p, cfg.max_duration / 2)) for (a, b), p in zip(ways, cfg.sweep_speeds, strict=True)
+    ]
     yield motion("sweeps", f"sweep {who} {span} at {speeds}", legs)
     reach = 0.15
-    slow = 2 * reach * quick / PACES[0]
-    turns = [_ramp(middle + a, middle + b, slow) for a, b in ((-reach, reach), (reach, -reach))] * 2
+    slow = 2 * reach * quick / cfg.sweep_speeds[0]
+    turns = [ramp(middle + a, middle + b, slow) for a, b in ((-reach, reach), (reach, -reach))] * 2
     yield motion("slow reversals", f"move {who} to and fro slowly over {100 * reach:.0f} % of the range", turns)
     top = float(np.clip(1 / (2 * np.pi * 0.3 * quick), 1.0, 8.0))
-    time = np.arange(0, 6.0, 1 / RATE)
+    time = np.arange(0, 6.0, 1 / cfg.rate)
     wave = middle + 0.3 * np.sin(2 * np.pi * (0.3 * time + (top - 0.3) * time**2 / 12.0))
     yield motion("chirp", f"swing {who} over 30 % of the range with a rising frequency, 0.3 to {top:.1f} Hz", [wave])
-    jumps = [np.full(int(0.6 * RATE), middle + step) for step in (0.0, 0.4, -0.4, 0.2, -0.2, 0.0)]
+    jumps = [np.full(int(0.6 * cfg.rate), middle + step) for step in (0.0, 0.4, -0.4, 0.2, -0.2, 0.0)]
     yield motion("steps", f"command steps of up to 40 % of the range to {who}", jumps)
     stands, here = [], -1.0
     for place in (-1.0, -0.5, 0.0, 0.5, 1.0):
-        stands += [_ramp(here, place, max(quick, 0.4)), np.full(int(0.7 * RATE), place)]
+        stands += [ramp(here, place, max(quick, 0.4)), np.full(int(0.7 * cfg.rate), place)]
         here = place
     yield motion("holds", f"hold {who} in five poses across the range", stands)
 
 
-def _ramp(a: float, b: float, duration: float) -> np.ndarray:
-    """Return a straight line of commands from `a` to `b` over `duration` [s], shape (K,)."""
-    return np.linspace(a, b, max(int(duration * RATE), 2))
-
-
-def _cleared_text(bench: RecordedRange) -> str:
-    """Return which objects are put away, in words."""
-    names = [words(bench.m.body(b).name) for b in bench.bodies]
+def _cleared_text(recorded: RecordedRange) -> str:
+    """Return which objects are out of the way, in words."""
+    names = [words(recorded.m.body(b).name) for b in recorded.bodies]
     return f", with {' and '.join(names)} out of the way" if names else ""
 
 
-def _commanded(bench: RecordedRange, drives: Drives, name: str, text: str, course: np.ndarray) -> ProposedMotion:
+def _commanded(recorded: RecordedRange, drives: Drives, name: str, text: str, command: np.ndarray) -> ProposedMotion:
     """Return a motion from commands (K, D); the other actuators hold still."""
-    course = course[: int(LONGEST * RATE)]
-    time = np.arange(len(course)) / RATE
-    action = bench.holding(bench.longest)
+    cfg = recorded.cfg
+    command = command[: int(cfg.max_duration * cfg.rate)]
+    time = np.arange(len(command)) / cfg.rate
+    action = recorded.holding(recorded.longest)
     for k, a in enumerate(drives.ids):
-        action[bench.m.actuator(a).name] = Channel(time, course[:, k])
-    qpos, qvel = bench.starts[bench.recording.demonstrations.index(bench.longest)]
+        action[recorded.m.actuator(a).name] = Channel(time, command[:, k])
+    qpos, qvel = recorded.starts[recorded.recording.demonstrations.index(recorded.longest)]
     qpos, away = qpos.copy(), []
-    for i, b in enumerate(bench.bodies):
-        qpos[int(bench.m.jnt_qposadr[bench.m.body_jntadr[b]])] += AWAY * (1 + i)
-        away.append(bench.m.body(b).name)
-    return ProposedMotion(name, text, len(course) / RATE, qpos, 0 * qvel, action, tuple(away))
+    for i, b in enumerate(recorded.bodies):
+        qpos[int(recorded.m.jnt_qposadr[recorded.m.body_jntadr[b]])] += cfg.clearance * (1 + i)
+        away.append(recorded.m.body(b).name)
+    return ProposedMotion(name, text, len(command) / cfg.rate, qpos, 0 * qvel, action, tuple(away))
 
 
-def _repeats(bench: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
-    """Yield what was commanded in the longest demonstration, done otherwise."""
-    d, m = bench.longest, bench.m
-    qpos, qvel = bench.starts[bench.recording.demonstrations.index(d)]
-    for pace in (FASTER, SLOWER):
-        action = {name: Channel(c.time / pace, c.value) for name, c in d.action.items()}
-        text = f"repeat the same commands {'faster' if pace > 1 else 'slower'}, {pace:g} times the pace"
-        yield ProposedMotion("repeat at another pace", text, min(d.duration / pace, LONGEST), qpos, qvel, action)
-    duration = min(d.duration, LONGEST)
+def _repeats(recorded: RecordedRange, tilted: bool) -> Iterator[ProposedMotion]:
+    """Yield the commands of the longest demonstration at other speeds, on a turned base, or with another grip."""
+    d, m, cfg = recorded.longest, recorded.m, recorded.cfg
+    qpos, qvel = recorded.starts[recorded.recording.demonstrations.index(d)]
+    for scale in cfg.time_scales:
+        action = {name: Channel(c.time / scale, c.value) for name, c in d.action.items()}
+        text = f"repeat the same commands {'faster' if scale > 1 else 'slower'}, at {scale:g} times the speed"
+        yield ProposedMotion(
+            "repeat at another speed", text, min(d.duration / scale, cfg.max_duration), qpos, qvel, action
+        )
+    duration = min(d.duration, cfg.max_duration)
     if tilted:
         text = "turn the base on which everything stands by 180 deg, so that its slope runs the other way, and repeat"
         yield ProposedMotion(
             "turned base", f"{text} the same commands", duration, qpos, qvel, d.action, change=slope_turned
         )
     hands = [m.actuator(a).name for a in gripper_actuators(m)]
-    if hands and bench.bodies:
-        still: dict[str, Channel] = {**d.action, **{n: c for n, c in bench.holding(d).items() if n in hands}}
+    if hands and recorded.bodies:
+        still: dict[str, Channel] = {**d.action, **{n: c for n, c in recorded.holding(d).items() if n in hands}}
         text = "push without a grasp: repeat the same commands with the gripper left as it is at first"
         yield ProposedMotion("push without grasp", text, duration, qpos, qvel, still)
-        text = f"grip with {100 * LIGHTER:.0f} % of the commanded closing and repeat the other commands"
-        yield ProposedMotion("lighter grip", text, duration, qpos, qvel, _loosened(d.action, hands))
+        text = f"grip with {100 * cfg.lighter_grip:.0f} % of the commanded closing and repeat the other commands"
+        yield ProposedMotion("lighter grip", text, duration, qpos, qvel, _loosened(d.action, hands, cfg.lighter_grip))
 
 
-def _loosened(action: Mapping[str, Channel], hands: Sequence[str]) -> dict[str, Channel]:
-    """Return commands in which grippers go a part of their way only."""
+def _loosened(action: Mapping[str, Channel], hands: Sequence[str], share: float) -> dict[str, Channel]:
+    """Return commands in which grippers close by a share of their recorded closing only."""
     found = dict(action)
     for name in hands:
         c = action[name]
-        found[name] = replace(c, value=c.value[0] + LIGHTER * (c.value - c.value[0]))
+        found[name] = replace(c, value=c.value[0] + share * (c.value - c.value[0]))
     return found

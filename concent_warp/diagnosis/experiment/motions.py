@@ -1,7 +1,7 @@
-"""Motions that could be recorded next: what a person or the robot would do, and how models are simulated doing it.
+"""Motions that could be recorded next: initial state, commands, and changes of the set-up.
 
-Speeds, commands and places stay within what the present recording has shown to be possible. The motions of drives are
-in `joint_motions`, those of objects in `object_motions`.
+Speeds, commands and positions stay within the range of the present recording. Motions of drives are in `joint_motions`,
+those of objects in `object_motions`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
 from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observation import ObservedRecording
@@ -24,54 +25,46 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
 
 Change = Callable[["Model"], "Model"]
-"""What is different about the set-up: given the model of the present one, returns that of the other."""
-RATE = 100.0
-"""Commands a second."""
-LONGEST = 8.0
-"""Longest motion [s]."""
-INSTANTS = 40
-"""Instants of a demonstration at which speeds are looked at."""
-EXTRA = 0.5
-"""A payload or a heavier object has this share of the body's mass more."""
-
-PAYLOAD_RADIUS = 0.01
-"""[m]."""
+"""A change of the set-up: takes the model of the present one, returns that of the changed one."""
 
 
-def _as_it_is(model: Model) -> Model:
-    """Leave the set-up as it is, see `Change`."""
+def _unchanged(model: Model) -> Model:
+    """Return the model itself, see `Change`."""
     return model
 
 
 @dataclass(frozen=True)
 class ProposedMotion:
-    """Something that could be done and recorded."""
+    """A motion that could be recorded."""
 
     name: str
-    """Which entry of the menu."""
+    """Kind of motion."""
     text: str
-    """What to do, in words."""
+    """What to do."""
     duration: float
-    """[s]."""
+    """Length [s]."""
     qpos: np.ndarray
-    """Start, shape (nq,)."""
+    """Initial positions [m, rad], shape (nq,)."""
     qvel: np.ndarray
-    """Shape (nv,)."""
+    """Initial velocities [m/s, rad/s], shape (nv,)."""
     action: Mapping[str, Channel] = field(default_factory=dict)
     """Commands by actuator."""
     away: tuple[str, ...] = ()
-    """Bodies that are out of the way, so that nothing of them is measured."""
-    change: Change = _as_it_is
+    """Bodies that are moved out of the way and not measured."""
+    change: Change = _unchanged
+    """Change of the set-up."""
 
 
 @dataclass(frozen=True)
 class RecordedRange:
-    """What the present recording shows of what can be done."""
+    """Range of states, commands and sampling intervals in the present recording."""
 
     model: Model
     recording: Recording
     noise: Mapping[str, float]
     """Standard deviation of a component of each channel."""
+    cfg: MotionMenuCfg = field(default_factory=MotionMenuCfg)
+    """Settings of the motions."""
 
     @cached_property
     def m(self) -> mujoco.MjModel:
@@ -90,15 +83,15 @@ class RecordedRange:
 
     @cached_property
     def states(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """States at some instants of all demonstrations."""
+        """States at `cfg.instants` instants of all demonstrations, and at their starts."""
         found = list(self.starts)
         for d in self.recording.demonstrations:
             if (measured := self.source.measured(d)) is not None:
-                found += [measured.state(t) for t in np.linspace(0, d.duration, INSTANTS + 2)[1:-1]]
+                found += [measured.state(t) for t in np.linspace(0, d.duration, self.cfg.instants + 2)[1:-1]]
         return found
 
     def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the measured state of a demonstration, as far as it is known."""
+        """Return the measured state of a demonstration; its initial one where it was not measured."""
         try:
             return self.source.state(d, time)
         except RecordingError:
@@ -110,7 +103,7 @@ class RecordedRange:
         found = {}
         for name in self.noise:
             steps = [
-                np.diff(d.measured[name].time) for d in self.recording.demonstrations if len(_read(d, name).time) > 1
+                np.diff(d.measured[name].time) for d in self.recording.demonstrations if len(_channel(d, name).time) > 1
             ]
             found[name] = float(np.median(np.concatenate(steps))) if steps else 0.01
         return found
@@ -122,7 +115,7 @@ class RecordedRange:
         return [b for b in free_bodies(self.m) if b in {self.body_of(c) for c in poses}]
 
     def body_of(self, channel: str) -> int:
-        """Return the body that a channel is about, -1 for a channel about something else."""
+        """Return the body whose site or frame a channel measures, -1 for another kind of channel."""
         row = self.m.sensor(channel).id
         kind, target = int(self.m.sensor_objtype[row]), int(self.m.sensor_objid[row])
         if kind == int(mujoco.mjtObj.mjOBJ_SITE):
@@ -140,18 +133,18 @@ class RecordedRange:
         return max(self.recording.demonstrations, key=lambda d: d.duration)
 
     def holding(self, d: Demonstration) -> dict[str, Channel]:
-        """Return commands that keep a demonstration's first ones."""
+        """Return constant commands, the first ones of a demonstration."""
         first = commands(self.m, d, 1)[0]
         return {self.m.actuator(i).name: Channel(np.zeros(1), first[i : i + 1]) for i in range(self.m.nu)}
 
 
-def _read(d: Demonstration, channel: str) -> Channel:
+def _channel(d: Demonstration, channel: str) -> Channel:
     """Return a channel of a demonstration, empty where it has none."""
     return d.measured.get(channel, Channel(np.zeros(0), np.zeros((0, 1))))
 
 
-def heavier(body: str) -> Change:
-    """Return what fastens a payload to a body, at its centre of mass."""
+def heavier(body: str, cfg: MotionMenuCfg) -> Change:
+    """Return the change that fastens a payload to a body, at its centre of mass."""
 
     def change(model: Model) -> Model:
         from concent_warp.scene.scene import Scene
@@ -160,8 +153,8 @@ def heavier(body: str) -> Change:
         row = m.body(body).id
         spec.body(body).add_body(name=f"{body}_payload", pos=m.body_ipos[row]).add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[PAYLOAD_RADIUS, 0, 0],
-            mass=EXTRA * float(m.body_mass[row]),
+            size=[cfg.payload_radius, 0, 0],
+            mass=cfg.extra_mass * float(m.body_mass[row]),
             contype=0,
             conaffinity=0,
         )
@@ -171,7 +164,7 @@ def heavier(body: str) -> Change:
 
 
 def slope_turned(model: Model) -> Model:
-    """Return the model with the table's slope the other way round, see `Change`."""
+    """Return the model with the table's slope reversed, see `Change`."""
     turned = tuple(
         replace(a, values=tuple(-v for v in a.values)) if a.effect.name == "gravity_tilt" else a for a in model.effects
     )

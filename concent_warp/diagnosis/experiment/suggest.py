@@ -1,25 +1,31 @@
-"""The experiment to do next: the motion in which the hypotheses that are left differ most.
+"""The experiment that best distinguishes hypotheses: the motion in which their predictions differ most.
 
-Each hypothesis is a model with its parameters as the present recording has them. Every motion of a menu is simulated in
-each of them, as the same instruments would see it; how far apart two predictions are is counted in units of the
-instruments' noise, after what errors of the start could account for has been taken out. Cf. Hunter and Reiner, "Designs
-for discriminating between two rival models", Technometrics 7, 1965.
+Each hypothesis is a model with its parameters as fitted to the present recording. Every motion of a menu is simulated
+in each of them, as the same sensors would measure it; the RMS difference of two predictions is taken in units of the
+sensors' noise, after what errors of the initial state could account for is projected out. Cf. Hunter and Reiner,
+"Designs for discriminating between two rival models", Technometrics 7, 1965.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from concent_warp.comparison.units import times, words
+from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.object_motions import body_motions
+from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment, TimeSeries
+from concent_warp.diagnosis.experiment.trajectory import motion_trajectory
 from concent_warp.errors import ConcentError
+from concent_warp.estimation.sensors import kind_and_unit
+from concent_warp.files import write_json
 from concent_warp.fit.effects.observation import ObservedRecording, Reading, Window, start_spread
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest, turn
@@ -28,137 +34,154 @@ from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS
 from concent_warp.simulate.select import EngineName
 
-MOST_MODELS = 4
-"""Hypotheses that are told apart; more cost too much."""
-FINALISTS = 8
-"""Motions that are looked at closely."""
-PROBE = 0.1
-"""Error of the start for which its effects are computed, in standard deviations."""
-LEAST = 1.0
-"""Predictions closer than this many times the noise are not worth an experiment."""
 
-
-@dataclass(frozen=True)
-class Experiment:
-    """A motion that tells hypotheses apart."""
-
-    motion: str
-    """Which entry of the menu."""
-    sentence: str
-    """What to do and what it would show."""
-    separation: float
-    """RMS difference of the predictions of `pair` over the noise, in the channel where it is largest [-]."""
-    pair: tuple[str, str]
-    """The two hypotheses that it separates best."""
-    channel: str
-    """Channel in which they differ most."""
-    separations: Mapping[tuple[str, str], float]
-    """The same of every pair."""
-
-
-def suggest(
-    models: Mapping[str, Model], recording: Recording, engine: EngineName = "mujoco", seed: int = 0
-) -> Experiment | None:
-    """Return the motion in which the predictions of models differ most, None where no motion of the menu tells.
+def suggest_experiment(
+    models: Mapping[str, Model],
+    recording: Recording,
+    cfg: SuggestExperimentCfg | None = None,
+    *,
+    engine: EngineName = "mujoco",
+    out: str | Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> SuggestedExperiment | None:
+    """Return the motion in which the predictions of models differ most, None where no motion distinguishes them.
 
     Args:
         models: Hypotheses by name, fitted to the recording, the likeliest first.
-        recording: What is known so far.
+        recording: What was commanded and measured.
+        cfg: Settings.
         engine: Which engine simulates.
-        seed: Of the disturbances that tell how long a motion can be predicted.
+        out: JSON file for the motion with its arrays; not written where there is none.
+        progress: Called with the share done, 0..1.
 
     Raises:
         RecordingError: The models do not predict what was measured.
         EngineError: A model cannot be simulated.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> recording = cw.load_recording(cw.example("servo"))
+        >>> model = cw.Model.from_recording(recording)
+        >>> damped = model.add(cw.effect_class("joint_damping")("hinge"), [0.015])
+        >>> rubbed = model.add(cw.effect_class("joint_friction")("hinge"), [0.03])
+        >>> found = cw.suggest_experiment({"joint_damping": damped, "joint_friction": rubbed}, recording)
+        >>> next(iter(found.motion.commands.values())).unit, found.separation > 5
+        ('rad', True)
     """
-    chosen = dict(list(models.items())[:MOST_MODELS])
+    cfg = cfg or SuggestExperimentCfg()
+    chosen = dict(list(models.items())[: cfg.max_hypotheses])
     if len(chosen) < 2:
         return None
     first = next(iter(chosen.values()))
-    bench = RecordedRange(first, recording, channel_noises(first, recording))
+    recorded = RecordedRange(first, recording, channel_noises(first, recording), cfg.menu)
     tilted = any(a.effect.name == "gravity_tilt" for model in chosen.values() for a in model.effects)
-    menu = [*drive_motions(bench, tilted), *body_motions(bench, engine, tilted)]
-    looked = [(_score(found), k) for k, motion in enumerate(menu) if (found := _rough(chosen, bench, motion, engine))]
+    menu = [*drive_motions(recorded, tilted), *body_motions(recorded, engine, tilted)]
+    report, count = progress or _ignore, len(menu) + cfg.finalists
+    ranked = []
+    for k, motion in enumerate(menu):
+        if found := _known_start_separations(chosen, recorded, motion, engine):
+            ranked.append((_score(found), k))
+        report((k + 1) / count)
     best = None
-    for _, k in sorted(looked, key=lambda pair: (-pair[0], pair[1]))[:FINALISTS]:
-        found = _close(chosen, bench, menu[k], engine, seed)
+    for i, (_, k) in enumerate(sorted(ranked, key=lambda pair: (-pair[0], pair[1]))[: cfg.finalists]):
+        found = _uncertain_start_separations(chosen, recorded, menu[k], engine, cfg)
         if found and (best is None or _score(found) > _score(best[1])):
             best = menu[k], found
-    if best is None or max(value for value, _ in best[1].values()) < LEAST:
+        report((len(menu) + i + 1) / count)
+    report(1.0)
+    if best is None or max(value for value, _ in best[1].values()) < cfg.min_separation:
         return None
-    return _experiment(*best, first=next(iter(chosen)))
+    experiment = _experiment(*best, chosen, recorded, engine)
+    if out is not None:
+        write_json(Path(out), experiment.to_json())
+    return experiment
+
+
+def _ignore(share: float) -> None:
+    """Ignore the progress."""
+    del share
 
 
 Separations = dict[tuple[str, str], tuple[float, str]]
-"""How far two hypotheses differ [noise], and in which channel, by their names."""
+"""RMS difference of two hypotheses over the noise [-], and the channel where it is largest, by their names."""
 
 
 def _score(found: Separations) -> float:
-    """Return a number that is larger the better a motion tells all pairs apart: one well apart makes up for little."""
+    """Return a score that grows with all separations, each with diminishing returns."""
     return float(np.mean([np.log1p(value) for value, _ in found.values()]))
 
 
-def _rough(
-    models: Mapping[str, Model], bench: RecordedRange, motion: ProposedMotion, engine: EngineName
+def _known_start_separations(
+    models: Mapping[str, Model], recorded: RecordedRange, motion: ProposedMotion, engine: EngineName
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion from the very same start; None where one cannot be simulated."""
-    window = _imagined(bench, motion, motion.duration)
+    window = _future_window(recorded, motion, motion.duration)
     return None if window is None else _separations(models, motion, window, engine)
 
 
-def _close(
-    models: Mapping[str, Model], bench: RecordedRange, motion: ProposedMotion, engine: EngineName, seed: int
+def _uncertain_start_separations(
+    models: Mapping[str, Model],
+    recorded: RecordedRange,
+    motion: ProposedMotion,
+    engine: EngineName,
+    cfg: SuggestExperimentCfg,
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion whose start is known only as well as it is measured.
 
-    It counts for as long as errors of the start have effects in proportion to them: what is chaotic tells nothing.
+    Over the time in which errors of the start have proportional effects: chaotic motion cannot be predicted.
     """
-    whole = _imagined(bench, motion, motion.duration)
+    whole = _future_window(recorded, motion, motion.duration)
     if whole is None:
         return None
-    model = motion.change(bench.model)
-    source = ObservedRecording(model, bench.recording, bench.noise)
-    reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, seed)
-    if (window := _imagined(bench, motion, reach)) is None:
+    model = motion.change(recorded.model)
+    source = ObservedRecording(model, recorded.recording, recorded.noise)
+    reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, cfg.seed)
+    if (window := _future_window(recorded, motion, reach)) is None:
         return None
-    starts = _start_effects(model, window, engine)
+    starts = _start_effects(model, window, engine, cfg.probe)
     return None if starts is None else _separations(models, motion, window, engine, starts)
 
 
-def _start_effects(model: Model, window: Window, engine: EngineName) -> np.ndarray | None:
-    """Return what an error of the start of one standard deviation does to the readings [noise], shape (count, 2 nv).
+def _start_effects(model: Model, window: Window, engine: EngineName, probe: float) -> np.ndarray | None:
+    """Return the change of the readings per standard deviation of the start, over the noise, shape (count, 2 nv).
 
     None where a motion with such an error cannot be simulated.
+
+    Args:
+        model: The model.
+        window: The motion.
+        engine: Which engine simulates.
+        probe: Step of the finite difference [standard deviations].
     """
     values = _readings(model, window, engine)
     if not all(np.isfinite(v).all() for v in values):
         return None
     filled = tuple(replace(r, value=v) for r, v in zip(window.readings, values, strict=True))
     prediction = Prediction(model, (), [replace(window, readings=filled)], engine=engine)
-    steps = PROBE * np.diag(window.spread)
+    steps = probe * np.diag(window.spread)
     found = prediction.residuals([SimulationRequest(0, prediction.start, step) for step in steps])
-    return np.stack(found, axis=1) / PROBE
+    return np.stack(found, axis=1) / probe
 
 
-def _imagined(bench: RecordedRange, motion: ProposedMotion, duration: float) -> Window | None:
-    """Return the beginning of a motion as a window of a recording yet to be made; None where nothing is measured."""
-    m = bench.m
-    channels, readings, clock, count = bench.channels(motion.away), [], [], 0
+def _future_window(recorded: RecordedRange, motion: ProposedMotion, duration: float) -> Window | None:
+    """Return the beginning of a motion as a window to be recorded; None where nothing is measured."""
+    m = recorded.m
+    channels, readings, clock, count = recorded.channels(motion.away), [], [], 0
     for name in channels:
         row = m.sensor(name).id
         orientation = int(m.sensor_type[row]) in map(int, UNIT_QUATERNION_SENSORS)
-        time = np.arange(0.0, duration, max(bench.period[name], m.opt.timestep))
+        time = np.arange(0.0, duration, max(recorded.period[name], m.opt.timestep))
         value = np.zeros((len(time), int(m.sensor_dim[row])))
         dim = 3 if orientation else value.shape[1]
         rows = slice(count, count + dim * len(time))
-        readings.append(Reading(name, rows, time, value, bench.noise[name], orientation))
+        readings.append(Reading(name, rows, time, value, recorded.noise[name], orientation))
         clock.append(np.repeat(time, dim))
         count = rows.stop
     if not count:
         return None
     measured = {r.channel: Channel(r.time, r.value, noise_std=r.std) for r in readings}
     d = Demonstration(motion.name, qpos=motion.qpos, qvel=motion.qvel, action=motion.action, measured=measured)
-    spread = start_spread(m, {c: bench.noise[c] for c in channels})
+    spread = start_spread(m, {c: recorded.noise[c] for c in channels})
     clocks = np.concatenate(clock)
     return Window(d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks)
 
@@ -174,16 +197,16 @@ def _separations(
 
     Args:
         models: Hypotheses by name.
-        motion: What is done.
-        window: The motion as a window of a recording.
+        motion: The motion.
+        window: The same as a window.
         engine: Which engine simulates.
-        starts: How residuals depend on the initial state in units of its spread, shape (count, 2 nv); what it may
-            account for is taken out.
+        starts: Dependence of the residuals on the initial state in units of its standard deviation, shape
+            (count, 2 nv), which is projected out.
     """
     try:
         seen = {name: _readings(motion.change(model), window, engine) for name, model in models.items()}
     except (ConcentError, ValueError, mujoco.FatalError):
-        # A payload may not fit a scene that asks for something special of its bodies: one motion less.
+        # A payload may break a rule of the scene on its bodies; the motion is left out.
         return None
     if not all(np.isfinite(value).all() for values in seen.values() for value in values):
         return None
@@ -216,13 +239,42 @@ def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np
     return found
 
 
-def _experiment(motion: ProposedMotion, found: Separations, first: str) -> Experiment:
-    """Return the experiment, in words that tell what separates the likeliest hypothesis, `first`, from the others."""
+def _experiment(
+    motion: ProposedMotion,
+    found: Separations,
+    models: Mapping[str, Model],
+    recorded: RecordedRange,
+    engine: EngineName,
+) -> SuggestedExperiment:
+    """Return the experiment, with a sentence on what distinguishes the likeliest hypothesis from the others."""
+    first = next(iter(models))
     best = max(found, key=lambda pair: found[pair][0])
     pairs = sorted((pair for pair in found if first in pair), key=lambda pair: -found[pair][0])
-    said = [f"{a} and {b} then differ by {times(found[a, b][0])} noise" for a, b in pairs[:1]]
-    said += [f"{a} and {b} by {times(found[a, b][0])}" for a, b in pairs[1:]]
+    differ = [f"{a} and {b} then differ by {times(found[a, b][0])} noise" for a, b in pairs[:1]]
+    differ += [f"{a} and {b} by {times(found[a, b][0])}" for a, b in pairs[1:]]
     separation, channel = found[best]
-    sentence = f"{motion.text}: {', '.join(said)} ({words(found[pairs[0]][1])})."
-    sizes = {pair: value for pair, (value, _) in found.items()}
-    return Experiment(motion.name, sentence, separation, best, channel, sizes)
+    return SuggestedExperiment(
+        name=motion.name,
+        sentence=f"{motion.text}: {', '.join(differ)} ({words(found[pairs[0]][1])}).",
+        separation=separation,
+        pair=best,
+        channel=channel,
+        separations={pair: value for pair, (value, _) in found.items()},
+        motion=motion_trajectory(models[first], motion, engine, recorded.cfg.rate),
+        predictions=_predictions(motion, models, recorded, channel, engine),
+    )
+
+
+def _predictions(
+    motion: ProposedMotion, models: Mapping[str, Model], recorded: RecordedRange, channel: str, engine: EngineName
+) -> dict[str, TimeSeries]:
+    """Return what each hypothesis predicts for the readings of a channel during a motion."""
+    window = _future_window(recorded, motion, motion.duration)
+    assert window is not None
+    (k,) = [i for i, r in enumerate(window.readings) if r.channel == channel]
+    kind, unit = kind_and_unit(recorded.m, recorded.m.sensor(channel).id)
+    unit = "-" if kind == "orientation" else unit  # readings are quaternions
+    return {
+        name: TimeSeries(window.readings[k].time, _readings(motion.change(model), window, engine)[k], unit)
+        for name, model in models.items()
+    }

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.comparison.phases import FREE, GRASPED, IMPACT, REST, SLIDE, SLIDING, STICK
+from concent_warp.diagnosis.forces.cfg import ContactStateCfg
 from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
@@ -18,15 +19,7 @@ if TYPE_CHECKING:
     from concent_warp.estimation.measured_motion import MeasuredMotion, SmoothedBodyMotion
 
 PUSHED, BETWEEN = "pushed", "between"
-"""Further phases: the robot presses on it from one side; it sets out or comes to rest."""
-LASTING = 0.8
-"""Share of a window from which on a contact lasts through it."""
-HOP = 0.02
-"""Interruptions of a contact up to this long [s] are put down to errors of the smoothed pose."""
-GRIPPING = 0.25
-"""Speed at the contact over that of the body below which it rolls or is carried."""
-HELD = 0.05
-"""Share of a motion, of unit size, that lasting contacts must see to count as held."""
+"""Further phases: the robot presses on it from one side; it starts or stops moving."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +59,10 @@ class BodyWindows:
     """Body to world, shape (K, 3, 3)."""
 
 
-def body_windows(motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMotion) -> BodyWindows:
-    """Return what a body touches in the model's simulation of each window, and what follows from it."""
+def body_windows(
+    motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMotion, cfg: ContactStateCfg
+) -> BodyWindows:
+    """Return the contacts of a body in the model's simulation of each window, its phase and its free motions."""
     m = motion.compiled
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1
     rotation = Rotation.from_quat(windows.qpos[:, body.qpos + 3 : body.qpos + 7], scalar_first=True)
@@ -102,7 +97,7 @@ def body_windows(motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMot
                 mean / max(float(np.linalg.norm(mean)), 1e-9),
                 len(np.unique(log.step[rows][mine])) / steps,
             )
-        share = _lasting_share(np.unique(log.step[rows]), steps, round(HOP / m.opt.timestep))
+        share = _lasting_share(np.unique(log.step[rows]), steps, round(cfg.max_interruption / m.opt.timestep))
         matrix = rotation[k].as_matrix()
         movers = {int(b) for b in np.unique(other) if _moved_by_joints(m, int(b))}
         fixed = (
@@ -117,35 +112,35 @@ def body_windows(motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMot
             passing[k, :, body.dof + 3 : body.dof + 6] @ matrix.T, centre
         )
         along -= np.outer(along @ up, up)
-        blur = 2 * float(speed_std[k])
+        blur = cfg.direction_standard_errors * float(speed_std[k])
         heading[k] = share * WEIGHTS @ (along / np.hypot(np.linalg.norm(along, axis=1), blur)[:, None])
-        if share < LASTING:
+        if share < cfg.lasting_share:
             phase[k] = IMPACT
         elif movers:
             phase[k] = GRASPED if len(movers) > 1 else PUSHED
         else:
-            limit = max(SLIDING, 3 * float(speed_std[k]))
+            limit = max(SLIDING, cfg.motion_standard_errors * float(speed_std[k]))
             speeds = windows.edge_qvel[:, k, body.dof : body.dof + 6]
             ends = [_speed_at(velocity[k], spin[k], centre, up, size)]
             ends += [_speed_at(v[:3], matrix @ v[3:], centre, up, size) for v in speeds]
             travel, slips = ends[0]
-            if slips < GRIPPING * travel and travel > limit:
+            if slips < cfg.rolling_ratio * travel and travel > limit:
                 phase[k] = STICK
             else:
-                # A window in which it comes to rest, or sets out, tells of neither.
+                # A window in which it stops or starts shows neither sliding nor rest.
                 slides = [s > limit for _, s in ends]
                 phase[k] = SLIDE if all(slides) else BETWEEN if any(slides) else REST
-        if share >= LASTING:
+        if share >= cfg.lasting_share:
             push = np.concatenate([normal, np.cross(point, normal) / size], axis=1)
             both = np.kron(np.eye(2), matrix)
-            free[k] = both @ _free_motions(push, len(np.unique(log.step[rows]))) @ both.T
+            free[k] = both @ _free_motions(push, len(np.unique(log.step[rows])), cfg.min_constraint) @ both.T
     return BodyWindows(phase, tuple(touches), free, size, sliding, heading, velocity, spin, rotation.as_matrix())
 
 
 def _speed_at(
     velocity: np.ndarray, spin: np.ndarray, point: np.ndarray, up: np.ndarray, size: float
 ) -> tuple[float, float]:
-    """Return how fast a body moves [m/s], and how fast it slips at a point, turning about the normal counted in.
+    """Return the speed of a body, and its slip at a point including the spin about the normal [m/s].
 
     Args:
         velocity: Of its origin [m/s], shape (3,).
@@ -159,33 +154,34 @@ def _speed_at(
     return float(np.linalg.norm(velocity)), float(np.hypot(np.linalg.norm(slip), abs(float(spin @ up)) * size))
 
 
-def _lasting_share(touched: np.ndarray, steps: int, hop: int) -> float:
-    """Return the share of `steps` with contact, interruptions of up to `hop` steps counted in.
+def _lasting_share(touched: np.ndarray, steps: int, longest_gap: int) -> float:
+    """Return the share of `steps` with contact, interruptions of up to `longest_gap` steps included.
 
     Args:
         touched: Steps with contact, increasing.
         steps: Steps of the window.
-        hop: Longest interruption.
+        longest_gap: Longest interruption that is included [steps].
     """
     edges = np.concatenate([[-1], touched, [steps]])
     gaps = np.diff(edges) - 1
-    return 1 - float(gaps[gaps > hop].sum()) / steps
+    return 1 - float(gaps[gaps > longest_gap].sum()) / steps
 
 
-def _free_motions(push: np.ndarray, steps: int) -> np.ndarray:
-    """Return the projector (6, 6) onto motions that contacts do not see.
+def _free_motions(push: np.ndarray, steps: int, min_constraint: float) -> np.ndarray:
+    """Return the projector (6, 6) onto motions that contacts leave free.
 
     Args:
         push: Direction of each contact's push in the space of motions, shape (C, 6).
         steps: Number of steps that the contacts are of.
+        min_constraint: Mean squared normal component of a unit motion from which on it is constrained.
     """
     value, axes = np.linalg.eigh(push.T @ push / steps)
-    loose = axes[:, value < HELD]
+    loose = axes[:, value < min_constraint]
     return loose @ loose.T
 
 
 def _moved_by_joints(m: mujoco.MjModel, body: int) -> bool:
-    """Return whether a body hangs on joints, as a robot's do, rather than being free or fixed."""
+    """Return whether a body is moved by joints, as a robot's links are, rather than being free or fixed."""
     root = body
     while m.body_parentid[root] != 0:
         root = int(m.body_parentid[root])

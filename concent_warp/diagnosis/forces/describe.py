@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from concent_warp.comparison.units import p_value_text
 from concent_warp.diagnosis.forces import features
 from concent_warp.diagnosis.forces.dependence import Dependences
 from concent_warp.diagnosis.forces.force_data import BodyForce, JointForce, PhaseForce
@@ -50,7 +51,7 @@ def joint_sentence(found: JointForce) -> str:
         return f"{head}; it {_pattern_words(found.dependences, found.unit, length)}."
     if found.significant:
         return f"{head}; it follows none of the features{_where_words(found)}."
-    return f"{head}, no more than noise; a steady force of {found.detectable:.2g} {found.unit} would have shown."
+    return f"{head}, no more than noise; smallest detectable steady force: {found.detectable:.2g} {found.unit}."
 
 
 def _where_words(found: JointForce) -> str:
@@ -82,9 +83,10 @@ def _pattern_words(found: Dependences, unit: str, length: str) -> str:
         factor = "" if pattern.feature in DIMENSIONLESS else unit
         per = UNITS.get(pattern.feature, "").format(speed=f"{length}/s", length=length)
         size = f"{pattern.slope:.3g} ± {1.96 * pattern.slope_std:.1g} {factor} {per}".rstrip()
-        text = f"{words} ({' '.join(size.split())}; {100 * pattern.share:.0f} % of it, p = {pattern.p:.2g})"
+        p = p_value_text(pattern.p, pattern.smallest_p)
+        text = f"{words} ({' '.join(size.split())}; {100 * pattern.share:.0f} % of it, {p})"
         if pattern.alternatives:
-            text += f", which these data cannot tell from {' or '.join(pattern.alternatives[:3])}"
+            text += f", which these data cannot distinguish from {' or '.join(pattern.alternatives[:3])}"
         parts.append(text)
     return "; besides, it ".join(parts)
 
@@ -99,7 +101,7 @@ def body_sentence(body: str, found: PhaseForce) -> str:
         text += _place_words(found.place)
     if found.phase == "impact":
         text += f"; {np.linalg.norm(found.impulse):.2g} N s a time"
-    return f"{text}; p = {found.p:.2g}."
+    return f"{text}; {p_value_text(found.p, found.smallest_p)}."
 
 
 def _place_words(place: ForcePlace) -> str:
@@ -111,13 +113,13 @@ def _place_words(place: ForcePlace) -> str:
     elif place.off:
         words = f", on a line that misses it by {1e3 * place.off:.0f} mm"
     else:
-        told = [i for i, axis in enumerate(AXES) if axis not in place.hidden]
-        coordinates = ", ".join(f"{1e3 * place.point[i]:.0f}" if i in told else "?" for i in range(3))
+        known = [i for i, axis in enumerate(AXES) if axis not in place.hidden]
+        coordinates = ", ".join(f"{1e3 * place.point[i]:.0f}" if i in known else "?" for i in range(3))
         words = f", at ({coordinates}) mm: {place.face}"
-        if told:
-            words += f", ± {1e3 * 1.96 * max(place.std[i] for i in told):.2g} mm"
+        if known:
+            words += f", ± {1e3 * 1.96 * max(place.std[i] for i in known):.2g} mm"
         if place.hidden:
-            words += f" (where along {' and '.join(place.hidden)} its contacts hide)"
+            words += f" (its contacts hide the place along {' and '.join(place.hidden)})"
     if place.through_center:
         words += "; its line passes through the centre of mass, as that of weight, wind or inertia does"
     return words

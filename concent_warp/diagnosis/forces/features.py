@@ -1,4 +1,4 @@
-"""What unexplained forces are tested against: features of the motion in each window, averaged as the forces are."""
+"""Features of the motion in each window that unexplained forces are tested against, averaged as the forces are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.comparison.phases import GRASPED
+from concent_warp.diagnosis.forces.cfg import FeatureCfg
 from concent_warp.diagnosis.forces.contact_state import PUSHED
 from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 
@@ -24,15 +25,8 @@ COMMAND_RATE, POSITION, CONSTANT, CONTACT = "rate of the command", "position", "
 SLIDING, DRAG = "direction of sliding", "velocity x speed"
 AXES = ("x", "y", "z")
 
-SLOW_PERCENTILE = 25
-"""Percentile of a joint's speed that is called slow."""
-PEAK = 0.75
-"""Share of the largest drive force from which on it is near its peak."""
-RATE_STEP = 0.01
-"""Time over which the rate of a command is taken [s]."""
 
-
-def joint_features(windows: Windows, motion: MeasuredMotion) -> dict[str, dict[str, np.ndarray]]:
+def joint_features(windows: Windows, motion: MeasuredMotion, cfg: FeatureCfg) -> dict[str, dict[str, np.ndarray]]:
     """Return the features of each measured joint, by its name, shape (K, 1) each.
 
     Units: "velocity" rad/s (m/s), "acceleration" rad/s^2, "direction of motion" -1..1, "position" rad about its mean,
@@ -46,7 +40,7 @@ def joint_features(windows: Windows, motion: MeasuredMotion) -> dict[str, dict[s
     qpos, qvel = motion.states(time)
     qacc = motion.acceleration(time)
     dt = m.opt.timestep
-    back = max(round(RATE_STEP / dt), 1)
+    back = max(round(cfg.rate_step / dt), 1)
     now = np.clip((time / dt).astype(int), 0, len(motion.ctrl) - 1)
     load, drive, before = (np.empty((len(time), m.nv)) for _ in range(3))
     for i in range(len(time)):
@@ -66,12 +60,12 @@ def joint_features(windows: Windows, motion: MeasuredMotion) -> dict[str, dict[s
     for joint in motion.joints:
         v = qvel[:, joint.dof]
         std = np.sqrt(joint.position.smooth.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
-        direction = v / np.sqrt(v**2 + (2 * std) ** 2)
-        force, scale = drive[:, joint.dof], float(np.percentile(np.abs(v), SLOW_PERCENTILE))
+        direction = v / np.sqrt(v**2 + (cfg.direction_standard_errors * std) ** 2)
+        force, scale = drive[:, joint.dof], float(np.percentile(np.abs(v), cfg.slow_percentile))
         raw = {
             DIRECTION: direction,
             SLOW: direction * np.exp(-((v / max(scale, 1e-9)) ** 2)),
-            LIMIT: np.sign(force) * np.maximum(np.abs(force) - PEAK * float(np.abs(force).max()), 0),
+            LIMIT: np.sign(force) * np.maximum(np.abs(force) - cfg.peak_share * float(np.abs(force).max()), 0),
             SPEED: v,
             ACCELERATION: qacc[:, joint.dof],
             LOADED: direction * np.abs(load[:, joint.dof]),
@@ -88,13 +82,13 @@ def joint_features(windows: Windows, motion: MeasuredMotion) -> dict[str, dict[s
 
 
 def _varies(name: str, value: np.ndarray) -> bool:
-    """Return whether a feature says more than a constant does."""
+    """Return whether a feature is a constant one or varies."""
     size = float(np.abs(value).max(initial=0))
     return name == CONSTANT or (size > 0 and float(np.ptp(value)) > 1e-6 * size)
 
 
 def _contact_shares(m: mujoco.MjModel, windows: Windows) -> np.ndarray:
-    """Return in which share of the steps of a window something beyond a degree of freedom touches, shape (K, nv)."""
+    """Return the share of each window's steps with a contact beyond a degree of freedom, shape (K, nv)."""
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1
     log = windows.contacts
     shares = np.zeros((count, m.nv))

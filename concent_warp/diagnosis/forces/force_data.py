@@ -19,7 +19,7 @@ class ForceSeries:
     time: np.ndarray
     """Middles of the windows [s], shape (K,)."""
     force: np.ndarray
-    """Shape (K,) of a joint, (K, 3) of a body (world frame); NaN where it cannot be told."""
+    """Shape (K,) of a joint, (K, 3) of a body (world frame); NaN where it cannot be estimated."""
     std: np.ndarray
     """Standard deviation, shape (K,)."""
 
@@ -42,9 +42,9 @@ class JointForce:
     ratio: float
     """RMS of force over noise, window by window."""
     detectable: float
-    """Smallest steady force that would have been seen."""
+    """Smallest detectable steady force, in `unit`."""
     p: float
-    """Probability of such a dependence on any of the features by chance."""
+    """p-value of the strongest dependence on any of the features [-]."""
     significant: bool
     """It follows a pattern, after correction for the number of joints and bodies (Holm), or is far beyond noise."""
     dependences: Dependences
@@ -80,7 +80,11 @@ class PhaseForce:
     torque: np.ndarray
     """Mean unexplained torque about the body's origin [N m], body frame, shape (3,)."""
     p: float
+    """p-value [-]."""
+    smallest_p: float
+    """Smallest `p` that the test can give [-]; 0 for known noise."""
     test: str
+    """"sign flips", or "known noise"."""
     significant: bool
     place: ForcePlace | None
     """Where it acts; None where that was not measured, or where nothing significant acts."""

@@ -1,4 +1,4 @@
-"""Locate what a model lacks: unexplained forces by degree of freedom, and the places on objects where they act."""
+"""Forces that a model lacks: by degree of freedom, and by the places on objects where they act."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from concent_warp.diagnosis.forces.body_forces import body_force, judged
-from concent_warp.diagnosis.forces.dependence import LEAST_SHARE, LEAST_SHARE_IN_CONTACT, LEVEL, blocks_of, dependences
+from concent_warp.diagnosis.forces.body_forces import body_force, with_significance
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
+from concent_warp.diagnosis.forces.dependence import blocks_of, dependences, min_share
 from concent_warp.diagnosis.forces.features import CONTACT, joint_features
 from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
-from concent_warp.diagnosis.forces.result import DETECTABLE, UnexplainedForces
-from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, Windows, window_forces, window_length
+from concent_warp.diagnosis.forces.result import UnexplainedForces
+from concent_warp.diagnosis.forces.window_forces import Windows, window_forces, window_length
 from concent_warp.estimation.measured_motion import MeasuredMotion, measured_motion
 from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
@@ -22,12 +23,6 @@ from concent_warp.simulate.select import EngineName, make_engine
 if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
-
-SELDOM = 0.05
-"""Share of the time below which a joint's contact is neglected."""
-BEYOND_NOISE = 1.7
-"""Forces this many times what noise leaves are there, whatever they depend on; without any, up to 1.4 was seen where
-contacts change within windows."""
 
 
 def locate_forces(
@@ -39,18 +34,18 @@ def locate_forces(
     out: str | Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> UnexplainedForces:
-    """Find the forces that a model lacks: by joint, and on which place of which object.
+    """Return the forces that a model lacks: by joint, and by place on each object.
 
     Args:
         model: The model.
         recording: What was commanded and measured.
-        cfg: How demonstrations are cut into windows.
+        cfg: Settings.
         engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device.
         out: JSON file for all figures, SI units.
         progress: Called with the share done, 0..1.
 
     Raises:
-        RecordingError: There is no such demonstration, or nothing in it that a force could be told from.
+        RecordingError: There is no such demonstration, or nothing in it from which a force could be estimated.
         EngineError: The model cannot be simulated.
 
     Example:
@@ -73,18 +68,18 @@ def locate_forces(
     for k, (d, motion) in enumerate(zip(chosen, motions, strict=True)):
         windows.append(window_forces(d.name, simulator, motion, cfg))
         report(0.1 + 0.6 * (k + 1) / len(chosen))
-    features = [joint_features(w, m) for w, m in zip(windows, motions, strict=True)]
+    features = [joint_features(w, m, cfg.features) for w, m in zip(windows, motions, strict=True)]
     joints = [_joint_force(name, unit, dof, windows, features, cfg) for name, unit, dof in _all_joints(motions)]
-    bodies = [body_force(model, name, motions, windows, cfg.seed) for name in _all_bodies(motions)]
-    accepted = _holm([f.p for f in joints] + [f.p for f in bodies])
+    bodies = [body_force(model, name, motions, windows, cfg) for name in _all_bodies(motions)]
+    accepted = _holm([f.p for f in joints] + [f.p for f in bodies], cfg.dependence.level)
     joints = [
-        replace(f, significant=f.ratio > BEYOND_NOISE or (ok and bool(f.dependences.patterns)))
+        replace(f, significant=f.ratio > cfg.significant_ratio or (ok and bool(f.dependences.patterns)))
         for f, ok in zip(joints, accepted[: len(joints)], strict=True)
     ]
-    bodies = [judged(f, ok, f.ratio > BEYOND_NOISE) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
+    bodies = [with_significance(f, ok, cfg) for f, ok in zip(bodies, accepted[len(joints) :], strict=True)]
     joints.sort(key=lambda f: (not f.significant, -f.ratio))
     bodies.sort(key=lambda f: (not f.significant, -f.ratio))
-    found = UnexplainedForces(windows[0].length, tuple(joints), tuple(bodies))
+    found = UnexplainedForces(windows[0].length, tuple(joints), tuple(bodies), cfg.dependence.level)
     if out is not None:
         write_json(Path(out), found.to_json())
     return found
@@ -121,10 +116,9 @@ def _joint_force(
     std = np.concatenate([w.std[:, dof] for w, _ in parts])
     names = [n for n in parts[0][1] if all(n in f for _, f in parts)]
     table = {n: np.concatenate([f[n] for _, f in parts]) for n in names}
-    block = blocks_of([len(w.start) for w, _ in parts])
-    touches = float(np.mean(table.get(CONTACT, 0.0))) > SELDOM
-    least = LEAST_SHARE_IN_CONTACT if touches else LEAST_SHARE
-    found = dependences(force[:, None], std, table, block, cfg.seed, least)
+    block = blocks_of([len(w.start) for w, _ in parts], cfg.dependence)
+    touches = float(np.mean(table.get(CONTACT, 0.0))) > cfg.max_contact_share
+    found = dependences(force[:, None], std, table, block, cfg.seed, cfg.dependence, in_contact=touches)
     valid = np.isfinite(force) & (std > 0)
     return JointForce(
         joint=name,
@@ -132,7 +126,7 @@ def _joint_force(
         rms=_root_mean_square(force[valid]),
         noise=_root_mean_square(std[valid]),
         ratio=_root_mean_square(force[valid] / std[valid]),
-        detectable=_detectable(std[valid], least),
+        detectable=_detectable(std[valid], min_share(cfg.dependence, touches), cfg.detectable_standard_errors),
         p=found.p,
         significant=False,
         dependences=found,
@@ -140,22 +134,22 @@ def _joint_force(
     )
 
 
-def _detectable(std: np.ndarray, share: float) -> float:
-    """Return the smallest steady force that would be seen in windows with errors `std` (n,); NaN without any.
+def _detectable(std: np.ndarray, share: float, standard_errors: float) -> float:
+    """Return the smallest detectable steady force in windows with errors `std` (n,); NaN without any.
 
-    It stands out from their mean's error, and makes a `share` of all forces.
+    It exceeds so many standard errors of their mean, and is a `share` of the mean squared force.
     """
     if not len(std):
         return np.nan
     precision = float((1 / std**2).sum())
-    return max(DETECTABLE, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
+    return max(standard_errors, float(np.sqrt(share / (1 - share) * len(std)))) / float(np.sqrt(precision))
 
 
-def _holm(p: Sequence[float]) -> list[bool]:
-    """Return which hypotheses are rejected at `LEVEL` over all of them (Holm, 1979)."""
+def _holm(p: Sequence[float], level: float) -> list[bool]:
+    """Return which hypotheses are rejected at a level over all of them (Holm, Scand. J. Stat. 6, 1979)."""
     accepted = [False] * len(p)
     for rank, i in enumerate(np.argsort(p)):
-        if p[i] > LEVEL / (len(p) - rank):
+        if p[i] > level / (len(p) - rank):
             break
         accepted[i] = True
     return accepted

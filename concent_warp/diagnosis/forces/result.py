@@ -1,4 +1,4 @@
-"""Where unexplained forces act: by degree of freedom, and on which place of which object."""
+"""Unexplained forces by degree of freedom and by place on each object."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from concent_warp.comparison.result import finite
-from concent_warp.diagnosis.forces.dependence import LEVEL
 from concent_warp.diagnosis.forces.describe import (
     body_sentence,
     joint_sentence,
@@ -15,13 +14,10 @@ from concent_warp.diagnosis.forces.describe import (
 )
 from concent_warp.diagnosis.forces.force_data import BodyForce, JointForce
 
-DETECTABLE = 3.0
-"""Standard errors above which a steady force is seen."""
-
 
 @dataclass(frozen=True)
 class UnexplainedForces:
-    """Where the model lacks forces."""
+    """Forces that a model lacks."""
 
     window: float
     """Time over which forces are averaged [s]."""
@@ -29,6 +25,8 @@ class UnexplainedForces:
     """Those with significant forces first, then by how far beyond noise."""
     bodies: tuple[BodyForce, ...]
     """Those with significant forces first, then by how far beyond noise."""
+    level: float
+    """Significance level [-]."""
 
     def arrows(self) -> list[dict[str, Any]]:
         """Return what to draw on the objects: significant forces that have a place, in the frame of their body.
@@ -50,7 +48,7 @@ class UnexplainedForces:
         ]
 
     def sentences(self) -> list[str]:
-        """Return what was found, a sentence for each force."""
+        """Return a sentence for each force."""
         found = []
         for joint in self.joints:
             found.append(joint_sentence(joint))
@@ -67,7 +65,7 @@ class UnexplainedForces:
         return finite(
             {
                 "window": self.window,
-                "level": LEVEL,
+                "level": self.level,
                 "sentences": self.sentences(),
                 "joints": [joint.to_json() for joint in self.joints],
                 "bodies": [body.to_json() for body in self.bodies],

@@ -1,14 +1,14 @@
-"""Unexplained forces, window by window: where the model goes from the measured state, against what was measured.
+"""Unexplained forces by window: the model's simulation from the measured state against the readings.
 
-From the smoothed state at the start of a short window the model is simulated to its end. What the readings depart from
-that is, to first order, an error of the start carried on by the model's dynamics, and what an unexplained acceleration
-a adds (see `window_solver`). Least squares over the window tells the two apart, and M a is the residual generalised
-force: the momentum that the model lacks, over the window. This holds through impacts and sliding, where forces at the
-measured state itself would be at the mercy of penetrations smaller than the noise. What it gives is averaged over a
-window with the weight 30 u^2 (1 - u)^2, u = 0..1 from start to end.
+From the smoothed state at the start of a short window the model is simulated to its end. The departure of the readings
+from that is, to first order, the response of the model's dynamics to an error of the start and to an unexplained
+acceleration a (see `window_solver`). Least squares over the window separates the two, and M a is the residual
+generalised force: the momentum that the model lacks, over the window. This holds through impacts and sliding, where an
+inverse dynamics at the measured state would depend on penetrations smaller than the noise. The force is an average over
+the window with the weight 30 u^2 (1 - u)^2, u = 0..1 from start to end.
 
-The window is simulated from further states too, drawn from the error of the smoothed one; how much a scatters among
-them (an impact now inside the window, now outside) adds to its error, and so does what the law leaves beyond the noise.
+The window is also simulated from further states, drawn from the error of the smoothed one; the scatter of a among them
+(an impact inside the window or outside) adds to its error, and so does a misfit beyond the noise.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.window_solver import Simulated, WindowSolver
 from concent_warp.errors import RecordingError
 from concent_warp.simulate.engine import ContactLog, Engine, Variants
@@ -29,25 +30,6 @@ SHARES = (np.arange(5) + 0.5) / 5
 """Instants within a window, as shares of its length, at which what forces depend on is taken."""
 WEIGHTS = 30 * SHARES**2 * (1 - SHARES) ** 2 / np.sum(30 * SHARES**2 * (1 - SHARES) ** 2)
 """Their weights: those with which forces are averaged, shape (5,)."""
-
-
-@dataclass(frozen=True)
-class LocateForcesCfg:
-    """How a demonstration is cut.
-
-    Example:
-        >>> import concent_warp as cw
-        >>> cw.LocateForcesCfg(0.1).length
-        0.1
-    """
-
-    length: float | None = None
-    """Length of a window [s]; by default 0.1 s for joints alone, 0.12 s with free bodies, whose readings are coarser,
-    and up to 0.3 s where readings are rare. Errors of forces fall with its square; what changes within it is blurred,
-    and a body that sets out or comes to rest within it tells nothing."""
-    draws: int = 4
-    """Further starting states of each window."""
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -66,9 +48,9 @@ class Windows:
     edge_qvel: np.ndarray
     """Smoothed velocities at start and end, shape (2, K, nv)."""
     force: np.ndarray
-    """Residual generalised force [N, N m], shape (K, nv); NaN where it cannot be told."""
+    """Residual generalised force [N, N m], shape (K, nv); NaN where it cannot be estimated."""
     covariance: np.ndarray
-    """Of the force, shape (K, nv, nv); 0 rows where it cannot be told."""
+    """Of the force, shape (K, nv, nv); 0 rows where it cannot be estimated."""
     contacts: ContactLog
     """Contacts of the model in each window; `variant` is the window, `step` counts from its start."""
     path: np.ndarray
@@ -86,7 +68,7 @@ class Windows:
 
 
 def window_length(motion: MeasuredMotion) -> float:
-    """Return the length of windows that suits what was measured [s]."""
+    """Return the default length of a window for what was measured [s]."""
     return float(min(max(0.12 if motion.bodies else 0.1, 8 * motion.period), 0.3))
 
 
@@ -103,7 +85,7 @@ def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: Locate
     steps, length = 2 * half, 2 * half * engine.timestep
     if end - begin < 1.5 * length:
         raise RecordingError(
-            "too short a time in which all that moves was measured",
+            "all that moves was measured for too short a time",
             where=name,
             expected=f"at least {1.5 * length:.3g} s",
             found=f"{max(end - begin, 0.0):.3g} s",
@@ -113,23 +95,23 @@ def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: Locate
     start = step * engine.timestep
     ctrl = motion.ctrl[np.minimum(step[:, None] + np.arange(steps), len(motion.ctrl) - 1)]
     rng = np.random.default_rng(cfg.seed)
-    qpos, qvel = motion.draws(start, cfg.draws, rng)
+    qpos, qvel = motion.draws(start, cfg.extra_starts, rng)
     first_run = Variants(len(start), qpos=qpos[0], qvel=qvel[0])
     nominal = engine.run(first_run, ctrl, bodies=(), contacts="all").numpy()
     assert nominal.contacts is not None
     path = np.asarray(nominal.qpos, dtype=float)[None]
-    if cfg.draws:
-        count = cfg.draws * len(start)
+    if cfg.extra_starts:
+        count = cfg.extra_starts * len(start)
         further = Variants(count, qpos=qpos[1:].reshape(count, m.nq), qvel=qvel[1:].reshape(count, m.nv))
-        drawn = engine.run(further, ctrl, bodies=()).numpy()
-        path = np.concatenate([path, np.asarray(drawn.qpos, dtype=float).reshape(cfg.draws, *path.shape[1:])])
+        extra = engine.run(further, ctrl, bodies=()).numpy()
+        path = np.concatenate([path, np.asarray(extra.qpos, dtype=float).reshape(cfg.extra_starts, *path.shape[1:])])
     speed = np.asarray(nominal.qvel, dtype=float)
     middle = start + length / 2
     mid_qpos, mid_qvel = motion.states(middle)
     edges = np.stack([motion.states(start)[1], motion.states(start + length)[1]])
     force = np.full((len(start), m.nv), np.nan)
     covariance = np.zeros((len(start), m.nv, m.nv))
-    solver = WindowSolver(motion, engine, length)
+    solver = WindowSolver(motion, engine, length, cfg.solver)
     log = nominal.contacts
     edge = np.searchsorted(log.variant, np.arange(len(start) + 1))
     for k in range(len(start)):

@@ -1,6 +1,6 @@
-"""One window: from departures of the readings from the model's simulation to unexplained forces.
+"""The unexplained force in one window, from departures of the readings from the model's simulation.
 
-Departures e of what moves answer to their own start and to an unexplained acceleration a,
+Departures e respond to their own start and to an unexplained acceleration a,
 
     e'' = Aq e + Av e' + a,
 
@@ -20,6 +20,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from concent_warp.diagnosis.forces.cfg import WindowSolverCfg
+
 if TYPE_CHECKING:
     from concent_warp.estimation.measured_motion import (
         MeasuredMotion,
@@ -28,13 +30,6 @@ if TYPE_CHECKING:
         SmoothedSignal,
     )
     from concent_warp.simulate.engine import ContactLog, Engine
-
-FEWEST_READINGS = 5
-"""Readings of a signal in a window that tell an acceleration with some redundancy."""
-SUBSTEPS = 40
-"""Parts of a window at which departures are laid out."""
-SLOW = 0.02
-"""Speed below which sliding friction damps no more than at it [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +68,11 @@ class Readings:
 class WindowSolver:
     """Turns departures from simulated windows into forces."""
 
-    def __init__(self, motion: MeasuredMotion, engine: Engine, length: float) -> None:
+    def __init__(self, motion: MeasuredMotion, engine: Engine, length: float, cfg: WindowSolverCfg) -> None:
+        """Prepare to solve windows of a length [s] of a motion."""
         self.motion = motion
         self.timestep = engine.timestep
-        self.length = length
+        self.length, self.cfg = length, cfg
         self.model = copy.copy(engine.compiled)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         self.data = mujoco.MjData(self.model)
@@ -117,7 +113,7 @@ class WindowSolver:
         noise: np.ndarray,
         known: np.ndarray,
     ) -> None:
-        """Fill in what is found of a free body, in the frames of its generalised velocity."""
+        """Write the acceleration of a free body, in the frames of its generalised velocity."""
         count = 3 if body.orientation is None else 6
         position = window.path[:, :, body.qpos : body.qpos + 3]
         readings = [self._readings(window.start, body.position, position, np.arange(3), turning=False)]
@@ -125,32 +121,31 @@ class WindowSolver:
             quaternion = window.path[:, :, body.qpos + 3 : body.qpos + 7]
             readings.append(self._readings(window.start, body.orientation, quaternion, np.arange(3, 6), turning=True))
         known[body.dof + count : body.dof + 6] = False
-        if min(len(r.clock) for r in readings) < FEWEST_READINGS:
+        if min(len(r.clock) for r in readings) < self.cfg.min_readings:
             known[body.dof : body.dof + 6] = False
             return
         # World frame for both: the error of an angular velocity turns with the body, but not in the world.
         frame = np.eye(6)
         frame[3:, 3:] = Rotation.from_quat(window.qpos[body.qpos + 3 : body.qpos + 7], scalar_first=True).as_matrix()
         inertia = frame @ mass[body.dof : body.dof + 6, body.dof : body.dof + 6] @ frame.T
-        damping = _sliding_damping(self.model, window, body)
+        damping = _sliding_damping(self.model, window, body, self.cfg.min_sliding_speed)
         rate = -np.linalg.solve(inertia, damping)[:count, :count]
         groups = np.repeat([0, 1], 3)[:count]
-        found, covariance = _fitted(
-            readings, _response(np.zeros((count, count)), rate, self.length), self.length, groups
-        )
+        response = _response(np.zeros((count, count)), rate, self.length, self.cfg.substeps)
+        found, covariance = _fitted(readings, response, self.length, groups, self.cfg.misfit_standard_errors)
         back = frame[:count, :count]
         dofs = slice(body.dof, body.dof + count)
         acceleration[:, dofs] = found @ back
         noise[dofs, dofs] = back.T @ covariance @ back
 
     def _joints(self, window: Simulated, acceleration: np.ndarray, noise: np.ndarray, known: np.ndarray) -> None:
-        """Fill in what is found of the joints, all at once: they pull at one another."""
+        """Write the accelerations of the joints, solved together since they are coupled."""
         joints: list[SmoothedJointMotion] = []
         readings: list[Readings] = []
         for joint in self.motion.joints:
             path = window.path[:, :, joint.qpos, None]
             found = self._readings(window.start, joint.position, path, np.array([len(joints)]), turning=False)
-            known[joint.dof] = len(found.clock) >= FEWEST_READINGS
+            known[joint.dof] = len(found.clock) >= self.cfg.min_readings
             if known[joint.dof]:
                 joints.append(joint)
                 readings.append(found)
@@ -163,13 +158,14 @@ class WindowSolver:
                 readings.append(
                     self._readings(window.start, joint.velocity, path, np.array([count + i]), turning=False)
                 )
-        law = _response(*self._drives(joints), self.length)
-        found, covariance = _fitted(readings, law, self.length, np.arange(count))
+        response = _response(*self._drives(joints), self.length, self.cfg.substeps)
+        groups = np.arange(count)
+        found, covariance = _fitted(readings, response, self.length, groups, self.cfg.misfit_standard_errors)
         acceleration[:, dofs] = found
         noise[np.ix_(dofs, dofs)] = covariance
 
     def _drives(self, joints: list[SmoothedJointMotion]) -> tuple[np.ndarray, np.ndarray]:
-        """Return how accelerations of joints answer to their positions and velocities, constraints left out, (n, n)."""
+        """Return derivatives of joint accelerations by positions and velocities, without constraints, (n, n) each."""
         m, d = self.model, self.data
         dofs = [j.dof for j in joints]
         base, step = d.qacc_smooth[dofs].copy(), 1e-5
@@ -200,10 +196,11 @@ class WindowSolver:
         return Readings(clock, off, signal.std, rows)
 
 
-def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMotion) -> np.ndarray:
+def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMotion, min_speed: float) -> np.ndarray:
     """Return the damping of a body's motion (world frame, about its origin) by sliding on what is fixed, shape (6, 6).
 
-    Friction f against the slip v, |f| fixed: df/dv = -|f| / |v| (1 - n n' - v v' / |v|^2), n the normal.
+    Friction f against the slip v, |f| fixed: df/dv = -|f| / |v| (1 - n n' - v v' / |v|^2), n the normal; |v| counts as
+    `min_speed` [m/s] at least.
     """
     log = window.contacts
     owner = m.geom_bodyid[log.geom]
@@ -225,7 +222,7 @@ def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMot
     friction = np.linalg.norm(force - normal * (force * normal).sum(axis=1, keepdims=True), axis=1)
     along = slip / np.maximum(speed, 1e-9)[:, None]
     across = np.eye(3) - normal[:, :, None] * normal[:, None] - along[:, :, None] * along[:, None]
-    local = (friction / np.maximum(speed, SLOW))[:, None, None] * across
+    local = (friction / np.maximum(speed, min_speed))[:, None, None] * across
     # Velocity at the contact is v + w x r = [1, -r x] [v, w].
     zero = np.zeros(len(rows))
     x, y, z = arm.T
@@ -234,46 +231,48 @@ def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMot
     return np.einsum("cki,ckl,clj->ij", carry, local, carry) / (window.path.shape[1] - 1)
 
 
-def _response(stiffness: np.ndarray, damping: np.ndarray, length: float) -> np.ndarray:
-    """Return how departures answer to their start and to a constant acceleration, shape (SUBSTEPS + 1, 3n, 3n).
+def _response(stiffness: np.ndarray, damping: np.ndarray, length: float, substeps: int) -> np.ndarray:
+    """Return the response of departures to their start and to a constant acceleration, shape (substeps + 1, 3n, 3n).
 
     Rows are position, velocity and acceleration of the departures, columns what they are at the start.
 
     Args:
         stiffness: Aq, shape (n, n).
         damping: Av, shape (n, n).
-        length: [s].
+        length: Length of the window [s].
+        substeps: Instants at which the response is tabulated, besides the start.
     """
     n = len(stiffness)
     generator = np.zeros((3 * n, 3 * n))
     generator[:n, n : 2 * n] = np.eye(n)
     generator[n : 2 * n] = np.concatenate([stiffness, damping, np.eye(n)], axis=1)
-    transition = expm(generator * length / SUBSTEPS)
-    law = np.empty((SUBSTEPS + 1, 3 * n, 3 * n))
-    law[0] = np.eye(3 * n)
-    for k in range(SUBSTEPS):
-        law[k + 1] = transition @ law[k]
-    return law
+    transition = expm(generator * length / substeps)
+    response = np.empty((substeps + 1, 3 * n, 3 * n))
+    response[0] = np.eye(3 * n)
+    for k in range(substeps):
+        response[k + 1] = transition @ response[k]
+    return response
 
 
 def _fitted(
-    readings: list[Readings], law: np.ndarray, length: float, groups: np.ndarray
+    readings: list[Readings], response: np.ndarray, length: float, groups: np.ndarray, standard_errors: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the accelerations (V, n) that fit readings best, and the covariance (n, n) that their noise leaves.
 
     Args:
         readings: Of positions, and of velocities.
-        law: See `_response`.
-        length: [s].
+        response: See `_response`.
+        length: Length of the window [s].
         groups: Which degrees of freedom share their misfit, shape (n,).
+        standard_errors: See `WindowSolverCfg.misfit_standard_errors`.
     """
-    n = law.shape[1] // 3
+    n, substeps = response.shape[1] // 3, len(response) - 1
     design, off, group = [], [], []
     for r in readings:
-        place = r.clock / length * SUBSTEPS
-        lower = np.clip(place.astype(int), 0, SUBSTEPS - 1)
+        place = r.clock / length * substeps
+        lower = np.clip(place.astype(int), 0, substeps - 1)
         part = (place - lower)[:, None, None]
-        shown = law[lower][:, r.rows] * (1 - part) + law[lower + 1][:, r.rows] * part
+        shown = response[lower][:, r.rows] * (1 - part) + response[lower + 1][:, r.rows] * part
         design.append(shown.reshape(-1, 3 * n) / r.std)
         off.append(r.off.reshape(len(r.off), -1) / r.std)
         group.append(np.tile(groups[r.rows % n], len(r.clock)))
@@ -282,19 +281,20 @@ def _fitted(
     inverse = size[:, None] * np.linalg.pinv(matrix * size)
     left = target.mean(axis=0) - matrix @ (inverse @ target.mean(axis=0))
     freedom = {g: int((owner == g).sum()) - 3 * int((groups == g).sum()) for g in np.unique(groups)}
-    scale = np.array([_misfit(float((left[owner == g] ** 2).sum()), freedom[g]) for g in groups])
+    scale = np.array([_misfit(float((left[owner == g] ** 2).sum()), freedom[g], standard_errors) for g in groups])
     inverse = inverse[2 * n :]
     return target @ inverse.T, np.sqrt(scale[:, None] * scale) * (inverse @ inverse.T)
 
 
-def _misfit(square: float, freedom: int) -> float:
-    """Return by how much variances grow where a window does not fit its law: its mean square, 1 where that is chance.
+def _misfit(square: float, freedom: int, standard_errors: float) -> float:
+    """Return the factor on variances for a window's misfit: its mean square where that is significant, else 1.
 
     Args:
-        square: Sum of squares of what is left, in noise standard deviations.
-        freedom: Readings less what was fitted.
+        square: Sum of squared residuals, in noise standard deviations.
+        freedom: Readings less fitted unknowns.
+        standard_errors: Standard errors above 1 from which on a mean square is significant.
     """
     if freedom < 1:
         return 1.0
     mean = square / freedom
-    return mean if mean > 1 + 3 * np.sqrt(2 / freedom) else 1.0
+    return mean if mean > 1 + standard_errors * np.sqrt(2 / freedom) else 1.0

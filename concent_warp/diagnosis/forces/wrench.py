@@ -1,7 +1,7 @@
-"""The unexplained force and torque on a free body in one phase: how large, which way, and whether more than noise.
+"""The unexplained force and torque on a free body in one phase: size, direction and significance.
 
-Contacts hide forces: what presses a block onto a table is answered by the table. So only the part of a wrench along
-motions that lasting contacts leave free is seen, P w with the projector P of `contact_state`; the rest is taken as 0.
+Contacts hide forces: the table balances what presses a block onto it. Only the part of a wrench along motions that
+lasting contacts leave free is visible, P w with the projector P of `contact_state`; the rest is taken as 0.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.contact_state import BodyWindows
-from concent_warp.diagnosis.forces.dependence import FEWEST_BLOCKS, flips
+from concent_warp.diagnosis.forces.dependence import flips
 
 WORLD, SLIP = "world", "sliding"
-SIGHT = 0.3
-"""Share of a direction's length that must be seen for it to count."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +23,13 @@ class Wrenches:
     """Unexplained wrenches on one body in some windows, world frame, about the body's origin; n windows."""
 
     force: np.ndarray
-    """What is seen of the force [N], shape (n, 3)."""
+    """Visible part of the force [N], shape (n, 3)."""
     torque: np.ndarray
-    """What is seen of the torque [N m], shape (n, 3)."""
+    """Visible part of the torque [N m], shape (n, 3)."""
     covariance: np.ndarray
     """Of force and torque / size, shape (n, 6, 6)."""
     free: np.ndarray
-    """Projectors onto what is seen, of force and torque / size, shape (n, 6, 6)."""
+    """Projectors onto the visible part of force and torque / size, shape (n, 6, 6)."""
     size: float
     """Radius that makes torques comparable with forces [m]."""
     rotation: np.ndarray
@@ -41,13 +40,15 @@ class Wrenches:
     """Block of each window for sign flips, shape (n,)."""
     turned: bool
     """Whether torques are known: the orientation was measured."""
+    min_visible: float
+    """Share of a direction's length that must be visible for it to count."""
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviation of a seen component of the force [N], shape (n,)."""
+        """Standard deviation of a visible component of the force [N], shape (n,)."""
         seen = np.einsum("nii->n", self.free[:, :3, :3])
         spread = np.einsum("nii->n", self.covariance[:, :3, :3])
-        return np.sqrt(spread / np.maximum(seen, SIGHT))
+        return np.sqrt(spread / np.maximum(seen, self.min_visible))
 
     def only(self, chosen: np.ndarray) -> Wrenches:
         """Return some of the windows."""
@@ -73,8 +74,9 @@ def wrenches(
     valid: np.ndarray,
     *,
     turned: bool,
+    min_visible: float,
 ) -> Wrenches:
-    """Return what is seen of residual generalised forces of a free joint.
+    """Return the visible part of residual generalised forces of a free joint.
 
     Args:
         force: Force in the world frame and torque in the body frame, about the origin, shape (K, 6).
@@ -83,6 +85,7 @@ def wrenches(
         block: Blocks, shape (K,).
         valid: Which windows to take, shape (K,) bool.
         turned: Whether the orientation was measured.
+        min_visible: Share of a direction's length that must be visible for it to count.
     """
     force, covariance = np.nan_to_num(force[valid]), covariance[valid]
     rotation = state.rotation[valid]
@@ -104,6 +107,7 @@ def wrenches(
         sliding=state.sliding[valid],
         block=block[valid],
         turned=turned,
+        min_visible=min_visible,
     )
 
 
@@ -128,13 +132,15 @@ class SteadyForce:
     scale: float
     """Scatter about it over what the noise leaves, at least 1."""
     p: float
-    """Probability of as much by chance."""
+    """p-value [-]."""
+    smallest_p: float
+    """Smallest `p` that the test can give [-]; 0 for known noise."""
     test: str
     """"sign flips", or "known noise" where there are too few blocks for them."""
 
 
-def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
-    """Return the force of a phase that is steady in the world, in the body or along the slip; None where all is hidden.
+def steady_force(w: Wrenches, cfg: LocateForcesCfg) -> SteadyForce | None:
+    """Return the steady force of a phase in the world, in the body or along the slip; None where contacts hide it.
 
     The significance is that of the largest of the shares explained in the three frames.
     """
@@ -146,14 +152,15 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
     bases = {WORLD: sight, "body": sight @ w.rotation, SLIP: (sight @ slip[:, :, None])}
     labels, block = np.unique(w.block, return_inverse=True)
     block = np.repeat(block, 3)
-    exact = len(labels) >= FEWEST_BLOCKS
-    signs = flips(len(labels), np.random.default_rng(seed)) if exact else np.ones((1, len(labels)))
+    exact = len(labels) >= cfg.dependence.min_blocks
+    rng = np.random.default_rng(cfg.seed)
+    signs = flips(len(labels), rng, cfg.dependence) if exact else np.ones((1, len(labels)))
     total, statistics, fits = float(y @ y), [], {}
     for frame, basis in bases.items():
         x = (basis * weight[:, None, None]).reshape(len(y), -1)
         left, value, right = np.linalg.svd(x, full_matrices=False)
-        # What contacts hide nearly always is not extrapolated from the rest.
-        kept = np.einsum("ri,nji,njk,rk->r", right, basis, basis, right) > SIGHT**2 * len(basis)
+        # A direction that contacts hide nearly always is not extrapolated from the rest.
+        kept = np.einsum("ri,nji,njk,rk->r", right, basis, basis, right) > w.min_visible**2 * len(basis)
         left, value, right = left[:, kept], value[kept], right[kept]
         if not kept.any():
             continue
@@ -162,7 +169,7 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
         vector = right.T @ (left.T @ y / value)
         std = np.sqrt(((right.T / value) ** 2).sum(axis=1))
         fits[frame] = float(statistics[-1][0]), basis, vector, std, len(value)
-    # A direction costs: a frame with more freedom must explain that much more.
+    # Akaike's criterion: each further component must explain 2 more.
     if not fits:
         return None
     frame = max(fits, key=lambda f: fits[f][0] - 2 * fits[f][4])
@@ -174,8 +181,12 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
     else:
         p = float(min(1.0, len(fits) * min(chi2.sf(f[0] / scale**2, f[4]) for f in fits.values())))
     steady = np.einsum("nij,j->ni", basis, vector)
-    # Scatter beyond the noise only where it is clearly so: with 3 standard errors of a mean square.
-    excess = 1 - 1 / scale**2 if scale**2 > 1 + 3 * np.sqrt(2 / max(len(y) - freedom, 1)) else 0.0
+    # Scatter beyond the noise counts where it is significant: 3 standard errors of a mean square.
+    excess = (
+        1 - 1 / scale**2
+        if scale**2 > 1 + cfg.solver.misfit_standard_errors * np.sqrt(2 / max(len(y) - freedom, 1))
+        else 0.0
+    )
     return SteadyForce(
         frame=frame,
         vector=np.pad(vector, (0, 3 - len(vector))),
@@ -186,5 +197,6 @@ def steady_force(w: Wrenches, seed: int = 0) -> SteadyForce | None:
         share=explained / total if total > 0 else 0.0,
         scale=scale,
         p=p,
+        smallest_p=1 / len(signs) if exact else 0.0,
         test="sign flips" if exact else "known noise",
     )

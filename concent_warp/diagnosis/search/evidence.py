@@ -1,4 +1,4 @@
-"""What speaks for a fitted effect: its parameters with intervals, what it removes, and which others do as well."""
+"""Evidence for a fitted effect: parameters with intervals, held-out gain, p-value, and which others explain as much."""
 
 from __future__ import annotations
 
@@ -6,28 +6,79 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Detectable, Finding
-from concent_warp.diagnosis.search.steps import Candidate, FittedModel, Screened
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.search.candidates import label
+from concent_warp.diagnosis.search.null_distribution import null_p_value
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
 from concent_warp.fit.effects.prediction import Prediction
 
-SAME = 0.02
-"""Errors that differ by less than this share are taken for the same."""
+
+def assess(
+    base: FittedModel, c: FittedCandidate, null: np.ndarray, step: int, among: Sequence[Effect], cfg: DiagnoseCfg
+) -> Finding:
+    """Return a fitted candidate with its evidence, and whether it is accepted.
+
+    Args:
+        base: The fitted baseline.
+        c: The candidate.
+        null: Null distribution of the best candidate's gain, shape (n,).
+        step: Index of the addition.
+        among: All candidates of this addition.
+        cfg: Settings.
+    """
+    rng = np.random.default_rng(cfg.seed)
+    share, gain = c.share(base), c.gain(base)
+    low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, rng)
+    p, parameters = null_p_value(null, share), fitted_parameters(base, c)
+    folds = [gain[base.blocks.fold == f].sum() > 0 for f in np.unique(base.blocks.fold)]
+    reason = ""
+    if p > cfg.significance_level:
+        reason = "no better than chance"
+    elif share < cfg.min_gain:
+        reason = f"removes less than {100 * cfg.min_gain:.0f} % of the error"
+    elif low <= 0:
+        reason = "the interval of its gain includes zero"
+    elif np.mean(folds) < cfg.search.min_fold_share:
+        reason = "folds disagree"
+    elif not any(q.excludes_null for q in parameters):
+        reason = "its parameters may be at their null values"
+    elif any(q.at_bound for q in parameters):
+        reason = "a parameter is at its bound"
+    return Finding(
+        label(c.effect, among),
+        c.effect.target,
+        c.effect.family,
+        parameters,
+        share,
+        low,
+        high,
+        p,
+        sign_flip_p(gain, rng),
+        not reason,
+        step,
+        removed_by_channel(base, c),
+        reason,
+        null_p_value(null, np.inf),
+    )
 
 
-def fitted_parameters(base: FittedModel, c: Candidate) -> tuple[FittedParameter, ...]:
+def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
-    With the law's own error, see `law_errors`.
+    The error of the formula itself is included, see `law_errors`.
     """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.spread is None else c.spread
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.std is None else c.std
     fresh = range(prediction.owned, len(prediction.parameters))
-    law = law_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
+    formula = law_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
     found = []
     for k in fresh:
         p, value = prediction.parameters[k], float(c.fit.values[k])
-        reach = 1.96 * np.hypot(spread[k] * p.scale, law[k - prediction.owned])
+        reach = 1.96 * np.hypot(std[k] * p.scale, formula[k - prediction.owned])
         low, high = max(value - reach, p.low), min(value + reach, p.high)
         bound = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
         at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bound)
@@ -35,8 +86,8 @@ def fitted_parameters(base: FittedModel, c: Candidate) -> tuple[FittedParameter,
     return tuple(found)
 
 
-def removed(base: FittedModel, c: Candidate) -> tuple[tuple[str, float], ...]:
-    """Return by how much the squared residual of each channel falls, as a share, most first."""
+def removed_by_channel(base: FittedModel, c: FittedCandidate) -> tuple[tuple[str, float], ...]:
+    """Return by how much the squared residual of each channel falls, as a share, largest first."""
     before: dict[str, float] = {}
     after: dict[str, float] = {}
     for window, old, new in zip(base.windows, base.pieces, c.pieces, strict=True):
@@ -47,40 +98,49 @@ def removed(base: FittedModel, c: Candidate) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(((n, s) for n, s in shares.items() if s > 0), key=lambda pair: -pair[1]))
 
 
-def alike(
-    base: FittedModel, good: Sequence[tuple[Candidate, Finding]], slack: float = 1.0
-) -> list[tuple[Candidate, Finding]]:
-    """Return the accepted candidates that the data cannot tell from the best, the likeliest first.
+def indistinguishable(
+    base: FittedModel,
+    accepted: Sequence[tuple[FittedCandidate, Finding]],
+    cfg: SearchCfg,
+    slack: float = 1.0,
+) -> list[tuple[FittedCandidate, Finding]]:
+    """Return the accepted candidates that the data cannot distinguish from the best, the most plausible first.
 
-    They are where what they leave differs by less than 2 standard errors, over the blocks and by the roughness of the
-    costs, or by `SAME` of it; by `slack` times that. And where the best is so much rarer that this outweighs what the
-    other leaves more: a law that is close to the missing one may fit a little better than it, as simulations of one
-    law differ too. Among them those come first that leave less, need fewer parameters and smaller values of them, see
-    `_plausibility`.
+    Their held-out errors differ from the best one's by less than `equal_standard_errors` standard errors, over blocks
+    and including the roughness of the costs, or by less than the share `equal_error`. A candidate that leaves more also
+    counts where the best is so much rarer that this outweighs it: the formula of a similar effect may fit slightly
+    better than that of the missing one, as simulations of the same formula differ too.
+
+    Args:
+        base: The fitted baseline.
+        accepted: Candidates with their evidence.
+        cfg: Settings.
+        slack: Factor on both bounds.
     """
-    best = max(good, key=lambda pair: pair[1].gain)[0]
+    best = max(accepted, key=lambda pair: pair[1].gain)[0]
     group = []
-    for c, f in good:
+    for c, f in accepted:
         difference = c.errors - best.errors
         # A cost is half a sum of squares, an error a whole one.
-        rough = 2 * np.hypot(c.rough, best.rough) if c is not best else 0.0
+        rough = 2 * np.hypot(c.cost_roughness, best.cost_roughness) if c is not best else 0.0
         error = np.hypot(np.sqrt(len(difference)) * difference.std(), rough)
         rarer = best.effect.rarity - c.effect.rarity > _log_errors(base, c) - _log_errors(base, best)
-        if rarer or difference.sum() <= slack * max(2 * error, SAME * best.errors.sum()):
+        bound = max(cfg.equal_standard_errors * error, cfg.equal_error * best.errors.sum())
+        if rarer or difference.sum() <= slack * bound:
             group.append((c, f))
     return sorted(group, key=lambda pair: -_plausibility(base, *pair))
 
 
-def _log_errors(base: FittedModel, c: Candidate) -> float:
+def _log_errors(base: FittedModel, c: FittedCandidate) -> float:
     """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, blocks of time."""
     return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))
 
 
-def _plausibility(base: FittedModel, c: Candidate, f: Finding) -> float:
+def _plausibility(base: FittedModel, c: FittedCandidate, f: Finding) -> float:
     """Return twice the log posterior of a candidate, up to a constant.
 
     Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
-    a Cauchy prior of sizes, and how rare the effect is.
+    a Cauchy prior of sizes, and the effect's rarity.
     """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
@@ -89,10 +149,15 @@ def _plausibility(base: FittedModel, c: Candidate, f: Finding) -> float:
     return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
 
 
-def detectable_size(base: FittedModel, s: Screened, share: float) -> Detectable | None:
+def detectable_size(base: FittedModel, s: ScreenedCandidate, share: float) -> Detectable | None:
     """Return the smallest size of a candidate that the search would have found in half of all cases.
 
-    A parameter off its null value by x adds H x^2 to the error, of which it must be more than a share.
+    A parameter off its null value by x adds H x^2 to the error, which must exceed a share of it.
+
+    Args:
+        base: The fitted baseline.
+        s: The candidate.
+        share: Share of the held-out error that an effect must remove [-].
     """
     prediction = Prediction(base.model, (s.effect,), base.windows, engine=base.engine)
     normal = sum(piece.jacobian.T @ piece.jacobian for piece in s.pieces)

@@ -1,189 +1,188 @@
-"""The values of an effect that was accepted: are there better ones nearby, and how sharply do the data tell them?
+"""Profile likelihood of an accepted effect's parameters: better values nearby, and their standard deviations.
 
-Contacts make the cost rough: derivatives at a point neither lead to the lowest point nor tell how wide its valley is.
-So the cost is looked at some standard deviations away along the profile of each parameter, the other parameters where
-they are likeliest then and the initial states fitted anew (Bates and Watts, Nonlinear Regression Analysis and Its
-Applications, 1988, chapter 6). Where it is lower, the fit is taken up again. Where it does not rise as derivatives
-promise, the looks go farther, until the valley shows through the roughness: in the end a parabola through the farthest
-ones tells how wide it is, how far off its middle, and how far off the roughness may have led.
+Contacts make the cost rough, so that derivatives at a point neither lead to its minimum nor give its width. The cost is
+therefore evaluated some standard deviations away along the profile of each parameter: the other parameters at their
+conditional optimum to first order, the initial states fitted again (Bates and Watts, Nonlinear Regression Analysis and
+Its Applications, 1988, chapter 6). A point with a lower cost restarts the fit. Where the cost rises by less than its
+roughness, points farther away follow. In the end a parabola through the farthest points gives the width, the offset of
+the minimum, and the variance that the roughness adds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.diagnosis.search.steps import Candidate, FittedModel, judged
+from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.fit_candidate import candidate_solver, fitted_candidate
+from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.intervals import covariance
-from concent_warp.fit.effects.least_squares import Solver
 from concent_warp.fit.effects.prediction import Prediction
-
-if TYPE_CHECKING:
-    pass
-
-NEAR, FARTHER, EXTENSIONS = 2.0, 3.0, 3
-"""How far to look at first, in standard deviations; how much farther then, and how often."""
-ROUNDS = 4
-"""How often the dependence on the initial states is computed at a look."""
-WORTH = 1.0
-"""Fall of the cost, half a sum of squares in units of noise, for which a fit is taken up again."""
-HOPS, STRIDES = 3, 4
-"""How often that is done, and how often the way to there is gone on, twice as far each time."""
-SHOWN, LEAST = 4.0, 1.0
-"""A valley shows where the cost has risen by so many times the roughness, and by the second number at least."""
-WIDEST = 100.0
-"""By how much a valley that never shows widens an interval."""
-ASTRAY = 0.5
-"""Share of the distance over which a valley rises by the roughness, squared, that counts as variance."""
-WIDTH_ONLY = float("inf")
-"""The same where nothing is taken up any more."""
 
 
 @dataclass(frozen=True)
 class ProfilePoint:
-    """The cost some way from a fit, initial states fitted anew."""
+    """The cost at one point of a parameter's profile, initial states fitted again."""
 
     parameter: int
-    """Along whose profile."""
-    reach: float
-    """How far, in standard deviations."""
+    """Index of the parameter."""
+    distance: float
+    """Signed distance from the fit [standard deviations]."""
     values: np.ndarray
-    """Shape (P,)."""
+    """All parameters, shape (P,)."""
     offsets: tuple[np.ndarray, ...]
+    """Errors of the initial states in units of their standard deviation, one (2 nv,) a window."""
     starts: tuple[np.ndarray, ...]
+    """Dependence of the residuals on the initial states, one (n, 2 nv) a window."""
     cost: float
-    expected: float
-    """By how much the cost would grow if it were quadratic."""
+    expected_rise: float
+    """Rise of a quadratic cost."""
 
 
-AllOf = Callable[[Callable[..., ProfilePoint], Sequence[tuple[Any, ...]]], Sequence[ProfilePoint]]
-"""Does independent pieces of work, and returns their results in order."""
+def refine_by_profile(
+    base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg | None = None
+) -> FittedCandidate:
+    """Return a candidate at a minimum of its profile likelihood, with standard deviations and roughness.
+
+    Args:
+        base: The baseline that it was added to.
+        c: The candidate.
+        runner: Runs the evaluations.
+        cfg: Settings.
+    """
+    cfg = cfg or ProfileLikelihoodCfg()
+    for _ in range(cfg.max_restarts):
+        points = _profile(base, c, runner, cfg, cfg.min_cost_fall)
+        best = min(points, key=lambda s: s.cost, default=None)
+        if best is None or best.cost > c.fit.cost - cfg.min_cost_fall:
+            return _with_spread(base, c, points, cfg)
+        c = _restarted(base, c, _line_search(base, c, best, cfg))
+    return _with_spread(base, c, _profile(base, c, runner, cfg, float("inf")), cfg)
 
 
-def _solver_of(base: FittedModel, c: Candidate) -> Solver:
-    """Return what fits a candidate."""
-    return Solver(Prediction(base.model, (c.effect,), base.windows, engine=base.engine))
+def profile_point(
+    base: FittedModel, c: FittedCandidate, parameter: int, distance: float, cfg: ProfileLikelihoodCfg
+) -> ProfilePoint:
+    """Evaluate the cost at a signed distance [standard deviations] along the profile of a parameter."""
+    solver, known = candidate_solver(base, c.effect), covariance(c.sums, base.blocks)
+    move = distance * known[parameter] / np.sqrt(known[parameter, parameter])
+    move = np.where(np.isfinite(c.fit.values), move, 0.0)
+    values = solver.inside(c.fit.values + move * solver.scale)
+    windows = range(len(base.windows))
+    offsets, starts, residuals = solver.search.refined(
+        values, solver.follow(c.fit, move), windows, cfg.state_iterations
+    )
+    expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
+    cost = solver.cost(residuals, offsets, values)
+    return ProfilePoint(parameter, distance, values, tuple(offsets), tuple(starts[w] for w in windows), cost, expected)
 
 
-def _ways(base: FittedModel, c: Candidate, tried: Sequence[ProfilePoint] = ()) -> list[tuple[int, float]]:
-    """Return where to look next: parameter of the candidate, and how far along its profile in standard deviations.
+def _profile(
+    base: FittedModel, c: FittedCandidate, runner: TaskRunner, cfg: ProfileLikelihoodCfg, min_cost_fall: float
+) -> list[ProfilePoint]:
+    """Return points on the profile of each parameter, farther away where needed, until one has a lower cost."""
+    points: list[ProfilePoint] = []
+    for _ in range(1 + cfg.max_extensions):
+        distances = _next_distances(base, c, points, cfg)
+        if not distances:
+            break
+        tasks = [(base, c, *each, cfg) for each in distances]
+        points += runner.run(profile_point, tasks, "profile likelihood")
+        if min(s.cost for s in points) < c.fit.cost - min_cost_fall:
+            break
+    return points
 
-    Both sides of each parameter at first; farther on the sides where the valley does not show yet.
+
+def _next_distances(
+    base: FittedModel, c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg
+) -> list[tuple[int, float]]:
+    """Return the points to evaluate next: parameter of the candidate, and signed distance [standard deviations].
+
+    Both sides of each parameter at first; then farther on the sides where the cost has not risen enough.
     """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
     found = []
     for k in range(prediction.owned, len(prediction.parameters)):
         p, value = prediction.parameters[k], c.fit.values[k]
-        rough = _roughness(c, tried, k)
+        needed = max(cfg.min_rise_over_roughness * _roughness(c, points, k, cfg), cfg.min_rise)
         for side in (-1.0, 1.0):
-            mine = [s for s in tried if s.parameter == k and s.reach * side > 0]
-            far = max(mine, key=lambda s: abs(s.reach), default=None)
-            if far is not None and far.cost - c.fit.cost >= max(SHOWN * rough, LEAST):
+            farthest = _farthest(points, k, side)
+            if farthest is not None and farthest.cost - c.fit.cost >= needed:
                 continue
-            reach = side * NEAR if far is None else FARTHER * far.reach
-            if np.isfinite(value) and p.low <= value + reach * spread[k] * p.scale <= p.high:
-                found.append((k, reach))
+            distance = side * cfg.first_step if farthest is None else cfg.step_growth * farthest.distance
+            if np.isfinite(value) and p.low <= value + distance * std[k] * p.scale <= p.high:
+                found.append((k, distance))
     return found
 
 
-def _roughness(c: Candidate, tried: Sequence[ProfilePoint], parameter: int) -> float:
-    """Return by how much the cost rises more than derivatives promise where it is looked at first, 0 if it does not."""
-    near = [s for s in tried if s.parameter == parameter and abs(s.reach) == NEAR]
-    return max(float(np.mean([s.cost - c.fit.cost - s.expected for s in near])), 0.0) if near else 0.0
+def _farthest(points: Sequence[ProfilePoint], parameter: int, side: float) -> ProfilePoint | None:
+    """Return the farthest point on one side of a parameter, None where there is none."""
+    on_side = [s for s in points if s.parameter == parameter and s.distance * side > 0]
+    return max(on_side, key=lambda s: abs(s.distance), default=None)
 
 
-def _look(base: FittedModel, c: Candidate, parameter: int, reach: float) -> ProfilePoint:
-    """Look at the cost some way along the profile of a parameter."""
-    solver, known = _solver_of(base, c), covariance(c.sums, base.blocks)
-    move = reach * known[parameter] / np.sqrt(known[parameter, parameter])
-    move = np.where(np.isfinite(c.fit.values), move, 0.0)
-    values = solver.inside(c.fit.values + move * solver.scale)
-    everywhere = range(len(base.windows))
-    offsets, starts, residuals = solver.search.refined(values, solver.follow(c.fit, move), everywhere, ROUNDS)
-    expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
-    cost = solver.cost(residuals, offsets, values)
-    return ProfilePoint(parameter, reach, values, tuple(offsets), tuple(starts[w] for w in everywhere), cost, expected)
+def _line_search(base: FittedModel, c: FittedCandidate, best: ProfilePoint, cfg: ProfileLikelihoodCfg) -> ProfilePoint:
+    """Return the point with the lowest cost as the distance is doubled for as long as the cost falls."""
+    for _ in range(cfg.max_step_doublings):
+        further = profile_point(base, c, best.parameter, 2 * best.distance, cfg)
+        if further.cost > best.cost:
+            break
+        best = further
+    return best
 
 
-def _taken_up(base: FittedModel, c: Candidate, seen: ProfilePoint) -> Candidate:
-    """Fit a candidate from where a look has found a lower cost; what is not better in the end is dropped."""
-    solver = _solver_of(base, c)
-    found = judged(base, c.effect, solver, solver.fit(seen.values, seen.offsets, seen.starts))
+def _restarted(base: FittedModel, c: FittedCandidate, point: ProfilePoint) -> FittedCandidate:
+    """Return the better of a fit and its refit from a point of the profile."""
+    solver = candidate_solver(base, c.effect)
+    found = fitted_candidate(base, c.effect, solver, solver.fit(point.values, point.offsets, point.starts))
     return found if found.fit.cost < c.fit.cost else c
 
 
-def settled(base: FittedModel, c: Candidate, all_of: AllOf) -> Candidate:
-    """Return a candidate with values that no look around betters, and with how sharply the data tell them.
-
-    Args:
-        base: What it was added to.
-        c: The candidate.
-        all_of: Does independent pieces of work.
-    """
-    for _ in range(HOPS):
-        seen = _looks(base, c, all_of)
-        best = min(seen, key=lambda s: s.cost, default=None)
-        if best is None or best.cost > c.fit.cost - WORTH:
-            return _told(base, c, seen)
-        for _ in range(STRIDES):
-            further = _look(base, c, best.parameter, 2 * best.reach)
-            if further.cost > best.cost:
-                break
-            best = further
-        c = _taken_up(base, c, best)
-    return _told(base, c, _looks(base, c, all_of, WIDTH_ONLY))
+def _with_spread(
+    base: FittedModel, c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg
+) -> FittedCandidate:
+    """Return a candidate with the standard deviations and the roughness that its profile gives."""
+    rough = max((_roughness(c, points, s.parameter, cfg) for s in points), default=0.0)
+    return replace(c, std=_standard_deviations(base, c, points, cfg), cost_roughness=rough)
 
 
-def _told(base: FittedModel, c: Candidate, seen: Sequence[ProfilePoint]) -> Candidate:
-    """Return a candidate with what looks around it tell: how sharp its values are, and how rough its cost."""
-    rough = max((_roughness(c, seen, s.parameter) for s in seen), default=0.0)
-    return replace(c, spread=_spreads(base, c, seen), rough=rough)
+def _roughness(c: FittedCandidate, points: Sequence[ProfilePoint], parameter: int, cfg: ProfileLikelihoodCfg) -> float:
+    """Return the mean rise of the cost beyond its quadratic form at the first points of a parameter, at least 0."""
+    near = [s for s in points if s.parameter == parameter and abs(s.distance) == cfg.first_step]
+    return max(float(np.mean([s.cost - c.fit.cost - s.expected_rise for s in near])), 0.0) if near else 0.0
 
 
-def _looks(base: FittedModel, c: Candidate, all_of: AllOf, worth: float = WORTH) -> list[ProfilePoint]:
-    """Look around a fit, farther where need be; stop where a lower cost is found."""
-    seen: list[ProfilePoint] = []
-    for _ in range(1 + EXTENSIONS):
-        untried = _ways(base, c, seen)
-        if not untried:
-            break
-        seen += all_of(_look, [(base, c, *way) for way in untried])
-        if min(s.cost for s in seen) < c.fit.cost - worth:
-            break
-    return seen
-
-
-def _spreads(base: FittedModel, c: Candidate, seen: Sequence[ProfilePoint]) -> np.ndarray:
+def _standard_deviations(
+    base: FittedModel, c: FittedCandidate, points: Sequence[ProfilePoint], cfg: ProfileLikelihoodCfg
+) -> np.ndarray:
     """Return the standard deviations of a candidate's parameters, in units of their scale, shape (P,).
 
-    Those of the linear fit, larger by what the valley is flatter, by how far its middle is off, and by how far the
-    roughness may have led astray.
+    Those of the linear fit, increased by the flatter curvature of the profile, by the offset of its minimum and by its
+    roughness.
     """
-    spread = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
-    for k in {s.parameter for s in seen}:
-        mine, rough = [s for s in seen if s.parameter == k], _roughness(c, seen, k)
-        far = [
-            max((s for s in mine if s.reach * side > 0), key=lambda s: abs(s.reach), default=None) for side in (-1, 1)
-        ]
-        ends = [s for s in far if s is not None]
-        at = np.array([s.reach for s in ends])
-        linear, curved = _parabola(at, np.array([s.cost - c.fit.cost - rough for s in ends]))
-        if curved <= 0:
-            spread[k] *= WIDEST
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    for k in {s.parameter for s in points}:
+        rough = _roughness(c, points, k, cfg)
+        ends = [s for side in (-1, 1) if (s := _farthest(points, k, side)) is not None]
+        distance = np.array([s.distance for s in ends])
+        slope, curvature = _parabola(distance, np.array([s.cost - c.fit.cost - rough for s in ends]))
+        if curvature <= 0:
+            std[k] *= cfg.max_widening
             continue
-        flatter = float(np.mean([s.expected / s.reach**2 for s in ends])) / curved
-        off = min(abs(linear) / (2 * curved), float(np.abs(at).max()))
-        spread[k] *= min(np.sqrt(max(flatter, 1.0) + off**2 + ASTRAY * rough / curved), WIDEST)
-    return spread
+        flatter = float(np.mean([s.expected_rise / s.distance**2 for s in ends])) / curvature
+        offset = min(abs(slope) / (2 * curvature), float(np.abs(distance).max()))
+        variance = max(flatter, 1.0) + offset**2 + cfg.roughness_variance * rough / curvature
+        std[k] *= min(np.sqrt(variance), cfg.max_widening)
+    return std
 
 
-def _parabola(at: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
-    """Return b and c of the parabola b x + c x^2 through two points; b is zero where they lie on one side only."""
-    both = len(at) > 1
-    columns = np.column_stack([at, at**2] if both else [at**2])
+def _parabola(x: np.ndarray, rise: np.ndarray) -> tuple[float, float]:
+    """Return b and c of the parabola b x + c x^2 through one or two points; b is zero for one."""
+    two = len(x) > 1
+    columns = np.column_stack([x, x**2] if two else [x**2])
     found = np.linalg.lstsq(columns, rise, rcond=None)[0]
-    return (float(found[0]), float(found[1])) if both else (0.0, float(found[0]))
+    return (float(found[0]), float(found[1])) if two else (0.0, float(found[0]))

@@ -1,9 +1,16 @@
+import json
+
 import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
-from concent_warp.diagnosis.experiment.suggest import _imagined, _separations, _start_effects, suggest
+from concent_warp.diagnosis.experiment.suggest import (
+    _future_window,
+    _separations,
+    _start_effects,
+    suggest_experiment,
+)
 from concent_warp.effects.library.contact import SlidingFriction, TorsionalFriction
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.effects.library.measurement import SensorBias
@@ -79,14 +86,14 @@ def frictions() -> dict[str, Model]:
 
 def test_frictions_alike_at_one_speed_are_told_apart_by_another():
     recording = one_speed()
-    found = suggest(frictions(), recording)
+    found = suggest_experiment(frictions(), recording)
     assert found is not None
     assert found.pair == ("joint_friction", "joint_damping")
     assert found.channel == "rail_position"
     bench = RecordedRange(Model(Scene(CART)), recording, channel_noises(Model(Scene(CART)), recording))
     d = recording.demonstrations[0]
     same = ProposedMotion("same", "do it again", 4.0, np.zeros(1), np.zeros(1), d.action)
-    window = _imagined(bench, same, same.duration)
+    window = _future_window(bench, same, same.duration)
     assert window is not None
     again = _separations(frictions(), same, window, "mujoco")
     assert again is not None
@@ -94,7 +101,7 @@ def test_frictions_alike_at_one_speed_are_told_apart_by_another():
 
 
 def test_sentence_says_what_to_do_and_by_how_much_hypotheses_differ():
-    found = suggest(frictions(), one_speed())
+    found = suggest_experiment(frictions(), one_speed())
     assert found is not None
     assert "drive" in found.sentence or "same commands" in found.sentence
     assert "joint_friction and joint_damping then differ by" in found.sentence
@@ -109,7 +116,7 @@ def test_friction_of_a_twist_is_told_from_sliding_friction_by_a_spin():
         "torsional_friction": plain.add(twist, [twist.parameters(m)[0].null + 0.01]),
         "sliding_friction": plain.add(SlidingFriction("block"), [0.3]),
     }
-    found = suggest(models, one_throw())
+    found = suggest_experiment(models, one_throw())
     assert found is not None
     assert "spin" in found.sentence
     assert found.channel == "block_orientation"
@@ -119,14 +126,14 @@ def test_friction_of_a_twist_is_told_from_sliding_friction_by_a_spin():
 @pytest.mark.parametrize("count", [1, 2])
 def test_hypotheses_that_predict_the_same_are_not_told_apart(count):
     model = Model(Scene(CART)).add(JointFriction("rail"), [0.5])
-    assert suggest({f"h{k}": model for k in range(count)}, one_speed()) is None
+    assert suggest_experiment({f"h{k}": model for k in range(count)}, one_speed()) is None
 
 
 def test_slope_is_told_from_a_throw_the_other_way_round():
     plain = Model(Scene(BLOCK))
     tilt = plain.add(GravityTilt(), [0.0, 0.02])
     friction = plain.add(SlidingFriction("block"), [0.3 + 0.02])
-    found = suggest({"gravity_tilt": tilt, "sliding_friction": friction}, one_throw())
+    found = suggest_experiment({"gravity_tilt": tilt, "sliding_friction": friction}, one_throw())
     assert found is not None
     assert found.separation > 2
     assert any(way in found.sentence for way in ("-x", "y", "turn the table"))
@@ -140,11 +147,11 @@ def test_what_an_error_of_the_start_explains_does_not_count():
     at_rest = Demonstration("rest", qpos=np.zeros(1), qvel=np.zeros(1), measured={"rail_position": channel})
     bench = RecordedRange(plain, Recording(plain.scene.xml, (at_rest,)), {"rail_position": NOISE})
     motion = ProposedMotion("coast", "let it coast", 1.0, np.zeros(1), np.array([0.1]))
-    window = _imagined(bench, motion, 1.0)
+    window = _future_window(bench, motion, 1.0)
     assert window is not None
     models = {"plain": plain, "biased": biased}
     raw = _separations(models, motion, window, "mujoco")
-    starts = _start_effects(plain, window, "mujoco")
+    starts = _start_effects(plain, window, "mujoco", 0.1)
     assert raw is not None
     assert raw["plain", "biased"][0] == pytest.approx(2.0, rel=1e-6)
     left = _separations(models, motion, window, "mujoco", starts)
@@ -157,6 +164,41 @@ def test_motion_in_which_a_model_diverges_is_left_out():
     recording = one_speed()
     bench = RecordedRange(plain, recording, {"rail_position": NOISE})
     motion = ProposedMotion("burst", "burst", 0.5, np.zeros(1), np.array([1e12]), recording.demonstrations[0].action)
-    window = _imagined(bench, motion, 0.5)
+    window = _future_window(bench, motion, 0.5)
     assert window is not None
     assert _separations({"a": plain, "b": plain}, motion, window, "mujoco") is None
+
+
+def test_the_experiment_has_the_motion_as_arrays_with_units(tmp_path):
+    shares = []
+    path = tmp_path / "experiment.json"
+    found = suggest_experiment(frictions(), one_speed(), out=path, progress=shares.append)
+    assert found is not None
+    command, rail = found.motion.commands["drive"], found.motion.joints["rail"]
+    assert (command.unit, rail.unit) == ("m", "m")
+    assert rail.value.shape == rail.time.shape
+    assert rail.time[-1] == pytest.approx(found.motion.duration, abs=0.01)
+    followed = np.interp(rail.time, command.time, command.value)
+    assert np.sqrt(np.mean((rail.value - followed) ** 2)) < 0.02
+    assert set(found.predictions) == {"joint_friction", "joint_damping"}
+    one, other = (found.predictions[name].value for name in found.pair)
+    assert np.sqrt(np.mean((one - other) ** 2)) > 0.5 * found.separation * NOISE
+    document = json.loads(path.read_text())
+    assert document["motion"]["commands"]["drive"]["value"] == command.value.tolist()
+    assert document["sentence"] == found.sentence
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_the_motion_of_an_object_starts_as_it_is_to_be_pushed():
+    plain = Model(Scene(BLOCK))
+    tilt, friction = plain.add(GravityTilt(), [0.0, 0.02]), plain.add(SlidingFriction("block"), [0.32])
+    found = suggest_experiment({"gravity_tilt": tilt, "sliding_friction": friction}, one_throw())
+    assert found is not None
+    block = found.motion.objects["block"]
+    assert block.position.shape == block.velocity.shape == block.angular_velocity.shape == (len(block.time), 3)
+    assert np.linalg.norm(block.orientation, axis=1) == pytest.approx(1.0)
+    assert np.linalg.norm(block.velocity[0]) > 0.1
+    assert np.linalg.norm(block.velocity[-1]) < np.linalg.norm(block.velocity[0])
+    moved = (block.position[1] - block.position[0]) / (block.time[1] - block.time[0])
+    assert moved == pytest.approx(block.velocity[0], abs=0.05)

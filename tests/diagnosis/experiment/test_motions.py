@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
-from concent_warp.diagnosis.experiment.motions import EXTRA, RecordedRange, heavier, slope_turned
+from concent_warp.diagnosis.experiment.motions import RecordedRange, heavier, slope_turned
 from concent_warp.diagnosis.experiment.object_motions import ThrowableBody, _roll, body_motions
 from concent_warp.effects.library.world import AirDrag, GravityTilt
 from concent_warp.model import Model
@@ -52,7 +53,7 @@ def bench(shape: str = BOX, lift: float = 0.0) -> RecordedRange:
 
 def test_commands_stay_within_what_was_recorded():
     made = list(drive_motions(bench(), tilted=False))
-    assert {"sweeps", "chirp", "slow reversals", "steps", "holds", "repeat at another pace"} <= {m.name for m in made}
+    assert {"sweeps", "chirp", "slow reversals", "steps", "holds", "repeat at another speed"} <= {m.name for m in made}
     for motion in made:
         reach = motion.action["reach"]
         assert reach.value.min() >= -0.1 - 1e-9
@@ -99,9 +100,11 @@ def test_turned_table_slopes_the_other_way_and_leaves_other_effects():
 @pytest.mark.parametrize("body", ["block", "hand"])
 def test_payload_adds_mass_at_the_centre_of_mass_and_nothing_else(body):
     model = Model(Scene(XML.format(shape=BOX))).add(AirDrag("block"), [3.0])
-    plain, heavy = model.compile(), heavier(body)(model).compile()
+    plain, heavy = model.compile(), heavier(body, MotionMenuCfg())(model).compile()
     row = plain.body(body).id
-    assert heavy.body_subtreemass[0] == pytest.approx(plain.body_subtreemass[0] + EXTRA * plain.body_mass[row])
+    assert heavy.body_subtreemass[0] == pytest.approx(
+        plain.body_subtreemass[0] + MotionMenuCfg().extra_mass * plain.body_mass[row]
+    )
     payload = heavy.body(f"{body}_payload")
     np.testing.assert_allclose(payload.pos, plain.body_ipos[row])
     assert heavy.nq == plain.nq

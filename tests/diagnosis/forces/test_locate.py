@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.forces import features
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
-from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
 from tests.diagnosis.forces.locate_scenes import PENDULUM, swing, throw
 
-QUICK = LocateForcesCfg(draws=2)
+QUICK = LocateForcesCfg(extra_starts=2)
 FORCE, POINT = np.array([0.0, -0.5, 0.2]), np.array([0.02, 0.03, -0.01])
 
 
@@ -134,7 +134,7 @@ def test_without_anything_hidden_a_block_shows_no_force():
 def test_nothing_found_is_said_with_what_would_have_been_seen():
     found = located(swing(lambda _: 0.0, duration=2))
     assert found.arrows() == []
-    assert "no more than noise; a steady force of" in found.sentences()[0]
+    assert "no more than noise; smallest detectable steady force:" in found.sentences()[0]
 
 
 def test_json_is_valid(rubbing, pushed_in_flight):

@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 
 from concent_warp.comparison.phases import FREE, REST, SLIDE
-from concent_warp.diagnosis.forces.body_forces import _body_parts
+from concent_warp.diagnosis.forces.body_forces import _body_records
+from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.contact_state import _free_motions, _lasting_share
 from concent_warp.diagnosis.forces.describe import _direction_words
 from concent_warp.diagnosis.forces.point_of_action import _face_words, _lever
-from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, window_forces
+from concent_warp.diagnosis.forces.window_forces import window_forces
 from concent_warp.estimation.measured_motion import measured_motion
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -19,8 +20,8 @@ def parts(recording):
     engine = MujocoEngine(model, threads=1)
     motions = [measured_motion(model, d, engine) for d in recording.demonstrations]
     pairs = zip(recording.demonstrations, motions, strict=True)
-    windows = [window_forces(d.name, engine, motion, LocateForcesCfg(draws=0)) for d, motion in pairs]
-    return _body_parts("block", motions, windows)
+    windows = [window_forces(d.name, engine, motion, LocateForcesCfg(extra_starts=0)) for d, motion in pairs]
+    return _body_records("block", motions, windows, LocateForcesCfg())
 
 
 def test_a_thrown_block_slides_and_then_rests_on_the_table():
@@ -52,12 +53,12 @@ def test_a_flying_block_is_free():
 
 def test_contacts_hide_motions_that_they_see():
     push = np.array([[0, 0, 1.0, 0, 0, 0]])
-    assert np.diag(_free_motions(push, 1)) == pytest.approx([1, 1, 0, 1, 1, 1])
+    assert np.diag(_free_motions(push, 1, 0.05)) == pytest.approx([1, 1, 0, 1, 1, 1])
 
 
 def test_short_interruptions_count_as_contact():
-    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=3) == 1
-    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, hop=2) == pytest.approx(0.7)
+    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, longest_gap=3) == 1
+    assert _lasting_share(np.array([0, 1, 2, 6, 7, 8, 9]), 10, longest_gap=2) == pytest.approx(0.7)
 
 
 def test_a_force_turns_about_the_origin_by_its_lever():
@@ -76,7 +77,7 @@ def test_a_force_turns_about_the_origin_by_its_lever():
     ],
 )
 def test_places_on_faces_are_named(place, normal, hidden, words):
-    assert _face_words(np.array(place, float), np.array(normal, float), hidden) == words
+    assert _face_words(np.array(place, float), np.array(normal, float), hidden, 0.75) == words
 
 
 def test_directions_are_named_by_their_axes():

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from concent_warp.diagnosis.forces.cfg import FeatureCfg, LocateForcesCfg
 from concent_warp.diagnosis.forces.features import DIRECTION, joint_features
-from concent_warp.diagnosis.forces.window_forces import LocateForcesCfg, window_forces
+from concent_warp.diagnosis.forces.window_forces import window_forces
 from concent_warp.diagnosis.forces.window_solver import _misfit, _response
 from concent_warp.estimation.measured_motion import _turning, measured_motion
 from concent_warp.estimation.smoothing_spline import smooth
@@ -18,7 +19,7 @@ def windows_of(recording, cfg=None, which=0):
     model = Model(Scene(recording.scene))
     engine = MujocoEngine(model, threads=1)
     motion = measured_motion(model, recording[which], engine)
-    return window_forces(recording[which].name, engine, motion, cfg or LocateForcesCfg(draws=1)), motion
+    return window_forces(recording[which].name, engine, motion, cfg or LocateForcesCfg(extra_starts=1)), motion
 
 
 def wave(seed, count=600, noise=1e-3):
@@ -74,18 +75,18 @@ def test_angular_velocity_follows_from_the_quaternion_and_its_rate():
 
 def test_departures_of_a_spring_swing_and_settle_about_its_sag():
     omega, length = 30.0, 0.1
-    law = _response(np.array([[-(omega**2)]]), np.zeros((1, 1)), length)
-    s = np.linspace(0, length, len(law))
-    assert law[:, 0, 0] == pytest.approx(np.cos(omega * s), abs=1e-9)
-    assert law[:, 0, 1] == pytest.approx(np.sin(omega * s) / omega, abs=1e-9)
-    assert law[:, 0, 2] == pytest.approx((1 - np.cos(omega * s)) / omega**2, abs=1e-9)
+    response = _response(np.array([[-(omega**2)]]), np.zeros((1, 1)), length, 40)
+    s = np.linspace(0, length, len(response))
+    assert response[:, 0, 0] == pytest.approx(np.cos(omega * s), abs=1e-9)
+    assert response[:, 0, 1] == pytest.approx(np.sin(omega * s) / omega, abs=1e-9)
+    assert response[:, 0, 2] == pytest.approx((1 - np.cos(omega * s)) / omega**2, abs=1e-9)
 
 
 def test_variance_grows_only_where_misfit_is_no_chance():
-    assert _misfit(30.0, 30) == 1
-    assert _misfit(40.0, 30) == 1
-    assert _misfit(90.0, 30) == 3
-    assert _misfit(5.0, 0) == 1
+    assert _misfit(30.0, 30, 3.0) == 1
+    assert _misfit(40.0, 30, 3.0) == 1
+    assert _misfit(90.0, 30, 3.0) == 3
+    assert _misfit(5.0, 0, 3.0) == 1
 
 
 def test_a_constant_torque_on_a_driven_joint_is_found_without_bias_and_with_its_error():
@@ -97,7 +98,7 @@ def test_a_constant_torque_on_a_driven_joint_is_found_without_bias_and_with_its_
 
 def test_wider_windows_see_smaller_forces():
     recording = swing(lambda _: 0.0, duration=2)
-    short, long = (np.median(windows_of(recording, LocateForcesCfg(w, draws=0))[0].std) for w in (0.08, 0.16))
+    short, long = (np.median(windows_of(recording, LocateForcesCfg(w, extra_starts=0))[0].std) for w in (0.08, 0.16))
     assert long < 0.4 * short
 
 
@@ -135,7 +136,7 @@ def test_windows_with_too_few_readings_tell_nothing():
 
 def test_features_of_a_joint_are_averaged_over_the_window():
     found, motion = windows_of(swing(lambda _: 0.0, duration=2))
-    direction = joint_features(found, motion)["hinge"][DIRECTION][:, 0]
+    direction = joint_features(found, motion, FeatureCfg())["hinge"][DIRECTION][:, 0]
     assert np.abs(direction).max() == pytest.approx(1, abs=0.02)
     turning_point = np.abs(direction) < 0.5
     assert 0 < turning_point.sum() < len(direction) / 2

@@ -8,9 +8,11 @@ import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.procedure import Procedure, silent
-from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _moved
-from concent_warp.diagnosis.search.steps import fit_candidate, screen
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
 from concent_warp.effects.library.objects import Inertia, Mass
 from concent_warp.errors import ModelError
@@ -65,20 +67,16 @@ def slid():
 @pytest.fixture(scope="module")
 def base(slid):
     model, recording = slid
-    return Procedure(model, recording, DiagnoseCfg(jobs=1), silent).baseline()
-
-
-def one_by_one(work, tasks, _text, _span):
-    return [work(*task) for task in tasks]
+    return Procedure(model, recording, DiagnoseCfg(jobs=1)).baseline()
 
 
 def test_gradients_start_the_fit_of_friction_near_the_truth_and_leave_others_alone(slid, base):
     screened = [screen(base, effect) for effect in (SlidingFriction("block"), Inertia("block"))]
-    friction, inertia = GradientStarts(*slid).led(base, screened, one_by_one)
+    friction, inertia = GradientStarts(*slid).apply(base, screened, TaskRunner())
     assert inertia is screened[1]
     assert screened[0].start[0] == pytest.approx(0.7 * GIVEN)
     assert friction.start[0] == pytest.approx(TRUE, rel=0.15)
-    assert friction.scanned > screened[0].scanned
+    assert friction.scanned_gain > screened[0].scanned_gain
     found = fit_candidate(base, friction)
     assert found.fit.values[0] == pytest.approx(TRUE, rel=0.02)
     assert found.ratio < 1.2
@@ -88,10 +86,10 @@ def test_a_worse_value_is_not_taken(slid, base):
     screened = screen(base, SlidingFriction("block"))
     starts = GradientStarts(*slid)
     starts.factors = replace(starts.factors, friction=4.0)
-    (same,) = starts.led(base, [screened], one_by_one)
+    (same,) = starts.apply(base, [screened], TaskRunner())
     np.testing.assert_array_equal(same.start, screened.start)
     assert not same.measured
-    assert same.scanned == screened.scanned
+    assert same.scanned_gain == screened.scanned_gain
 
 
 def test_factors_are_turned_into_the_values_of_effects():
@@ -103,7 +101,7 @@ def test_factors_are_turned_into_the_values_of_effects():
         (Mass("arm"), [1.0], [1.0]),
     )
     for effect, null, value in cases:
-        np.testing.assert_allclose(_moved(effect, np.array(null), _factor_of(effect, found)), value)
+        np.testing.assert_allclose(_scaled(effect, np.array(null), _factor_of(effect, found)), value)
 
 
 def test_what_gradients_cannot_do_is_said_before_anything_is_fitted(slid):

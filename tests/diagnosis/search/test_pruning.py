@@ -1,9 +1,12 @@
 import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.checkpoint import CheckpointedProcedure
-from concent_warp.diagnosis.procedure import Procedure, silent
-from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, polish_candidate, screen, without
+from concent_warp.diagnosis.checkpoint import CheckpointedRunner
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline, refit_without_effect
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.tasks import silent
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
@@ -14,19 +17,18 @@ def nodes():
     """A swing damped by viscous friction that dry friction was blamed for first."""
     recording = swung()
     windows = windows_of(recording)
-    found = [node(drawing(recording), windows, cut_blocks(windows), "mujoco")]
+    found = [fit_baseline(drawing(recording), windows, cut_blocks(windows), "mujoco")]
     for name in ("joint_friction", "joint_damping"):
         base = found[-1]
         chosen = fit_candidate(base, screen(base, effect_class(name)("hinge")))
-        found.append(extended(base, polish_candidate(base, chosen)))
+        found.append(add_candidate(base, polish_candidate(base, chosen)))
     return recording, found
 
 
 def procedure(recording, nodes, folder=None):
     cfg = DiagnoseCfg(jobs=1)
-    made = Procedure(nodes[0].model, recording, cfg, silent)
-    if folder is not None:
-        made = CheckpointedProcedure(nodes[0].model, recording, cfg, silent, folder, "key")
+    runner = None if folder is None else CheckpointedRunner(1, silent, nodes[0].model, folder, "key")
+    made = Procedure(nodes[0].model, recording, cfg, runner)
     for last in nodes[1:]:
         # What a search leaves behind after each addition.
         name = last.model.effects[-1].effect.name
@@ -37,7 +39,7 @@ def procedure(recording, nodes, folder=None):
 
 def test_a_model_without_one_of_its_effects_is_fitted_again(nodes):
     last = nodes[1][-1]
-    alone = without(last, 0)
+    alone = refit_without_effect(last, 0)
     assert [a.effect.name for a in alone.model.effects] == ["joint_damping"]
     assert alone.model.effects[0].values[0] == pytest.approx(DAMPING, rel=0.05)
     assert alone.ratio == pytest.approx(last.ratio, rel=0.02)
@@ -47,7 +49,7 @@ def test_a_model_without_one_of_its_effects_is_fitted_again(nodes):
 def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(nodes, kept, tmp_path):
     recording, found = nodes
     made = procedure(recording, found, tmp_path if kept else None)
-    after = made.pruned(list(found))
+    after = made.remove_superfluous(list(found))
     assert [a.effect.name for a in after[-1].model.effects] == ["joint_damping"]
     assert len(after) == len(found) + 1
     assert made.groups == [("joint_damping",)]
@@ -56,5 +58,5 @@ def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(nodes, kept, tm
 def test_an_only_effect_stays(nodes):
     recording, found = nodes
     made = procedure(recording, found[:2])
-    assert made.pruned(list(found[:2])) == found[:2]
+    assert made.remove_superfluous(list(found[:2])) == found[:2]
     assert made.groups == [("joint_friction",)]

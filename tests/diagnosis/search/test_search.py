@@ -3,19 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.procedure import Procedure, silent
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.evidence import alike
-from concent_warp.diagnosis.search.steps import (
-    chance,
-    extended,
-    fit_candidate,
-    node,
-    polish_candidate,
-    restarted_candidate,
-    screen,
-)
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.search.evidence import indistinguishable
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate, restart_candidate
+from concent_warp.diagnosis.search.fit_promising import CandidateFits
+from concent_warp.diagnosis.search.grouping import group_indistinguishable
+from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.least_squares import Solver
@@ -27,7 +24,7 @@ NAMES = ("joint_damping", "joint_friction", "armature")
 
 def base_of(recording):
     windows = windows_of(recording)
-    return node(drawing(recording), windows, cut_blocks(windows), "mujoco")
+    return fit_baseline(drawing(recording), windows, cut_blocks(windows), "mujoco")
 
 
 def effect(name):
@@ -49,7 +46,7 @@ def test_a_model_that_lacks_nothing_leaves_noise_alone(lacking, complete):
     assert lacking.ratio > 2.5
 
 
-def test_a_fit_that_is_stuck_at_the_model_itself_is_led_on_without_fitting_its_initial_states_again(lacking):
+def test_a_fit_that_is_stuck_at_the_null_value_is_continued_without_fitting_its_initial_states_again(lacking):
     found = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
     solver = Solver(Prediction(lacking.model, (effect("joint_damping"),), lacking.windows, threads=1))
     linear = solver.linearise(solver.p.start, lacking.fit.offsets)
@@ -60,8 +57,8 @@ def test_a_fit_that_is_stuck_at_the_model_itself_is_led_on_without_fitting_its_i
     assert polished.fit.values[0] == pytest.approx(DAMPING, rel=0.05)
 
 
-def test_a_look_promises_most_of_the_effect_that_is_missing(lacking):
-    promised = {name: screen(lacking, effect(name)).promise for name in NAMES}
+def test_screening_expects_most_of_the_effect_that_is_missing(lacking):
+    promised = {name: screen(lacking, effect(name)).expected_gain for name in NAMES}
     assert max(promised, key=promised.__getitem__) == "joint_damping"
     assert promised["joint_damping"] > 0.8
     assert promised["armature"] < 0.5
@@ -75,7 +72,7 @@ def test_a_fit_of_the_missing_effect_leaves_noise_alone_and_gains_in_every_fold(
     gain = found.gain(lacking)
     assert all(gain[lacking.blocks.fold == f].sum() > 0 for f in range(5))
     assert polish_candidate(lacking, found).fit.cost <= found.fit.cost
-    assert extended(lacking, found).ratio == pytest.approx(found.ratio)
+    assert add_candidate(lacking, found).ratio == pytest.approx(found.ratio)
 
 
 def test_a_fit_that_was_taken_up_again_in_vain_is_left_as_it_is(lacking):
@@ -91,7 +88,7 @@ def test_a_fit_that_was_taken_up_again_in_vain_is_left_as_it_is(lacking):
 
 def test_a_fit_that_others_initial_states_do_not_better_is_left_as_it_is(lacking):
     right, wrong = (fit_candidate(lacking, screen(lacking, effect(name))) for name in ("joint_damping", "armature"))
-    assert restarted_candidate(lacking, right, wrong.fit) is right
+    assert restart_candidate(lacking, right, wrong.fit) is right
 
 
 def test_a_fit_with_wrong_initial_states_finds_back_from_the_leaders(lacking):
@@ -102,44 +99,48 @@ def test_a_fit_with_wrong_initial_states_finds_back_from_the_leaders(lacking):
     cost = solver.cost([piece.residual for piece in linear], astray, right.fit.values)
     assert cost > 1.1 * right.fit.cost
     stuck = replace(right, fit=replace(right.fit, offsets=astray, cost=cost, linear=linear))
-    assert restarted_candidate(lacking, stuck, right.fit).fit.cost < 1.01 * right.fit.cost
+    assert restart_candidate(lacking, stuck, right.fit).fit.cost < 1.01 * right.fit.cost
 
 
-def test_an_effect_that_is_not_missing_gains_no_more_than_chance(complete):
+def test_an_effect_that_is_not_missing_gains_no_more_than_the_null_distribution(complete):
     screened = [screen(complete, effect(name)) for name in NAMES]
-    null = chance(complete, screened, 200, 0)
+    null = max_gain_under_null(complete, screened, 200, 0)
     assert len(null) == 200
     for s in screened:
         assert fit_candidate(complete, s).share(complete) < np.quantile(null, 0.99)
 
 
-def test_chance_makes_more_of_more_candidates_and_little_in_all(complete):
+def test_the_null_distribution_grows_with_the_candidates_and_stays_small(complete):
     screened = [screen(complete, effect(name)) for name in NAMES]
-    one, all_of_them = chance(complete, screened[:1], 200, 0), chance(complete, screened, 200, 0)
+    one, all_of_them = (
+        max_gain_under_null(complete, screened[:1], 200, 0),
+        max_gain_under_null(complete, screened, 200, 0),
+    )
     assert (all_of_them >= one - 1e-12).all()
     assert np.quantile(all_of_them, 0.95) < 0.1
-    assert np.array_equal(one, chance(complete, screened[:1], 200, 0))
+    assert np.array_equal(one, max_gain_under_null(complete, screened[:1], 200, 0))
 
 
 def of_two(base, rival_leaves, rough=0.0):
-    """Return the names of those that cannot be told apart: damping, and armature as if it left so much more."""
+    """Return the names of the indistinguishable ones of damping and an armature whose errors are larger by a factor."""
     best = fit_candidate(base, screen(base, effect("joint_damping")))
-    best = replace(best, rough=rough)
+    best = replace(best, cost_roughness=rough)
     other = fit_candidate(base, screen(base, effect("armature")))
-    other = replace(other, errors=rival_leaves * best.errors, rough=rough)
+    other = replace(other, errors=rival_leaves * best.errors, cost_roughness=rough)
     findings = [
         Finding(c.effect.name, c.effect.target, "", (), c.share(base), 0.0, 1.0, 0.0, 0.0, True, 0, (), "")
         for c in (best, other)
     ]
-    return {f.name for _, f in alike(base, list(zip((best, other), findings, strict=True)))}
+    accepted = list(zip((best, other), findings, strict=True))
+    return {f.name for _, f in indistinguishable(base, accepted, SearchCfg())}
 
 
-def test_candidates_that_leave_nearly_the_same_are_alike_and_those_that_leave_more_are_not(lacking):
+def test_candidates_with_nearly_equal_errors_are_indistinguishable_and_others_are_not(lacking):
     assert of_two(lacking, 1.01) == {"joint_damping", "armature"}
     assert of_two(lacking, 1.3) == {"joint_damping"}
 
 
-def test_rough_costs_tell_less(lacking):
+def test_rough_costs_distinguish_less(lacking):
     left = fit_candidate(lacking, screen(lacking, effect("joint_damping"))).errors.sum()
     assert of_two(lacking, 1.3, rough=0.3 * left) == {"joint_damping", "armature"}
 
@@ -153,7 +154,7 @@ def test_a_rare_effect_does_not_shut_out_a_common_one_that_leaves_hardly_more(la
     assert of_two(lacking, much) == {"joint_damping"}
 
 
-def test_a_rival_gets_on_from_the_leaders_initial_states_and_goes_on_as_long_as_it_gains(lacking):
+def test_a_rival_is_refitted_from_the_best_fits_initial_states_for_as_long_as_it_gains(lacking):
     right = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
     solver = Solver(Prediction(lacking.model, (right.effect,), lacking.windows))
     astray = tuple(o + 3.0 for o in right.fit.offsets)
@@ -163,31 +164,31 @@ def test_a_rival_gets_on_from_the_leaders_initial_states_and_goes_on_as_long_as_
     stuck = replace(right, fit=replace(right.fit, values=values, offsets=astray, cost=cost, linear=linear))
     stuck = replace(stuck, errors=1.5 * right.errors)
     found = [right, stuck]
-    procedure = Procedure(lacking.model, swung(), DiagnoseCfg(jobs=1), silent)
-    procedure.level(lacking, found, np.array([right.share(lacking)] * 2))
+    fits = CandidateFits(lacking, DiagnoseCfg(jobs=1), TaskRunner())
+    fits.fits = found
+    fits.refit_rivals(np.array([right.share(lacking)] * 2))
     assert found[0].fit.cost <= right.fit.cost
     assert found[1].fit.cost < 1.01 * right.fit.cost
     assert found[1].fit.values[0] == pytest.approx(DAMPING, rel=0.05)
 
 
-def test_what_is_nearly_alike_is_looked_around_and_what_comes_first_is_polished(lacking):
+def test_nearly_equal_candidates_get_a_profile_likelihood_and_the_first_is_polished(lacking):
     best = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
     other = replace(fit_candidate(lacking, screen(lacking, effect("armature"))), errors=1.022 * best.errors)
-    procedure = Procedure(lacking.model, swung(), DiagnoseCfg(jobs=1), silent)
-    looked = []
-    settling = procedure.settling
+    evaluated = []
+
+    class Watched(TaskRunner):
+        def results(self, task, arguments):
+            evaluated.extend(c.effect.name for _, c, *_ in arguments)
+            return super().results(task, arguments)
 
     def judge(c):
         return Finding(c.effect.name, c.effect.target, "", (), c.share(lacking), 0.0, 1.0, 0.0, 0.0, False, 0, (), "")
 
-    def seen(work, tasks):
-        looked.extend(c.effect.name for _, c, *_ in tasks)
-        return settling(work, tasks)
-
-    procedure.settling = seen
-    group = procedure.told_apart(lacking, [(c, replace(judge(c), accepted=True)) for c in (best, other)], judge)
-    assert set(looked) == {"joint_damping", "armature"}
+    accepted = [(c, replace(judge(c), accepted=True)) for c in (best, other)]
+    group = group_indistinguishable(lacking, accepted, judge, Watched(), DiagnoseCfg(jobs=1))
+    assert set(evaluated) == {"joint_damping", "armature"}
     first, finding = group[0]
     assert finding.accepted
     assert finding.name == "joint_damping"
-    assert first.spread is not None
+    assert first.std is not None

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.procedure import Procedure, silent
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.candidates import candidates
-from concent_warp.diagnosis.search.steps import extended, fit_candidate, node, screen
-from concent_warp.diagnosis.search.unknown_force import LEAST, _best_force, _forces, unknown_force
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.search.unknown_force import _best_force, _forces, unknown_force
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -65,9 +67,9 @@ def nodes_of(recording, *effects):
     """Return the model as drawn, fitted, and with effects added in turn."""
     model = Model(Scene(recording.scene))
     windows = observe(model, recording)
-    nodes = [node(model, windows, cut_blocks(windows), "mujoco")]
+    nodes = [fit_baseline(model, windows, cut_blocks(windows), "mujoco")]
     for name in effects:
-        nodes.append(extended(nodes[-1], fit_candidate(nodes[-1], screen(nodes[-1], effect_class(name)("rail")))))
+        nodes.append(add_candidate(nodes[-1], fit_candidate(nodes[-1], screen(nodes[-1], effect_class(name)("rail")))))
     return nodes
 
 
@@ -86,18 +88,18 @@ def partly():
 
 
 def test_a_force_that_depends_on_place_is_seen_behind_an_effect_that_took_up_part_of_it(partly):
-    assert 1.02 < partly[-1].ratio < CFG.adequate
+    assert 1.02 < partly[-1].ratio < CFG.adequate_ratio
     found = unknown_force(partly, CFG, one_by_one)
     assert found is not None
     assert "the position of rail" in found.words
     assert found.p < 0.05
     assert 0.01 < found.share < 0.5
-    assert LEAST <= found.gain < 1 - 1 / partly[-1].ratio ** 2 + 0.1
+    assert CFG.unknown_force.min_gain <= found.gain < 1 - 1 / partly[-1].ratio ** 2 + 0.1
 
 
 def test_the_verdict_then_is_none_of_these_and_says_so(partly):
     recording = ridden(friction=FRICTION, force=bump)
-    said = Procedure(Model(Scene(rail())), recording, CFG, silent).conclude(partly, (), ())
+    said = Procedure(Model(Scene(rail())), recording, CFG).conclude(partly, (), ())
     assert said.verdict == "none_of_these"
     assert said.unknown_force is not None
     assert said.unexplained >= said.unknown_force.share
@@ -108,17 +110,17 @@ def test_the_verdict_then_is_none_of_these_and_says_so(partly):
 def test_a_force_that_beats_the_effect_which_was_added_is_seen(partly):
     (_, friction) = partly
     damping = fit_candidate(friction, screen(friction, effect_class("joint_damping")("rail")))
-    found = _best_force(friction, extended(friction, damping), 1.0, CFG, one_by_one)
+    found = _best_force(friction, add_candidate(friction, damping), 1.0, CFG, one_by_one)
     assert found is not None
     assert found.instead is not None
-    assert found.gain > found.instead + LEAST
+    assert found.gain > found.instead + CFG.unknown_force.min_gain
     assert found.instead == pytest.approx(damping.share(friction), abs=0.02)
     assert "of which the effect that was added explains" in found.sentence
 
 
 def test_a_second_effect_that_is_there_is_not_beaten():
     nodes = nodes_of(ridden(friction=FRICTION, damping=1.0), "joint_friction", "joint_damping")
-    assert nodes[1].ratio ** 2 > 1 + 2 * LEAST
+    assert nodes[1].ratio ** 2 > 1 + 2 * CFG.unknown_force.min_gain
     assert nodes[2].ratio < 1.05
     assert unknown_force(nodes, CFG, one_by_one) is None
 
@@ -143,7 +145,9 @@ def test_a_model_that_explains_nothing_needs_no_such_test():
 
 
 def test_bumps_lie_where_the_joint_was():
-    laws = [force.law(mujoco.MjModel.from_xml_string(rail())) for force in _forces(nodes_of(ridden())[0])]
+    laws = [
+        force.law(mujoco.MjModel.from_xml_string(rail())) for force in _forces(nodes_of(ridden())[0], CFG.unknown_force)
+    ]
     position, velocity = laws
     assert isinstance(position, UnknownJointForce)
     assert isinstance(velocity, UnknownJointForce)

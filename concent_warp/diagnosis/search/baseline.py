@@ -1,0 +1,92 @@
+"""Baselines of the search: a model with its own parameters and the initial states fitted, and its held-out errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
+from concent_warp.fit.effects.initial_states import ROUNDS
+from concent_warp.fit.effects.least_squares import Fit, Solver, projected
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.robust import huber_limit
+from concent_warp.model import Model
+from concent_warp.simulate.select import EngineName
+
+
+def fit_baseline(
+    model: Model,
+    windows: Sequence[Window],
+    blocks: Blocks,
+    engine: EngineName = "mujoco",
+    *,
+    state_iterations: int = ROUNDS,
+) -> FittedModel:
+    """Fit a model's own parameters and the initial states of all windows.
+
+    Args:
+        model: The model.
+        windows: The measured windows.
+        blocks: Blocks of time of the windows' residuals.
+        engine: Which engine simulates.
+        state_iterations: Most iterations of the initial states; with fewer than by default parameters get no second
+            fit.
+    """
+    solver = Solver(Prediction(model, (), windows, engine=engine))
+    measured = [np.zeros(len(w.spread)) for w in windows]
+    fit = solver.fit(None, *solver.refine_starts(solver.p.start, measured, state_iterations))
+    if len(fit.values) and state_iterations >= ROUNDS:
+        fit = solver.polish(fit)
+        model = solver.p.model(fit.values)
+    return _fitted_model(model, windows, blocks, fit, engine)
+
+
+def refit_without_effect(last: FittedModel, effect: int) -> FittedModel:
+    """Return the fitted model without one of its effects, by its index, all that is left fitted again."""
+    model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
+    solver = Solver(Prediction(model, (), last.windows, engine=last.engine))
+    fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
+    return _fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
+
+
+def add_candidate(base: FittedModel, added: FittedCandidate) -> FittedModel:
+    """Return the baseline with the effect of a fitted candidate."""
+    return _fitted_model(added.model, base.windows, base.blocks, added.fit, base.engine)
+
+
+def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> FittedModel:
+    """Return the baseline with the best initial state of each window, also tried from those of its rivals.
+
+    A fit may end in a local minimum of an initial state; a rival that only left such a minimum has explained nothing.
+    """
+    solver = Solver(Prediction(base.model, (), base.windows, engine=base.engine))
+    fit = solver.better_starts(base.fit, [c.fit.offsets for c in rivals])
+    found = _fitted_model(base.model, base.windows, base.blocks, fit, base.engine)
+    return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
+
+
+def quiet_noise_ratios(base: FittedModel, quantile: float) -> dict[str, float]:
+    """Return the RMS residual over the noise of each channel in its quietest blocks [-].
+
+    Args:
+        base: The fitted model.
+        quantile: Quantile of the blocks' RMS residuals, 0..1.
+    """
+    blocks: dict[str, list[float]] = {}
+    for window, piece, rows in zip(base.windows, base.pieces, base.blocks.of_row, strict=True):
+        for r in window.readings:
+            square, block = piece.residual[r.rows] ** 2, rows[r.rows]
+            blocks.setdefault(r.channel, []).extend(float(np.sqrt(square[block == b].mean())) for b in np.unique(block))
+    return {channel: float(np.quantile(values, quantile)) for channel, values in blocks.items()}
+
+
+def _fitted_model(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> FittedModel:
+    """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
+    pieces = tuple(projected(fit))
+    limit = huber_limit([piece.residual for piece in pieces])
+    errors = HeldOut(block_sums(pieces, blocks, limit), blocks).own()
+    return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine)

@@ -1,0 +1,97 @@
+"""What the search passes on: the fitted baseline model, and candidates as screened and as fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.cross_validation import Blocks, Sums
+from concent_warp.fit.effects.least_squares import Fit, Linear
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.robust import HUBER, huber
+from concent_warp.model import Model
+from concent_warp.simulate.select import EngineName
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A model with its own parameters and the initial states fitted: the baseline that a candidate must beat."""
+
+    model: Model
+    windows: tuple[Window, ...]
+    blocks: Blocks
+    fit: Fit
+    pieces: tuple[Linear, ...]
+    """Residuals and sensitivities to the model's own parameters by window, initial states eliminated."""
+    limit: float
+    """Residual over noise above which the robust loss is linear [-]."""
+    errors: np.ndarray
+    """Held-out error of each block, shape (B,)."""
+    engine: EngineName = "mujoco"
+
+    @property
+    def ratio(self) -> float:
+        """Robust RMS residual over the noise [-]: 1 where the model explains all but noise."""
+        return noise_ratio(self.pieces)
+
+
+@dataclass(frozen=True)
+class ScreenedCandidate:
+    """A candidate effect with its expected gain, before any fit."""
+
+    effect: Effect
+    linear_gain: float
+    """Share of the held-out error that a linear step along its sensitivities removes [-]."""
+    scanned_gain: float
+    """Share that the best of a few scanned values removes [-]; 0 where none does."""
+    start: np.ndarray
+    """Values of all parameters from which a fit starts, shape (P,)."""
+    pieces: tuple[Linear, ...]
+    """Sensitivities at the null value by window, initial states eliminated."""
+    measured: bool = False
+    """Whether the fit starts from the measured initial states and not from the baseline's."""
+
+    @property
+    def expected_gain(self) -> float:
+        """The larger of the two gains."""
+        return max(self.linear_gain, self.scanned_gain)
+
+
+@dataclass(frozen=True)
+class FittedCandidate:
+    """A candidate effect that was fitted together with the model's own parameters and the initial states."""
+
+    effect: Effect
+    model: Model
+    """The model with the effect."""
+    fit: Fit
+    sums: Sums
+    pieces: tuple[Linear, ...]
+    errors: np.ndarray
+    """Held-out error of each block, shape (B,)."""
+    ratio: float
+    """Robust RMS residual over the noise that is left [-]."""
+    std: np.ndarray | None = None
+    """Standard deviations of the parameters in units of their scale, shape (P,), where a profile likelihood gives them,
+    see `concent_warp.diagnosis.search.profile_likelihood`."""
+    cost_roughness: float = 0.0
+    """Rise of the cost beyond its quadratic form, which local minima of the initial states cause; see there."""
+    polished: bool = False
+    """Whether refitting the initial states no longer lowers the cost."""
+
+    def gain(self, base: FittedModel) -> np.ndarray:
+        """Return the fall of each block's held-out error against the baseline, shape (B,)."""
+        return base.errors - self.errors
+
+    def share(self, base: FittedModel) -> float:
+        """Return the gain as a share of the baseline's held-out error [-]."""
+        return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
+
+
+def noise_ratio(pieces: Sequence[Linear]) -> float:
+    """Return the RMS of residuals in units of the noise [-], with Huber's loss beyond `HUBER`."""
+    pooled = np.concatenate([piece.residual for piece in pieces])
+    return float(np.sqrt(np.mean(2 * huber(pooled, HUBER))))

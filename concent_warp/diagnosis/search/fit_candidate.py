@@ -1,0 +1,91 @@
+"""Fits of one candidate effect, each a unit of parallel work: plain data in, plain data out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate, noise_ratio
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
+from concent_warp.fit.effects.least_squares import Fit, Solver, projected
+from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.prediction import Prediction
+
+
+def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window] = ()) -> Solver:
+    """Return the solver of the baseline with one effect more; over other windows where some are given."""
+    return Solver(Prediction(base.model, (effect,), windows or base.windows, engine=base.engine))
+
+
+def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit) -> FittedCandidate:
+    """Return a fit of a candidate with its residuals and held-out errors."""
+    pieces = tuple(projected(fit))
+    sums = block_sums(pieces, base.blocks, base.limit)
+    errors = HeldOut(sums, base.blocks).own()
+    return FittedCandidate(effect, solver.p.model(fit.values), fit, sums, pieces, errors, noise_ratio(pieces))
+
+
+def fit_candidate(base: FittedModel, screened: ScreenedCandidate) -> FittedCandidate:
+    """Fit a screened candidate together with the model's own parameters and the initial states."""
+    solver = candidate_solver(base, screened.effect)
+    if screened.measured:
+        return fitted_candidate(base, screened.effect, solver, solver.fit(screened.start))
+    fit = solver.fit(screened.start, base.fit.offsets, base.fit.starts)
+    return fitted_candidate(base, screened.effect, solver, fit)
+
+
+def polish_candidate(
+    base: FittedModel, candidate: FittedCandidate, cfg: SearchCfg | None = None, *, thorough: bool = False
+) -> FittedCandidate:
+    """Return the better of a fit and its refit with initial states fitted again.
+
+    A fit that a refit hardly bettered is returned as it is, unless `thorough`.
+    """
+    if candidate.polished and not thorough:
+        return candidate
+    cfg, solver = cfg or SearchCfg(), candidate_solver(base, candidate.effect)
+    # To the last bit: a fit that no step improves has the baseline's own cost, at the effect's null value.
+    stuck = candidate.fit.cost == base.fit.cost
+    fit = solver.polish(candidate.fit, thorough=thorough, stuck=stuck)
+    found = _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
+    return replace(found, polished=fit.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost)
+
+
+def restart_candidate(
+    base: FittedModel, candidate: FittedCandidate, leader: Fit, cfg: SearchCfg | None = None, quick: bool = False
+) -> FittedCandidate:
+    """Return the better of a fit and its refit from the initial states of the leading candidate's fit.
+
+    Those are taken window by window where they lower the cost, or all together with the parameters that go with them,
+    which a stuck fit needs; `quick` tries the latter alone.
+    """
+    cfg, solver = cfg or SearchCfg(), candidate_solver(base, candidate.effect)
+    start = solver.led(candidate.fit, leader)
+    if not quick:
+        by_window = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
+        start = min(by_window, start, key=lambda f: f.cost)
+    if start.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost:
+        return candidate
+    fit = solver.fit(start.values, start.offsets, start.starts)
+    return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
+
+
+def multiple_shooting_candidate(
+    base: FittedModel, candidate: FittedCandidate, short_windows: Sequence[Window]
+) -> FittedCandidate:
+    """Return the better of a fit and its refit from the values of a multiple-shooting fit over short windows.
+
+    Over long windows stick and slip cause many local minima; short ones, each with its own initial state, have few
+    (multiple shooting: Bock 1983).
+    """
+    values = candidate_solver(base, candidate.effect, short_windows).fit(candidate.fit.values).values
+    solver = candidate_solver(base, candidate.effect)
+    fit = solver.fit(values, base.fit.offsets, base.fit.starts)
+    return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
+
+
+def _better(candidate: FittedCandidate, refitted: FittedCandidate) -> FittedCandidate:
+    """Return the refit where its cost is lower, else the fit as it was."""
+    return refitted if refitted.fit.cost < candidate.fit.cost else candidate

@@ -1,0 +1,158 @@
+"""Fits of the promising candidates of one addition, with the rivals of the best refitted until none lags by chance.
+
+Initial states have local minima, more so with contacts. A candidate whose fit ended in one gains too little, so those
+that may equal the best are refitted from its initial states, and none gets more refits than the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.search.fit_candidate import (
+    fit_candidate,
+    multiple_shooting_candidate,
+    polish_candidate,
+    restart_candidate,
+)
+from concent_warp.diagnosis.tasks import TaskRunner
+from concent_warp.fit.effects.least_squares import MANY
+from concent_warp.fit.effects.observation import Window
+
+BATCH_SPAN = 0.15
+"""Share of a diagnosis that the first fits of an addition take, for the progress."""
+
+
+class CandidateFits:
+    """The fits of candidates to one baseline."""
+
+    def __init__(self, base: FittedModel, cfg: DiagnoseCfg, runner: TaskRunner) -> None:
+        """Prepare to fit candidates to a baseline."""
+        self.base, self.cfg, self.search, self.runner = base, cfg, cfg.search, runner
+        self.fits: list[FittedCandidate] = []
+
+    def fit(
+        self,
+        screened: Sequence[ScreenedCandidate],
+        critical_gain: float,
+        short_windows: Callable[[], Sequence[Window]],
+    ) -> list[FittedCandidate]:
+        """Return fits of the promising candidates, the most promising first.
+
+        Args:
+            screened: All candidates.
+            critical_gain: Gain that chance reaches at the significance level.
+            short_windows: Returns the windows of a multiple-shooting fit.
+        """
+        least = self.search.min_expected_gain * critical_gain
+        promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
+        self._fit_in_batches(promising[: self.cfg.max_fits])
+        if not self.fits:
+            return []
+        expected = np.array(
+            [max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, promising, strict=False)]
+        )
+        best = self._best()
+        self._restart_lagging(best, expected)
+        self._polish_near(best, expected)
+        expected = np.maximum(expected, [c.share(self.base) for c in self.fits])
+        self.refit_rivals(expected)
+        if self._best().ratio > self.cfg.adequate_ratio:
+            self._initialise_by_multiple_shooting(short_windows)
+        return self.fits
+
+    def refit_rivals(self, expected: np.ndarray) -> None:
+        """Refit the best candidate and those that may equal it, for as long as that lowers the cost of one.
+
+        Rivals start from the initial states of the best too, where contacts make the cost rough and local minima would
+        decide between them; over many windows these average out, and one round is enough.
+
+        Args:
+            expected: Gain that each candidate may have, shape (candidates,).
+        """
+        base, search = self.base, self.search
+        for _ in range(search.max_rounds if len(base.windows) <= MANY else 1):
+            before, best = list(self.fits), self._best()
+            k_best, least = self.fits.index(best), search.close_min_gain * best.share(base)
+            close = [k for k, c in enumerate(self.fits) if c is not best and expected[k] > least]
+            self._refit(close, restart_candidate, "fitting rivals again", best.fit, search)
+            near = [k for k in close if self.fits[k].share(base) > least]
+            if any(self.fits[k].errors.sum() > (1 + search.equal_error) * best.errors.sum() for k in near):
+                self._refit([*near, k_best], polish_candidate, "refining initial states", search)
+            elif best.ratio > search.noise_level_ratio:  # those near are its equals already
+                self.fits[k_best] = polish_candidate(base, best, search)
+            if all(
+                c.fit.cost > (1 - search.min_cost_fall) * old.fit.cost for c, old in zip(self.fits, before, strict=True)
+            ):
+                break
+            expected = np.array([c.share(base) for c in self.fits])
+
+    def _best(self) -> FittedCandidate:
+        """Return the fit that removes most of the baseline's error."""
+        return max(self.fits, key=lambda c: c.share(self.base))
+
+    def _refit(self, chosen: Sequence[int], task: Callable[..., FittedCandidate], text: str, *settings: Any) -> None:
+        """Replace some fits by what a task makes of each."""
+        tasks = [(self.base, self.fits[k], *settings) for k in chosen]
+        for k, c in zip(chosen, self.runner.run(task, tasks, text), strict=True):
+            self.fits[k] = c
+
+    def _fit_in_batches(self, promising: Sequence[ScreenedCandidate]) -> None:
+        """Fit candidates, a few at a time; once one explains the data, only those that promise enough beside it."""
+        base, search, left = self.base, self.search, list(promising)
+        while left:
+            tasks, left = [(base, s) for s in left[: search.batch_size]], left[search.batch_size :]
+            self.fits += self.runner.run(fit_candidate, tasks, "fitting", BATCH_SPAN / search.batch_size)
+            if (least := min(c.ratio for c in self.fits)) < search.explained_ratio:
+                best = max(c.share(base) for c in self.fits)
+                at_noise = least < search.noise_level_ratio
+                needed = search.noise_level_min_gain if at_noise else search.explained_min_gain
+                left = [s for s in left if s.expected_gain > needed * best]
+
+    def _restart_lagging(self, best: FittedCandidate, expected: np.ndarray) -> None:
+        """Restart candidates that lag behind one that explains the data from its initial states.
+
+        A fit in a local minimum gains too little; the gains after the restart are written into `expected`.
+        """
+        if best.ratio >= self.search.explained_ratio:
+            return
+        low, high = (
+            share * best.share(self.base) for share in (self.search.restart_min_gain, self.search.polish_min_gain)
+        )
+        lagging = [k for k in range(len(self.fits)) if low < expected[k] <= high]
+        self._refit(lagging, restart_candidate, "fitting rivals again", best.fit, self.search, True)
+        for k in lagging:
+            expected[k] = max(expected[k], self.fits[k].share(self.base))
+
+    def _polish_near(self, best: FittedCandidate, expected: np.ndarray) -> None:
+        """Refit the initial states of candidates near the best that have not reached the noise.
+
+        Beside a best one that has, those close to it are left to `refit_rivals`, which restarts them from its initial
+        states first.
+        """
+        search, gain = self.search, best.share(self.base)
+        restarted = best.ratio < search.noise_level_ratio
+        chosen = [
+            k
+            for k, c in enumerate(self.fits)
+            if expected[k] > search.polish_min_gain * gain
+            and c.ratio > search.noise_level_ratio
+            and not (restarted and c.share(self.base) > search.close_min_gain * gain)
+        ]
+        self._refit(chosen, polish_candidate, "refining initial states", search)
+
+    def _initialise_by_multiple_shooting(self, short_windows: Callable[[], Sequence[Window]]) -> None:
+        """Refit the candidates that explain most from the values of a fit over shorter windows."""
+        base, search = self.base, self.search
+        if max(w.end - w.start for w in base.windows) < 2 * search.shooting_window:
+            return
+        windows = short_windows()
+        least = search.shooting_min_gain * max(c.share(base) for c in self.fits)
+        near = sorted(
+            (k for k, c in enumerate(self.fits) if c.share(base) > least), key=lambda k: self.fits[k].fit.cost
+        )
+        self._refit(near[: search.shooting_fits], multiple_shooting_candidate, "multiple shooting", windows)

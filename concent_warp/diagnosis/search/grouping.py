@@ -1,0 +1,51 @@
+"""The accepted effects of one addition that the data cannot distinguish."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.result import Finding
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.evidence import indistinguishable
+from concent_warp.diagnosis.search.fit_candidate import polish_candidate
+from concent_warp.diagnosis.search.profile_likelihood import refine_by_profile
+from concent_warp.diagnosis.tasks import TaskRunner
+from concent_warp.fit.effects.least_squares import MANY
+
+
+def group_indistinguishable(
+    base: FittedModel,
+    accepted: Sequence[tuple[FittedCandidate, Finding]],
+    assess: Callable[[FittedCandidate], Finding],
+    runner: TaskRunner,
+    cfg: DiagnoseCfg,
+) -> list[tuple[FittedCandidate, Finding]]:
+    """Return the accepted candidates that cannot be distinguished from the best, the most plausible first.
+
+    The first one is polished and its parameters get a profile likelihood. Where more candidates are nearly equal,
+    theirs are evaluated too, which lowers their costs and measures their roughness; over many windows the latter shows
+    in the differences of their errors anyway.
+
+    Args:
+        base: The fitted baseline.
+        accepted: Candidates with their evidence.
+        assess: Returns the evidence of a candidate.
+        runner: Runs the evaluations.
+        cfg: Settings.
+    """
+    search = cfg.search
+
+    def with_evidence(c: FittedCandidate) -> tuple[FittedCandidate, Finding]:
+        # An accepted effect stays accepted: its gain is the evidence, even where a rough cost widens its interval.
+        return c, replace(assess(c), accepted=True, reason="")
+
+    near = indistinguishable(base, accepted, search, slack=search.near_equal_factor)
+    if len(near) > len(indistinguishable(base, accepted, search)) and len(base.windows) <= MANY:
+        first, rest = near[: search.profiled], near[search.profiled :]
+        near = [with_evidence(refine_by_profile(base, c, runner, cfg.profile)) for c, _ in first] + rest
+    group = indistinguishable(base, near, search)
+    polished = polish_candidate(base, group[0][0], search, thorough=True)
+    group[0] = with_evidence(refine_by_profile(base, polished, runner, cfg.profile))
+    return group

@@ -1,0 +1,106 @@
+"""Screening of candidate effects: the expected gain of a fit, from sensitivities and a few scanned values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
+from concent_warp.fit.effects.least_squares import Linear, Solver, projected
+from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.robust import huber, trust
+
+
+def screen(base: FittedModel, effect: Effect, cfg: SearchCfg | None = None) -> ScreenedCandidate:
+    """Return a candidate with the gain that a fit is expected to have.
+
+    Sensitivities are taken at the baseline's initial states, and at the measured ones where those are far away: initial
+    states that compensate for a missing effect lead to a point where its sensitivities mean little.
+
+    Args:
+        base: The fitted baseline.
+        effect: The candidate.
+        cfg: Settings.
+    """
+    cfg = cfg or SearchCfg()
+    solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))
+    values = solver.p.start.copy()
+    # Sensitivities need finite values where the null value is infinite, as that of a limit is.
+    at = np.where(np.isfinite(values), values, solver.scale)
+    # The residual is the baseline's own; at a start off the null value it is another.
+    pieces = with_residuals(projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces)
+    gain = _linear_gain(base, pieces, base.pieces, base.errors)
+    if max(float(np.abs(o).max()) for o in base.fit.offsets) > cfg.max_state_offset:
+        zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
+        measured = projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
+        plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in measured]
+        before = HeldOut(block_sums(plain, base.blocks, base.limit), base.blocks).own()
+        gain = max(gain, _linear_gain(base, measured, plain, before))
+    scanned_gain, start = _scan(solver, base, values)
+    return ScreenedCandidate(effect, gain, scanned_gain, start, pieces)
+
+
+def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Linear, ...]:
+    """Return sensitivities with the residuals of others, window by window."""
+    return tuple(replace(piece, residual=other.residual) for piece, other in zip(pieces, of, strict=True))
+
+
+def projected_residuals(
+    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return residuals by window without what a change of the initial states takes up to first order, each (n,).
+
+    Args:
+        solver: Solver of the candidate.
+        base: The fitted baseline; the dependence on the initial states is its own.
+        values: Parameters, shape (P,).
+        offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
+    """
+    residuals = solver.p.residuals(solver.trials(values, offsets))
+    found = []
+    for r, a, o in zip(residuals, base.fit.starts, offsets, strict=True):
+        near = trust(o)
+        inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
+        found.append(r - a @ inner)
+    return found
+
+
+def robust_sum(base: FittedModel, residuals: Sequence[np.ndarray]) -> float:
+    """Return the robust sum of squares of projected residuals."""
+    return float(2 * sum(huber(r, base.limit).sum() for r in residuals))
+
+
+def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
+    """Return the share of the held-out error that a linear step along the sensitivities removes."""
+    errors = HeldOut(block_sums(with_residuals(pieces, plain), base.blocks, base.limit), base.blocks).own()
+    return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
+
+
+def _scan(solver: Solver, base: FittedModel, values: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
+
+    Threshold effects such as adhesion or backlash have no sensitivity at their null value.
+    """
+    trials = []
+    for k, parameter in enumerate(solver.p.parameters):
+        if k < solver.p.owned:
+            continue
+        for value in parameter.scan:
+            moved = values.copy()
+            moved[k] = value
+            trials.append(moved)
+    best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
+    if not trials:
+        return best, start
+    before = robust_sum(base, [piece.residual for piece in base.pieces])
+    for moved in trials:
+        after = robust_sum(base, projected_residuals(solver, base, moved, base.fit.offsets))
+        gain = (before - after) / max(before, 1e-12)
+        if gain > best:
+            best, start = gain, moved
+    return best, start
