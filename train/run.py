@@ -1,4 +1,4 @@
-"""A run folder: everything that a training was made from, and what it came to."""
+"""Inputs of a training and the run folder that holds them beside its checkpoint."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import SETTINGS, TrainCfg, plain
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
-from concent_warp.train.resets.sample import ResetStates, draw_states
+from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.task import Task
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
-FREE = ("iterations", "checkpoint", "target", "capture", "fuse")
-"""Settings that may change when a training is gone on with."""
+CHANGEABLE = ("iterations", "checkpoint", "target", "capture", "fuse")
+"""Settings that may differ when a training is resumed."""
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What a training is made from."""
+    """Inputs of a training."""
 
     model: Model
     recording: Recording
-    """Of the one demonstration."""
+    """Holds one demonstration."""
     events: ContactEventSequence
     cfg: TrainCfg
 
@@ -40,7 +40,7 @@ class TrainingRun:
         model: Model, recording: Recording, cfg: TrainCfg, *, demonstration: str | None = None,
         events: ContactEventSequence | None = None,
     ) -> TrainingRun:  # fmt: skip
-        """Make a run of one demonstration of a recording, the first by default; its events are extracted if need be."""
+        """Return the inputs for one demonstration of a recording, the first by default; extract its events if None."""
         name = recording[0].name if demonstration is None else demonstration
         one = recording.only([name])
         if events is None:
@@ -48,7 +48,7 @@ class TrainingRun:
         return TrainingRun(model, one, events, cfg)
 
     def save(self, folder: Path) -> None:
-        """Write all of it to a folder."""
+        """Write model, events, demonstration and settings to a folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self.model.save(folder / MODEL)
         self.events.save(folder / EVENTS)
@@ -76,12 +76,13 @@ class TrainingRun:
         return Task.build(self.model, self.recording[0], self.cfg.environment, self.events)
 
     def evaluation_states(self, task: Task, count: int, seed: int) -> ResetStates:
-        """Return initial states to judge a policy by, none of which training has seen.
+        """Return initial states for an evaluation, sampled with another seed than those of training.
 
-        They are displaced ones alone, held as demonstrated; where stages are chained, starts of the whole alone.
+        All are displaced from the demonstration, with the object grasped as demonstrated; in a chain of stages, all are
+        initial states of the whole task.
         """
         cfg = replace(self.cfg.environment.reset, demonstrated=0.0, held=0.0, free=1.0)
-        return draw_states(task, cfg, seed + 1_000_000, count=count)
+        return sample_reset_states(task, cfg, seed + 1_000_000, count=count)
 
 
 def train_run(
@@ -92,35 +93,36 @@ def train_run(
     resume: bool = False,
     report: Report | None = None,
     seconds: float | None = None,
-    ranks: Ranks | None = None,
+    process: DistributedProcess | None = None,
     begin_with: Path | None = None,
 ) -> tuple[Trainer, Iteration | None]:
-    """Train, and return the trainer and its last round.
+    """Train, and return the trainer and its last iteration.
 
     Args:
         run: What to train.
-        folder: Where to write; None for nowhere.
+        folder: Run folder; None writes none.
         device: Warp's name of the device; the first CUDA device by default where there is one.
-        resume: Go on from the folder's checkpoint.
-        report: Called after every round.
+        resume: Continue from the folder's checkpoint.
+        report: Called after every iteration.
         seconds: Time after which to stop [s].
-        ranks: The processes that train together, joined already; this one alone by default. Each has
-            `run.cfg.environment.worlds` worlds of its own.
-        begin_with: Checkpoint whose policy to begin with, where nothing is gone on with.
+        process: This process of a data-parallel training, within its group; a single process by default. Each rank
+            simulates `run.cfg.environment.worlds` worlds.
+        begin_with: Checkpoint of the initial policy, unless a training is resumed.
 
     Raises:
-        TrainError: The folder's training was begun with other settings, or the policy to begin with does not fit.
+        TrainError: The folder's training was started with other settings, or the initial policy has another
+            architecture.
     """
-    ranks = Ranks() if ranks is None else ranks
-    with ranks.agreeing():
-        if folder is not None and ranks.first:
+    process = process or DistributedProcess()
+    with process.raise_together():
+        if folder is not None and process.is_rank_zero:
             if resume:
                 _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
             run.save(folder)
-        task, where, seed = run.task(), ranks.device(device), ranks.seed(run.cfg.seed)
-        states = draw_states(task, run.cfg.environment.reset, seed, device=where)
-        environment = make_environment(task, run.cfg.environment, states, device=where, seed=seed)
-        trainer = Trainer(environment, run.cfg, folder, ranks)
+        task, device, seed = run.task(), process.device(device), process.seed(run.cfg.seed)
+        states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
+        environment = make_environment(task, run.cfg.environment, states, device=device, seed=seed)
+        trainer = Trainer(environment, run.cfg, folder, process)
         environment.reset()
         if resume and folder is not None:
             trainer.resume(folder / CHECKPOINT)
@@ -130,7 +132,11 @@ def train_run(
 
 
 def _check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
-    """Refuse settings that differ from those that a training was begun with."""
+    """Check that settings are those that a training was started with.
+
+    Raises:
+        TrainError: Some differ.
+    """
 
     def flat(value: object, prefix: str = "") -> dict[str, object]:
         if not isinstance(value, dict):
@@ -138,12 +144,12 @@ def _check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
         return {k: v for name, part in value.items() for k, v in flat(part, f"{prefix}.{name}".lstrip(".")).items()}
 
     a, b = flat(plain(before)), flat(plain(now))
-    differing = [n for n in sorted(a | b) if n.split(".")[-1] not in FREE and a.get(n) != b.get(n)]
+    differing = [n for n in sorted(a | b) if n.split(".")[-1] not in CHANGEABLE and a.get(n) != b.get(n)]
     if differing:
         raise TrainError(
-            "this training was begun with other settings",
+            "this training was started with other settings",
             where=folder,
             expected=", ".join(f"{name} {a.get(name)}" for name in differing),
             found=", ".join(f"{name} {b.get(name)}" for name in differing),
-            fix="repeat them, or start anew with --overwrite",
+            fix="pass the same settings, or train again with --overwrite",
         )

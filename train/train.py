@@ -11,7 +11,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
-from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
@@ -34,25 +34,25 @@ def train(
 ) -> Policy:
     """Train a policy by PPO to bring about the contact events of a demonstration.
 
-    With ``torchrun`` several processes train one policy together, each with worlds of its own.
+    Under ``torchrun`` the training is distributed data-parallel: each rank simulates its own worlds.
 
     Args:
         model: The grounded model.
-        recording: Holds the demonstration.
+        recording: Recording with the demonstration.
         cfg: Settings.
-        events: Contact event sequence of the demonstration, or of several by name; extracted where it is not given.
+        events: Contact event sequence of the demonstration, or of several demonstrations by name; extracted by default.
         demonstration: Name of the demonstration; the first by default.
-        begin_with: Policy to start from; random weights by default.
-        device: Warp's name of the device; the first CUDA device by default where there is one.
+        begin_with: Initial policy; random weights by default.
+        device: Warp's name of the device; the first CUDA device by default, the CPU without one.
         seconds: Time after which to stop [s].
-        out: Run folder for checkpoints, curves and all that the policy was made from; None keeps it in memory.
-        resume: Continue the training in the run folder, as if it had not stopped.
+        out: Run folder for checkpoints, metrics and inputs; None writes none.
+        resume: Continue the training of the run folder, as if it had not stopped.
         overwrite: Replace an earlier run in the folder.
         progress: Called after every iteration.
 
     Raises:
-        TrainError: The settings do not fit the demonstration, the folder's training was begun with other settings, or
-            the losses are not finite any more.
+        TrainError: The settings do not fit the demonstration, the folder's training was started with other settings, or
+            the losses became non-finite.
         ConcentError: The folder holds a run and neither `resume` nor `overwrite` is given.
 
     Example:
@@ -64,15 +64,15 @@ def train(
         >>> policy.weights["iteration"]
         1
     """
-    cfg, ranks = cfg or TrainCfg(), Ranks.here()
+    cfg, process = cfg or TrainCfg(), DistributedProcess.from_environment()
     name = recording[0].name if demonstration is None else demonstration
     sequence = events.get(name) if isinstance(events, Mapping) else events
     folder = None if out is None else Path(out)
     claimed = nullcontext()
-    if folder is not None and ranks.first:
+    if folder is not None and process.is_rank_zero:
         claimed = run_folder(folder, overwrite=overwrite, resume=resume)
-    with ranks.joined(ranks.device(device)), claimed:
-        if folder is not None and ranks.first:
+    with process.group(process.device(device)), claimed:
+        if folder is not None and process.is_rank_zero:
             write_settings(folder, {"demonstration": name, **plain(cfg)})
         run = TrainingRun.new(model, recording, cfg, demonstration=name, events=sequence)
         trainer, _ = train_run(
@@ -82,7 +82,7 @@ def train(
             resume=resume,
             report=progress,
             seconds=seconds,
-            ranks=ranks,
+            process=process,
             begin_with=None if begin_with is None else begin_with.folder / CHECKPOINT,
         )
     return Policy(run, trainer.weights(), folder or Path())

@@ -89,7 +89,7 @@ def train_one(args: Args, name: str, seed: int) -> None:
     from concent_warp.simulate.warp_engine import preferred_device
     from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, load_checkpoint
     from concent_warp.train.policy.load import Policy
-    from concent_warp.train.policy.ship import ship
+    from concent_warp.train.policy.write_pretrained import write_pretrained
 
     quiet_warp()
     case, folder, device = CASES[name], folder_of(args, name, seed), args.device or preferred_device()
@@ -120,7 +120,7 @@ def train_one(args: Args, name: str, seed: int) -> None:
     }
     del trainer
     result["simulation"] = simulated(run, checkpoint, args, device)
-    ship(Policy.load(checkpoint), folder / POLICY, overwrite=True)
+    write_pretrained(Policy.load(checkpoint), folder / POLICY, overwrite=True)
     write_text(folder / RESULT, json.dumps(result, indent=1))
     print(f"{folder.name}: {result['simulation']['rate']:.2%} after {result['seconds']:.0f} s", flush=True)
 

@@ -46,7 +46,7 @@ from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import buffers, make_environment
 from concent_warp.train.learning.ppo import Trainer
-from concent_warp.train.resets.sample import ResetStates, draw_states
+from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
 
@@ -173,7 +173,7 @@ class Bench:
         if collision not in self.tasks:
             cfg = replace(self.args.cfg, collision=collision)
             task = Task.build(self.run.model, self.run.recording[0], cfg, self.run.events)
-            states = draw_states(task, cfg.reset, 0, count=self.args.states)
+            states = sample_reset_states(task, cfg.reset, 0, count=self.args.states)
             self.tasks[collision] = task, states
         return self.tasks[collision]
 

@@ -4,7 +4,7 @@ from small_insertion import SETTINGS, make_task
 
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.resets.sample import ResetStates, draw_states
+from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.task import Task
 
 
@@ -15,7 +15,7 @@ def task() -> Task:
 
 @pytest.fixture(scope="session")
 def states(task: Task) -> ResetStates:
-    return draw_states(task, SETTINGS.reset, 0, count=40)
+    return sample_reset_states(task, SETTINGS.reset, 0, count=40)
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.policy.evaluate import run_episodes
-from concent_warp.train.resets.sample import ResetStates, draw_states
-from concent_warp.train.task.movable import movable
+from concent_warp.train.resets.sample import ResetStates, sample_reset_states
+from concent_warp.train.task.movable_fixtures import movable
 from concent_warp.train.task.stages import _worst_distance
 from concent_warp.train.task.task import Task
 
@@ -27,14 +27,14 @@ def chain() -> Task:
 
 @pytest.fixture(scope="module")
 def drawn(chain) -> ResetStates:
-    return draw_states(chain, CHAIN.reset, 0, count=80)
+    return sample_reset_states(chain, CHAIN.reset, 0, count=80)
 
 
 @pytest.fixture
 def as_shown(chain) -> Environment:
     """Return worlds that all start where the demonstration does."""
     cfg = replace(CHAIN, worlds=2, reset=replace(CHAIN.reset, free=1.0, place=(0.0, 0.0)))
-    return make_environment(chain, cfg, draw_states(chain, cfg.reset, 0, count=2), device="cpu")
+    return make_environment(chain, cfg, sample_reset_states(chain, cfg.reset, 0, count=2), device="cpu")
 
 
 def as_demonstrated(environment: Environment, k: int) -> torch.Tensor:
@@ -200,7 +200,7 @@ def test_saved_chain_is_gone_on_with_exactly(chain, drawn):
 
 def test_evaluation_tells_how_many_targets_were_met_in_order(chain):
     cfg = replace(CHAIN, worlds=4, reset=replace(CHAIN.reset, free=1.0, place=(0.0, 0.0)))
-    states = draw_states(chain, cfg.reset, 0, count=6)
+    states = sample_reset_states(chain, cfg.reset, 0, count=6)
     environment = make_environment(chain, cfg, states, device="cpu")
     step = iter(range(10_000))
     found = run_episodes(environment, lambda _: as_demonstrated(environment, next(step)), states)

@@ -12,8 +12,8 @@ from concent_warp.effects.effect import AddedEffect, Parameter
 from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.commands import CommandDynamics, CommandFilter
-from concent_warp.train.environment.effects import effects_of_worlds
+from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
+from concent_warp.train.environment.world_effects import sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.task.task import Task
 
@@ -44,7 +44,7 @@ def offline(task: Task, values: tuple[np.ndarray, ...], world: int, ctrl: np.nda
 
 def test_commands_are_followed_as_the_effects_have_it(late):
     rng = np.random.default_rng(0)
-    values = effects_of_worlds(late, WORLDS, 0, draw=True)
+    values = sample_world_effects(late, WORLDS, 0, draw=True)
     rows = (np.array([[0.0], [0.005], [0.0123], [0.062], [0.29]]), np.array([[0.0], [0.03], [0.001], [0.2], [0.05]]))
     parts = []
     for added, row in zip(late.model.effects, rows, strict=True):
@@ -83,7 +83,7 @@ def test_worlds_that_begin_anew_forget_what_was_commanded(late):
 def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=DECIMATION)
     physics = _make_physics(late, settings, device="cpu")
-    values = effects_of_worlds(late, WORLDS, 0, draw=True).values
+    values = sample_world_effects(late, WORLDS, 0, draw=True).values
     assert len(np.unique(values[0])) == WORLDS
     physics.qpos[:] = torch.as_tensor(late.replay.qpos[0]).to(physics.qpos.dtype)
     ctrl = np.tile(late.replay.ctrl[0], (8, 1))

@@ -14,8 +14,8 @@ from concent_warp.effects.library.joints import JointDamping, Stribeck
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.effects import _drawn, effects_of_worlds
-from concent_warp.train.environment.randomisation import drawn_fields
+from concent_warp.train.environment.randomisation import sample_model_fields
+from concent_warp.train.environment.world_effects import _drawn, sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics
 from concent_warp.train.task.task import Task
 
@@ -52,30 +52,30 @@ def test_parameters_have_the_interval_of_the_fit(varied):
 
 
 def test_values_follow_from_the_seed(varied):
-    first, again, other = (effects_of_worlds(varied, 5, seed, draw=True).values[0] for seed in (0, 0, 1))
+    first, again, other = (sample_world_effects(varied, 5, seed, draw=True).values[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1
 
 
 def test_parameters_stay_within_their_bounds():
     wide = replace(DAMPING, intervals=((-40.0, 100.0), (0.0, 40.0)))
-    values = effects_of_worlds(task_of(wide), 500, 0, draw=True).values[0]
+    values = sample_world_effects(task_of(wide), 500, 0, draw=True).values[0]
     assert values.min() >= 0
     assert values[:, 0].max() > 90
     assert len(np.unique(values[:, 0])) == 500
 
 
 def test_nothing_is_drawn_where_it_is_not_wanted_or_not_known(varied):
-    found = effects_of_worlds(varied, 3, 0, draw=False)
+    found = sample_world_effects(varied, 3, 0, draw=False)
     assert not found.fields
     for values, added in zip(found.values, varied.model.effects, strict=True):
         np.testing.assert_array_equal(values, np.tile(added.array, (3, 1)))
-    unknown = effects_of_worlds(task_of(replace(DAMPING, intervals=())), 3, 0, draw=True)
+    unknown = sample_world_effects(task_of(replace(DAMPING, intervals=())), 3, 0, draw=True)
     assert not unknown.fields
 
 
 def test_fields_are_those_of_models_with_the_drawn_values(varied):
-    found = effects_of_worlds(varied, WORLDS, 0, draw=True)
+    found = sample_world_effects(varied, WORLDS, 0, draw=True)
     assert set(found.fields) >= {"dof_damping", "body_mass"}
     for world in range(WORLDS):
         effects = [replace(a, values=tuple(v[world])) for a, v in zip(varied.model.effects, found.values, strict=True)]
@@ -88,7 +88,7 @@ def test_fields_are_those_of_models_with_the_drawn_values(varied):
 def test_each_world_moves_as_a_model_with_its_values(varied, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=5)
     physics = _make_physics(varied, settings, device="cpu")
-    found = effects_of_worlds(varied, WORLDS, 0, draw=True)
+    found = sample_world_effects(varied, WORLDS, 0, draw=True)
     start = torch.as_tensor(varied.replay.qpos[0])
     physics.qpos[:] = start.to(physics.qpos.dtype)
     ctrl = varied.replay.ctrl[0].copy()
@@ -127,13 +127,13 @@ def test_what_is_compiled_in_is_kept_and_said_so():
     late = AddedEffect(Latency(), (0.01,), ((0.005, 0.015),))
     task = task_of(size, DAMPING, late)
     with pytest.warns(UserWarning, match="cannot vary size between worlds") as said:
-        found = effects_of_worlds(task, 3, 0, draw=True)
+        found = sample_world_effects(task, 3, 0, draw=True)
     assert len(said) == 1
     assert found.kept == ("size",)
     assert (found.values[0] == 1.01).all()
     assert len(np.unique(found.values[1][:, 0])) == 3
     with pytest.warns(UserWarning, match="joint_damping"):
-        found = effects_of_worlds(task, 3, 0, draw=True, variable=lambda name: name != "dof_damping")
+        found = sample_world_effects(task, 3, 0, draw=True, variable=lambda name: name != "dof_damping")
     assert found.kept == ("size", "joint_damping")
     assert not found.fields
 
@@ -142,7 +142,7 @@ def test_factors_are_on_top_of_effects(varied):
     cfg = RandomisationCfg(damping=(2.0, 2.0000001))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fields = effects_of_worlds(varied, WORLDS, 0, draw=True).fields
-    both = drawn_fields(varied, WORLDS, cfg, 0, fields)
+        fields = sample_world_effects(varied, WORLDS, 0, draw=True).fields
+    both = sample_model_fields(varied, WORLDS, cfg, 0, fields)
     np.testing.assert_allclose(both["dof_damping"], 2 * fields["dof_damping"], rtol=1e-6)
     np.testing.assert_array_equal(both["body_mass"], fields["body_mass"])

@@ -12,7 +12,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.physics import WarpPhysics, _compiled_or_plain
-from concent_warp.train.environment.randomisation import drawn_fields
+from concent_warp.train.environment.randomisation import sample_model_fields
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 
 
@@ -74,10 +74,10 @@ def test_world_that_diverges_is_reset_counted_and_kept_apart(environment):
     assert torch.isfinite(reward).all()
     assert torch.isfinite(environment.observation).all()
     assert environment.read_log()["diverged worlds"] == 1
-    offence = environment.offending_state()
-    assert offence is not None
-    assert offence["qvel"][0] == pytest.approx(1e9)
-    np.testing.assert_allclose(offence["qvel"][1:], before[3, 1:], atol=1e-6)
+    diverged = environment.diverged_state()
+    assert diverged is not None
+    assert diverged["qvel"][0] == pytest.approx(1e9)
+    np.testing.assert_allclose(diverged["qvel"][1:], before[3, 1:], atol=1e-6)
 
 
 def test_ended_worlds_start_from_initial_states_and_show_them(environment, states):
@@ -194,7 +194,7 @@ def test_both_simulators_give_the_same_steps(task, states):
 
 def test_randomised_fields_differ_between_worlds_and_are_used(task):
     cfg = replace(SETTINGS.randomisation, friction=(0.5, 1.5), grip=(2.0, 3.0), stiffness=(0.8, 1.2), mass=(0.5, 2.0))
-    fields = drawn_fields(task, 4, cfg, 0)
+    fields = sample_model_fields(task, 4, cfg, 0)
     m = task.compiled
     ratio = fields["geom_friction"][:, :, 0] / m.geom_friction[:, 0]
     robot = [m.body(name).id for name in ("rail", "palm", "left_finger", "right_finger")]

@@ -7,7 +7,7 @@ import pytest
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 from concent_warp.train.cfg import ActionCfg
 from concent_warp.train.resets.inverse_kinematics import reach
-from concent_warp.train.resets.inverse_kinematics_batch import _tool_chain, reach_many
+from concent_warp.train.resets.inverse_kinematics_batch import _tool_chain, solve_inverse_kinematics_batch
 from concent_warp.train.task.robot import Robot
 
 Asked = tuple[mujoco.MjModel, Robot, np.ndarray, np.ndarray, np.ndarray]
@@ -62,7 +62,7 @@ def test_small_displacements_are_reached_from_the_posture(asked):
 @pytest.mark.slow
 def test_newton_reaches_all_poses_at_once(asked):
     m, robot, qpos, position, rotation = asked
-    joints, fine = reach_many(m, robot, qpos, position, rotation, device="cpu")
+    joints, fine = solve_inverse_kinematics_batch(m, robot, qpos, position, rotation, device="cpu")
     assert fine.tolist() == [True] * 5 + [False]
     for i in range(5):
         check(asked, i, joints[i])

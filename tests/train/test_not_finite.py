@@ -1,4 +1,4 @@
-"""A world that is not finite any more spoils neither the others nor the policy."""
+"""A world that is losses or weights are not finite spoils neither the others nor the policy."""
 
 from dataclasses import replace
 
@@ -66,27 +66,27 @@ def test_what_is_not_finite_stays_in_its_world_and_goes_with_its_episode(task, s
             assert torch.isfinite(b.double()).all()
         assert bool(after[2][WORLD]) == (k == 2)
     assert environment.read_log()["diverged worlds"] == 1
-    offence = environment.offending_state()
-    assert offence is not None
+    diverged = environment.diverged_state()
+    assert diverged is not None
     if place != "warmstart":
-        assert np.isnan(offence[place][-1])
+        assert np.isnan(diverged[place][-1])
 
 
 @engines
 def test_kept_state_diverges_again(task, states, engine):
     environment = made(task, states, engine)
     run(environment, {"qvel": 1e9})
-    offence = environment.offending_state()
-    assert offence is not None
-    assert offence["world"] == WORLD
+    diverged = environment.diverged_state()
+    assert diverged is not None
+    assert diverged["world"] == WORLD
     again = made(task, states, engine)
     again.start_from(list(range(WORLDS)))
     for name in ("qpos", "qvel", "ctrl"):
         state = getattr(again.physics, name)
-        state[0] = torch.as_tensor(offence[name]).to(state.dtype)
+        state[0] = torch.as_tensor(diverged[name]).to(state.dtype)
     for state, name in zip(again.physics.mocap, ("mocap_pos", "mocap_quat"), strict=True):
-        assert offence[name].shape == state[0].shape
-        state[0] = torch.as_tensor(offence[name]).to(state.dtype)
+        assert diverged[name].shape == state[0].shape
+        state[0] = torch.as_tensor(diverged[name]).to(state.dtype)
     again.step(torch.zeros(WORLDS, again.num_actions))
     assert again.failure[:, 2].tolist() == [True, *[False] * (WORLDS - 1)]
 
@@ -102,8 +102,8 @@ def test_policy_is_the_same_whether_a_world_ends_not_finite_or_too_fast(task, st
         environment.reset()
         trainer.learn()
         assert sum(this.log["diverged worlds"] for this in trainer.history) == 1
-        with np.load(tmp_path / str(value) / DIVERGED_STATE_FILE) as offence:
-            assert np.isnan(offence["qvel"][0]) if value != value else offence["qvel"][0] == value
+        with np.load(tmp_path / str(value) / DIVERGED_STATE_FILE) as diverged:
+            assert np.isnan(diverged["qvel"][0]) if value != value else diverged["qvel"][0] == value
         found.append(trainer.algorithm.save())
     for name in ("actor_state_dict", "critic_state_dict"):
         for key, weight in found[0][name].items():
@@ -135,7 +135,7 @@ def test_training_that_diverges_stops_and_keeps_its_last_checkpoint(task, states
         if this.iteration == 2:
             trainer.algorithm.optimizer.param_groups[0]["lr"] = 1e30
 
-    with pytest.raises(TrainError, match="not finite any more"):
+    with pytest.raises(TrainError, match="losses or weights are not finite"):
         trainer.learn(spoil)
     saved = torch.load(tmp_path / CHECKPOINT, weights_only=False)
     assert 2 <= saved["iteration"] < 8

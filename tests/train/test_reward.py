@@ -6,8 +6,8 @@ import torch
 
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
 from concent_warp.train.environment.environment import TERMS
+from concent_warp.train.environment.quaternions import angle, inverse, multiply, rotate, rotation_columns
 from concent_warp.train.environment.reward import disturbance, effort, engineered
-from concent_warp.train.environment.rotation import angle, inverse, multiply, rotate, two_columns
 from concent_warp.train.learning.distribution import SquashedGaussian
 
 
@@ -31,7 +31,7 @@ def test_rotations_agree_with_matrices():
         rotate(multiply(ta, tb), tv), np.einsum("nij,njk,nk->ni", matrix(a), matrix(b), v), atol=1e-12
     )
     np.testing.assert_allclose(rotate(inverse(ta), rotate(ta, tv)), v, atol=1e-12)
-    np.testing.assert_allclose(two_columns(ta), matrix(a)[:, :, :2].transpose(0, 2, 1).reshape(5, 6), atol=1e-12)
+    np.testing.assert_allclose(rotation_columns(ta), matrix(a)[:, :, :2].transpose(0, 2, 1).reshape(5, 6), atol=1e-12)
     turn = torch.tensor([np.cos(0.0001), np.sin(0.0001), 0, 0], dtype=torch.float32)
     assert float(angle(turn)) == pytest.approx(0.0002, rel=1e-4)
     assert float(angle(-turn)) == pytest.approx(0.0002, rel=1e-4)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from several_processes import make_run
+from data_parallel_training import make_run
 
 from concent_warp.cli import main
 from concent_warp.errors import TrainError
@@ -15,7 +15,7 @@ from concent_warp.train.environment.observation import Layout
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, pretrained_checkpoint
-from concent_warp.train.policy.ship import ship
+from concent_warp.train.policy.write_pretrained import write_pretrained
 from concent_warp.train.run import TrainingRun, train_run
 
 
@@ -88,12 +88,12 @@ def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_p
         np.testing.assert_array_equal(getattr(tasks[0].table, name), getattr(tasks[1].table, name))
     origin = tomllib.loads((small / ORIGIN).read_text())
     assert origin["command"] == "concent train demo.h5 --seed 0"
-    assert origin["rounds"] == 4
+    assert origin["iterations"] == 4
 
 
 def test_training_cannot_go_on_from_a_policy_alone(folder, tmp_path):
-    ship(Policy.load(folder), tmp_path / "small")
-    with pytest.raises(TrainError, match="no training to go on with"):
+    write_pretrained(Policy.load(folder), tmp_path / "small")
+    with pytest.raises(TrainError, match="no training to resume"):
         train_run(make_run(), tmp_path / "small", device="cpu", resume=True)
 
 

@@ -15,7 +15,7 @@ from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.observation import Layout
 from concent_warp.train.environment.physics import MujocoPhysics
-from concent_warp.train.resets.sample import draw_states
+from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.task.slots import _choose
 from concent_warp.train.task.task import Task
 
@@ -46,7 +46,7 @@ def test_observation_of_the_shape_sorter_is_the_papers_table(sorter):
 
 
 def test_observation_of_the_shape_sorter_reads_the_state(sorter):
-    states = draw_states(sorter, ResetCfg(), 0, count=2)
+    states = sample_reset_states(sorter, ResetCfg(), 0, count=2)
     physics = MujocoPhysics(sorter.compiled, 2, 10)
     environment = Environment(sorter, EnvironmentCfg(worlds=2), physics, states)
     environment.start_from([0, 1])
@@ -113,7 +113,7 @@ def test_displaced_states_keep_the_block_in_the_hand(task, states):
 
 def test_what_is_held_is_turned_about_the_axis_along_which_it_is_held(task):
     cfg = replace(SETTINGS.reset, demonstrated=0.0, turn=0.0, held=0.2)
-    found = draw_states(task, cfg, 0, count=24)
+    found = sample_reset_states(task, cfg, 0, count=24)
     # The fingers close along y: the block turns about y by up to 0.2 rad, and about nothing else.
     angles = 2 * np.arcsin(found.qpos[:, 4:7] * np.sign(found.qpos[:, 3:4]))
     assert np.abs(angles[:, 1]).max() > 0.1
@@ -123,7 +123,7 @@ def test_what_is_held_is_turned_about_the_axis_along_which_it_is_held(task):
 
 
 def test_states_follow_from_the_seed_and_arms_reach_theirs(sorter):
-    first, again, other = (draw_states(sorter, ResetCfg(), seed, count=8) for seed in (0, 0, 1))
+    first, again, other = (sample_reset_states(sorter, ResetCfg(), seed, count=8) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.qpos, again.qpos)
     assert np.abs(first.qpos - other.qpos).max() > 1e-3
     assert sum(first.discarded.values()) < 20
@@ -131,7 +131,7 @@ def test_states_follow_from_the_seed_and_arms_reach_theirs(sorter):
 
 def test_impossible_displacements_are_given_up_with_counts(task):
     with pytest.raises(TrainError, match="unreachable"):
-        draw_states(task, replace(SETTINGS.reset, turn=1.0, demonstrated=0.0), 0, count=3)
+        sample_reset_states(task, replace(SETTINGS.reset, turn=1.0, demonstrated=0.0), 0, count=3)
 
 
 def test_configuration_comes_back_from_its_file(tmp_path):

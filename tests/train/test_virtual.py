@@ -10,7 +10,7 @@ from small_insertion import SETTINGS
 from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.train.cfg import CollisionCfg
-from concent_warp.train.environment.vcp import _surface_points, _within
+from concent_warp.train.environment.virtual_collision import _surface_points, _within
 from concent_warp.train.environment.worlds import make_environment
 
 HALF, RADIUS, SLACK = 0.02, 0.004, 0.0005

@@ -23,9 +23,9 @@ from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.observation import BaseObservation, Layout
 from concent_warp.train.environment.physics import Graph, Physics, captured
+from concent_warp.train.environment.quaternions import inverse, rotate
 from concent_warp.train.environment.reward import disturbance, effort, engineered, relative_pose
-from concent_warp.train.environment.rotation import inverse, rotate
-from concent_warp.train.environment.vcp import virtual_collision
+from concent_warp.train.environment.virtual_collision import virtual_collision
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
@@ -93,8 +93,8 @@ class Environment(VecEnv):
         self.observation = wp.to_torch(self._observation)
         """The observation, shape (N, layout.size); overwritten by the next step."""
         whole = cfg.capture == "step" and self.device.startswith("cuda")
-        parts = (self._apply_action, self._judge_step, self._read_base)
-        self._command, self._judge, self._observe = (captured(part, whole, fuse=cfg.fuse) for part in parts)
+        parts = (self._apply_action, self._evaluate_step, self._read_base)
+        self._command, self._evaluate, self._observe = (captured(part, whole, fuse=cfg.fuse) for part in parts)
         self.reset()
 
     def _make_tables(self) -> None:
@@ -123,7 +123,7 @@ class Environment(VecEnv):
         self._rest = max(1, round(cfg.chain.rest / self.control_step))
         self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
         force, torque = cfg.randomisation.push
-        self._push = real([force] * 3 + [torque] * 3) if force or torque else None
+        self._perturbation_std = real([force] * 3 + [torque] * 3) if force or torque else None
         pool = self._states
         self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
         self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
@@ -157,26 +157,26 @@ class Environment(VecEnv):
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
-        self._offence = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
-        self._offended = torch.zeros((), dtype=torch.bool, device=device)
+        self._diverged_state = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
+        self._has_diverged = torch.zeros((), dtype=torch.bool, device=device)
         self._none = torch.zeros(n, device=device)
-        self._skill = torch.zeros((), device=device)
-        self._pushing = torch.ones((), device=device)
+        self._success_average = torch.zeros((), device=device)
+        self._perturbing = torch.ones((), device=device)
 
     def reset(self) -> None:
         """Start an episode in every world for training, at random places of it, so that they do not end all at once."""
-        self._pushing.fill_(1)
+        self._perturbing.fill_(1)
         with torch.no_grad():
             self._start(torch.ones_like(self.done))
             self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
             self._return.zero_()
-            for value in (self._sums, self._skill, self._offended):
+            for value in (self._sums, self._success_average, self._has_diverged):
                 value.zero_()
             self.refresh()
 
     def start_from(self, rows: Sequence[int]) -> None:
         """Start an episode in every world from the states of these rows, one each; from here on nothing is pushed."""
-        self._pushing.zero_()
+        self._perturbing.zero_()
         index = torch.as_tensor(np.asarray(rows), device=self.device)
         with torch.no_grad():
             self._start(torch.ones_like(self.done), index)
@@ -200,7 +200,7 @@ class Environment(VecEnv):
             self._command()
             self.physics.advance()
             self._measured.launch()
-            self._judge()
+            self._evaluate()
             reward, done, time_out = self.reward.clone(), self.done.clone(), self.time_out.clone()
             means = self.terms.mean(dim=0)
             self.refresh()
@@ -230,15 +230,15 @@ class Environment(VecEnv):
             means |= {**chained, "success": success, "chains": sums["chains"]}
         return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
 
-    def offending_state(self) -> dict[str, np.ndarray] | None:
+    def diverged_state(self) -> dict[str, np.ndarray] | None:
         """Return the state at the start of the step in which a world first diverged, None if none has.
 
         It consists of "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, where objects stand that do not move,
         "mocap_pos" (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the number of the "world", shape ().
         """
-        if not bool(self._offended):
+        if not bool(self._has_diverged):
             return None
-        m, values = self.task.compiled, self._offence.cpu().numpy()
+        m, values = self.task.compiled, self._diverged_state.cpu().numpy()
         shapes = {"qpos": (m.nq,), "qvel": (m.nv,), "ctrl": (m.nu,), "mocap_pos": (m.nmocap, 3)}
         shapes |= {"mocap_quat": (m.nmocap, 4), "world": ()}
         parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
@@ -267,7 +267,7 @@ class Environment(VecEnv):
         parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
         parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
         parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
-        parts |= {"most": self._most, "near": self._near, "resting": self._resting, "skill": self._skill}
+        parts |= {"most": self._most, "near": self._near, "resting": self._resting, "skill": self._success_average}
         return parts | p.memory
 
     def parts(self) -> tuple[Callable[[], None], ...]:
@@ -280,7 +280,7 @@ class Environment(VecEnv):
             self._paired.launch()
 
         return (
-            self._command, self.physics.advance, self._measured.launch, self._judge, poses_and_pairs, self._observe,
+            self._command, self.physics.advance, self._measured.launch, self._evaluate, poses_and_pairs, self._observe,
         )  # fmt: skip
 
     def place(self) -> torch.Tensor:
@@ -305,14 +305,14 @@ class Environment(VecEnv):
         if len(self._gripper):
             opened = p.ctrl[:, self._gripper] + action[:, joints:] * self._step[joints:]
             p.ctrl[:, self._gripper] = opened.clamp(self._range[self._gripper, 0], self._range[self._gripper, 1])
-        if self._push is not None:
-            self._push_object(self._push)
+        if self._perturbation_std is not None:
+            self._perturb_object(self._perturbation_std)
 
-    def _push_object(self, deviation: torch.Tensor) -> None:
+    def _perturb_object(self, deviation: torch.Tensor) -> None:
         """Have forces and torques of these standard deviations (6,) act on object 1 in some worlds that hold it."""
         held = self._frames[self.stage.long(), 0] > 0
         hit = held & (torch.rand(self.num_envs, device=self.device) < self._settings.randomisation.push_share)
-        wrench = torch.randn(self.num_envs, 6, device=self.device) * deviation * self._pushing
+        wrench = torch.randn(self.num_envs, 6, device=self.device) * deviation * self._perturbing
         self.physics.wrench[:, self.task.objects[0]] = wrench * hit[:, None]
 
     def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -332,7 +332,7 @@ class Environment(VecEnv):
         if self._virtual is not None:
             self._virtual.launch()
 
-    def _judge_step(self) -> None:
+    def _evaluate_step(self) -> None:
         """Reward the step, let worlds move on, end episodes, and start new ones in their worlds."""
         p, cfg, stage = self.physics, self._settings.reward, self.stage.long()
         sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
@@ -354,7 +354,7 @@ class Environment(VecEnv):
         disturb = disturbance(cfg, self._pose_before, self._object_poses())
         weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
         weighted += [cfg.regularisation * t for t in (*arm, disturb)]
-        strictness = cfg.lenience + (1 - cfg.lenience) * self._skill.square()
+        strictness = cfg.lenience + (1 - cfg.lenience) * self._success_average.square()
         weighted += [cfg.vcp * strictness * self._penalty, self._none]
         terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
         terms[:, -1] = -cfg.failure * strictness * failed
@@ -367,7 +367,7 @@ class Environment(VecEnv):
         finished = (self.episode_length_buf >= self.max_episode_length) | (self._resting >= self._rest)
         self.time_out.copy_(finished & ~failed)
         self.done.copy_(failed | self.time_out)
-        self._note_offence(diverged)
+        self._record_divergence(diverged)
         self._count(terms)
         self._start(self.done)
 
@@ -407,7 +407,7 @@ class Environment(VecEnv):
         # Of as many episodes as there are worlds, those before count by 1 / e.
         keep = torch.exp(-ended.sum() / self.num_envs)
         share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
-        self._skill.copy_(torch.lerp(share, self._skill.double(), keep))
+        self._success_average.copy_(torch.lerp(share, self._success_average.double(), keep))
         counts = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
         sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
         sums += [count.double().sum() for count in counts]
@@ -418,14 +418,14 @@ class Environment(VecEnv):
         self._sums += torch.stack(sums)
         p.overflow.zero_()
 
-    def _note_offence(self, diverged: torch.Tensor) -> None:
+    def _record_divergence(self, diverged: torch.Tensor) -> None:
         """Keep the state before the step of the first world that diverged."""
         world = diverged.to(torch.uint8).argmax()
         parts = [*self._before, *self.physics.mocap, self._worlds]
         state = torch.cat([values.index_select(0, world[None]).flatten().double() for values in parts])
-        first = diverged.any() & ~self._offended
-        self._offence.copy_(torch.where(first, state, self._offence))
-        self._offended.logical_or_(first)
+        first = diverged.any() & ~self._has_diverged
+        self._diverged_state.copy_(torch.where(first, state, self._diverged_state))
+        self._has_diverged.logical_or_(first)
 
     def _start(self, where: torch.Tensor, rows: torch.Tensor | None = None) -> None:
         """Start episodes in the worlds of a mask (N,) bool, from initial states drawn anew or of these rows (N,)."""

@@ -8,7 +8,7 @@ import torch
 
 from concent_warp.kernels.contact_pairs import SLOT
 from concent_warp.train.environment.physics import Physics
-from concent_warp.train.environment.rotation import two_columns
+from concent_warp.train.environment.quaternions import rotation_columns
 from concent_warp.train.task.task import Task
 
 
@@ -86,5 +86,5 @@ class BaseObservation:
         place = p.position[:, self._objects]
         if self._noise:
             place = place + self._noise * torch.randn_like(place)
-        objects = torch.cat([place, two_columns(p.quaternion[:, self._objects])], dim=-1)
+        objects = torch.cat([place, rotation_columns(p.quaternion[:, self._objects])], dim=-1)
         return torch.cat([*parts, p.site[:, self._tool], objects.flatten(1)], dim=1)

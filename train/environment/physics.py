@@ -15,7 +15,7 @@ import warp as wp
 
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
-from concent_warp.train.environment.commands import CommandDynamics, CommandFilter
+from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel

@@ -12,14 +12,14 @@ import mujoco
 import numpy as np
 
 from concent_warp.train.cfg import RandomisationCfg
-from concent_warp.train.environment.commands import CommandDynamics
+from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.task.task import Task
 
 ONE, NONE = (1.0, 1.0), (0.0, 0.0)
 """Ranges in which a factor, or a time, changes nothing."""
 
 
-def drawn_fields(
+def sample_model_fields(
     task: Task,
     worlds: int,
     cfg: RandomisationCfg,
@@ -70,7 +70,7 @@ def drawn_fields(
     return found
 
 
-def drawn_following(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> CommandDynamics:
+def sample_command_dynamics(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> CommandDynamics:
     """Return the delay and the lag of the arm's commands in N worlds."""
     rng = np.random.default_rng([seed, 4])
     times = []

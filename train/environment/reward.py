@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
-from concent_warp.train.environment.rotation import angle, inverse, multiply, rotate
+from concent_warp.train.environment.quaternions import angle, inverse, multiply, rotate
 
 
 def effort(

@@ -7,11 +7,11 @@ import copy
 import mujoco
 
 from concent_warp.train.cfg import EnvironmentCfg
-from concent_warp.train.environment.commands import CommandDynamics
-from concent_warp.train.environment.effects import effects_of_worlds
+from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics, Physics, WarpPhysics
-from concent_warp.train.environment.randomisation import drawn_fields, drawn_following
+from concent_warp.train.environment.randomisation import sample_command_dynamics, sample_model_fields
+from concent_warp.train.environment.world_effects import sample_world_effects
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
@@ -48,9 +48,9 @@ def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None,
         variable = None
     else:
         from concent_warp.simulate.warp_model import batchable as variable
-    effects = effects_of_worlds(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
-    fields = drawn_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
-    following = CommandDynamics.of([*effects.late, drawn_following(task, cfg.worlds, cfg.randomisation, seed)])
+    effects = sample_world_effects(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
+    fields = sample_model_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
+    following = CommandDynamics.of([*effects.late, sample_command_dynamics(task, cfg.worlds, cfg.randomisation, seed)])
     if plain:
         return MujocoPhysics(m, cfg.worlds, cfg.simulation_steps, effects.laws, fields=fields, following=following)
     contacts, constraints = buffers(task, cfg)

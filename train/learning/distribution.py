@@ -8,14 +8,12 @@ import torch
 from rsl_rl.modules.distribution import GaussianDistribution
 from torch import nn
 
-LARGEST = 1.0 - 1e-6
-"""Magnitude to which actions are kept off the ends, where the squashing cannot be undone in single precision."""
-
-
-FARTHEST = 4.0
-"""Magnitude to which means of u are kept in training: tanh(4) is 0.9993. What a network answers to an observation far
-out of the ordinary may be in the hundreds; there a small update changes densities by more than single precision holds,
-and one such step of one world would end a training with losses that are not finite."""
+MAX_ACTION = 1.0 - 1e-6
+"""Largest magnitude of an action: nearer to 1, tanh cannot be inverted in single precision."""
+MAX_MEAN = 4.0
+"""Largest magnitude of the mean of u in training: tanh(4) is 0.9993. For an observation far from those seen before, the
+network's output can be in the hundreds, where a small update changes the density by more than single precision
+represents, and the losses become non-finite."""
 
 
 class SquashedGaussian(GaussianDistribution):
@@ -26,21 +24,21 @@ class SquashedGaussian(GaussianDistribution):
     """
 
     def update(self, mlp_output: torch.Tensor) -> None:
-        """Take means (..., A) of u, kept within -4..4."""
-        super().update(mlp_output.clamp(-FARTHEST, FARTHEST))
+        """Set the distribution from means (..., A) of u, clamped to -4..4."""
+        super().update(mlp_output.clamp(-MAX_MEAN, MAX_MEAN))
 
     def sample(self) -> torch.Tensor:
         """Return actions, shape (..., A), strictly between -1 and 1."""
-        return torch.tanh(super().sample()).clamp(-LARGEST, LARGEST)
+        return torch.tanh(super().sample()).clamp(-MAX_ACTION, MAX_ACTION)
 
     def log_prob(self, outputs: torch.Tensor) -> torch.Tensor:
         """Return the log density of actions (..., A), shape (...)."""
-        u = torch.atanh(outputs.clamp(-LARGEST, LARGEST))
+        u = torch.atanh(outputs.clamp(-MAX_ACTION, MAX_ACTION))
         return super().log_prob(u) - _log_slope(u).sum(dim=-1)
 
     @property
     def entropy(self) -> torch.Tensor:
-        """Return the entropy, shape (...): that of u, and the mean of log da/du estimated from one draw."""
+        """Return the entropy, shape (...): that of u, and the mean of log da/du estimated from one sample."""
         assert self._distribution is not None
         u = self._distribution.rsample()
         return super().entropy + _log_slope(u).sum(dim=-1)
@@ -50,10 +48,10 @@ class SquashedGaussian(GaussianDistribution):
         return torch.tanh(mlp_output)
 
     def as_deterministic_output_module(self) -> nn.Module:
-        """Return the same as a module for export."""
+        """Return the module that maps the mean of u to the action, for export."""
         return nn.Tanh()
 
 
 def _log_slope(u: torch.Tensor) -> torch.Tensor:
-    """Return log(1 - tanh(u)^2), in the form that does not run out of precision."""
+    """Return log(1 - tanh(u)^2) in a numerically stable form, shape of `u`."""
     return 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))

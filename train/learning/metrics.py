@@ -1,4 +1,4 @@
-"""What each round of a training came to: lines of JSON in its run folder, and curves for TensorBoard where it is."""
+"""Per-iteration metrics of a training: JSON lines in its run folder, and TensorBoard curves if it is installed."""
 
 from __future__ import annotations
 
@@ -11,21 +11,25 @@ from typing import Any
 from concent_warp.files import write_text
 
 CURVE = "curve.jsonl"
-"""File of the rounds in a run folder."""
+"""File of per-iteration metrics in a run folder."""
 Point = dict[str, Any]
-"""Rounds, environment steps and seconds so far, and what the round was logged to have come to."""
+"""Iterations, environment steps and seconds so far, with the metrics of the iteration, by name."""
 
 
 def read_curve(folder: Path) -> list[Point]:
-    """Return the rounds of a run folder, in their order; none where none are written."""
+    """Return the metrics of a run folder in order of iterations; an empty list without a file."""
     path = folder / CURVE
     lines = path.read_text().splitlines() if path.is_file() else []
-    return [json.loads(line) for line in lines if line.endswith("}")]  # the last may have been cut short
+    return [
+        json.loads(line) for line in lines if line.endswith("}")
+    ]  # an interrupted write leaves the last line incomplete
 
 
 @contextmanager
 def curve(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
-    """Give what writes a round, after those of the first `steps` environment steps; later ones are forgotten."""
+    """Yield a function that appends the metrics of an iteration; earlier entries beyond `steps` environment steps are
+    removed.
+    """
     kept = [json.dumps(point) + "\n" for point in read_curve(folder) if point["steps"] <= steps]
     write_text(folder / CURVE, "".join(kept))
     with (folder / CURVE).open("a") as file, _tensorboard(folder, steps) as board:
@@ -40,7 +44,7 @@ def curve(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
 
 @contextmanager
 def _tensorboard(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
-    """Give what writes a round to TensorBoard, nothing where it is not installed."""
+    """Yield a function that writes metrics to TensorBoard, one without effect if it is not installed."""
     try:
         from torch.utils.tensorboard.writer import SummaryWriter
     except ImportError:

@@ -1,4 +1,4 @@
-"""Normalisation of observations by their running mean and deviation, within bounds."""
+"""Normalisation of observations by their running mean and standard deviation, clamped."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 
-LARGEST = 10.0
-"""Largest magnitude of a normalised observation: what is farther out, such as an object that flew away, would make the
-networks' outputs, and the losses, as large as it likes."""
+MAX_NORMALISED = 10.0
+"""Largest magnitude of a normalised observation [standard deviations]: an object that flew away would otherwise make
+the networks' outputs and the losses arbitrarily large."""
 
 
 class BoundedNormalization(EmpiricalNormalization):
-    """rsl-rl's normalisation, its results kept within bounds and its variances above rounding."""
+    """rsl-rl's running normalisation with clamped results and non-negative variances."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return observations normalised, shape (..., D), each within +-`LARGEST`."""
-        return super().forward(x).clamp(-LARGEST, LARGEST)
+        """Return observations normalised, shape (..., D), each clamped to +-`MAX_NORMALISED`."""
+        return super().forward(x).clamp(-MAX_NORMALISED, MAX_NORMALISED)
 
     @torch.jit.unused
     def update(self, x: torch.Tensor) -> None:
-        """Learn from observations (N, D)."""
+        """Update mean and variance from observations (N, D)."""
         super().update(x)
-        # Of what never changes, rounding may leave a variance below 0, whose root is not a number.
+        # Rounding can leave the variance of a constant observation below 0, whose root is not a number.
         self._std = torch.sqrt(self.get_buffer("_var").clamp_(min=0.0))
 
 
 def bound_observations(model: MLPModel) -> None:
-    """Have a network normalise its observations within bounds, if it normalises them."""
+    """Replace a network's observation normalisation by `BoundedNormalization`, if it has one."""
     if model.obs_normalization:
         where = next(model.parameters()).device
         model.obs_normalizer = BoundedNormalization(model.obs_dim).to(where)

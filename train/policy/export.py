@@ -52,7 +52,7 @@ def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str,
             "the format of the export is not known", where=out, expected=f"a name in {' or '.join(SUFFIXES)}"
         )
     task = run.task()
-    described = _describe(run.cfg, task) | {"rounds": weights["iteration"], "steps": weights["steps"]}
+    described = _describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
     module = _policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"])
     partial = out.with_name(f".{out.name}.partial")
     write = _write_onnx if out.suffix == ".onnx" else _write_torchscript
@@ -71,7 +71,7 @@ def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapp
     try:
         actor.load_state_dict(weights)
     except RuntimeError as error:
-        raise TrainError("the checkpoint is of another network", found=str(error)[:200]) from None
+        raise TrainError("the checkpoint's network has another architecture", found=str(error)[:200]) from None
     return actor.as_jit().eval()
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.train.cfg import ResetCfg
-from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, about_vertical, place
+from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, place, vertical_rotation
 from concent_warp.train.task.task import Task
 
 FARTHER = 3.0
@@ -36,7 +36,7 @@ class PlanarMotion:
 
     def of(self, point: np.ndarray) -> np.ndarray:
         """Return the shift of a point [m], shape (3,)."""
-        return self.pivot + about_vertical(self.turn) @ (point - self.pivot) + self.shift - point
+        return self.pivot + vertical_rotation(self.turn) @ (point - self.pivot) + self.shift - point
 
 
 class ChainedResetSampler(ResetSampler):
@@ -119,7 +119,7 @@ class ChainedResetSampler(ResetSampler):
             moved = PlanarMotion(held, shift, (1 - share) * first.turn + share * second.turn)
         own, own_turn = (np.zeros(3), 0.0) if draft.kept else self.displacement(lift=True)
         shift, turn = moved.of(pivot) + farther * own, moved.turn + own_turn
-        draft.position, draft.rotation = pivot + shift, about_vertical(turn) @ turn_matrix
+        draft.position, draft.rotation = pivot + shift, vertical_rotation(turn) @ turn_matrix
         if draft.case > 1 and address is not None:
             place(draft.qpos, address, pivot, (shift, turn))
 

@@ -21,7 +21,7 @@ POSITION, ANGLE = 3e-4, 3e-3
 """Errors that are accepted [m, rad]."""
 
 
-def reach_many(
+def solve_inverse_kinematics_batch(
     m: mujoco.MjModel,
     robot: Robot,
     qpos: np.ndarray,
@@ -85,10 +85,10 @@ def reach_many(
         solver.step(start, found, iterations=ITERATIONS)
         angles = found.numpy().astype(float) + reference
     order = [list(joints).index(j) for j in robot.joint]
-    return angles[:, order], _reached(m, robot, qpos, angles[:, order], position, rotation)
+    return angles[:, order], _within_tolerance(m, robot, qpos, angles[:, order], position, rotation)
 
 
-def _reached(
+def _within_tolerance(
     m: mujoco.MjModel, robot: Robot, qpos: np.ndarray, angles: np.ndarray, position: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
     """Return whether joint positions (P, J) bring the tool to its poses within the limits, shape (P,) bool."""

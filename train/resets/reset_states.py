@@ -12,8 +12,8 @@ from concent_warp.errors import TrainError
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import reach
-from concent_warp.train.resets.inverse_kinematics_batch import reach_many
-from concent_warp.train.task.movable import mocap_of
+from concent_warp.train.resets.inverse_kinematics_batch import solve_inverse_kinematics_batch
+from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
 
 ROUNDS = 20
@@ -93,7 +93,7 @@ class ResetSampler:
         self.is_sphere = np.zeros(self.full.ngeom, dtype=bool)
         self.is_sphere[sphere_geom] = True
         self.free = [self.free_joint(body) for body in task.objects]
-        self.mocap = [mocap_of(self.m, body) for body in task.objects]
+        self.mocap = [mocap_id(self.m, body) for body in task.objects]
         self.places = np.hstack([self.d.mocap_pos, self.d.mocap_quat])
         stage = task.events.stages[task.stage]
         self.keeps = task.keeps(task.stage)
@@ -166,7 +166,7 @@ class ResetSampler:
         robot = self.task.robot
         asked = [i for i, draft in enumerate(drafts) if draft.position is not None]
         if self.newton:
-            angles, fine = reach_many(
+            angles, fine = solve_inverse_kinematics_batch(
                 self.m,
                 robot,
                 np.array([drafts[i].qpos for i in asked]).reshape(-1, self.m.nq),
@@ -240,7 +240,7 @@ class ResetSampler:
         d.qpos[:] = draft.qpos
         mujoco.mj_kinematics(self.m, d)
         pivot = d.site_xpos[tool].copy()
-        draft.position, draft.rotation = pivot + shift, about_vertical(turn) @ d.site_xmat[tool].reshape(3, 3)
+        draft.position, draft.rotation = pivot + shift, vertical_rotation(turn) @ d.site_xmat[tool].reshape(3, 3)
         for address in self.free[: 1 + together]:
             assert address is not None
             place(draft.qpos, address, pivot, (shift, turn))
@@ -317,13 +317,13 @@ def place(qpos: np.ndarray, address: int, pivot: np.ndarray, move: tuple[np.ndar
     """Turn and shift a free body in place, about a pivot [m], shape (3,)."""
     shift, turn = move
     pivot = np.array(pivot)
-    qpos[address : address + 3] = pivot + about_vertical(turn) @ (qpos[address : address + 3] - pivot) + shift
+    qpos[address : address + 3] = pivot + vertical_rotation(turn) @ (qpos[address : address + 3] - pivot) + shift
     turned = np.zeros(4)
     mujoco.mju_mulQuat(turned, np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), qpos[address + 3 : address + 7])
     qpos[address + 3 : address + 7] = turned
 
 
-def about_vertical(angle: float) -> np.ndarray:
+def vertical_rotation(angle: float) -> np.ndarray:
     """Return the rotation by an angle [rad] about the vertical, shape (3, 3)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])

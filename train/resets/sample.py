@@ -23,10 +23,10 @@ from concent_warp.train.resets.chained import ChainedResetSampler
 from concent_warp.train.resets.reset_states import ResetSampler, ResetStates
 from concent_warp.train.task.task import Task
 
-__all__ = ["ResetStates", "draw_states"]
+__all__ = ["ResetStates", "sample_reset_states"]
 
 
-def draw_states(
+def sample_reset_states(
     task: Task,
     cfg: ResetCfg,
     seed: int,

@@ -18,7 +18,7 @@ from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
 from concent_warp.train.cfg import ALL, EnvironmentCfg
-from concent_warp.train.task.movable import movable
+from concent_warp.train.task.movable_fixtures import movable
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.slots import slot_table
 from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stages

@@ -38,11 +38,11 @@ def run(arguments: Arguments) -> dict[str, Any]:
     quiet_warp()
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
     if arguments.as_pretrained:
-        from concent_warp.train.policy.ship import ship
+        from concent_warp.train.policy.write_pretrained import write_pretrained
 
         folder = Path("pretrained") if arguments.out is None else arguments.out
         make_folder(folder.parent)
-        origin = ship(policy, folder, overwrite=arguments.overwrite)
+        origin = write_pretrained(policy, folder, overwrite=arguments.overwrite)
         size = sum(file.stat().st_size for file in folder.iterdir())
         say(f"policy of {origin['steps']:,} steps with all it takes to run it, {size / 1e3:,.0f} kB")
         say_written(folder)

@@ -74,11 +74,13 @@ def run(arguments: Arguments) -> Policy:
     """Train and write the run folder, one of several processes where torchrun started them."""
     quiet_warp()
     from concent_warp.events.sequence import ContactEventSequence
-    from concent_warp.train.learning.distributed import Ranks
+    from concent_warp.train.learning.distributed import DistributedProcess
     from concent_warp.train.learning.ppo import CHECKPOINT
     from concent_warp.train.train import train
 
-    Ranks.here().device(arguments.device)  # more processes than GPUs: refused before anything is read
+    DistributedProcess.from_environment().device(
+        arguments.device
+    )  # more processes than GPUs: refused before anything is read
     begin_with = None if arguments.begin_with is None else given_policy(arguments.begin_with, None)
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
     recording = load_recording(arguments.recording)

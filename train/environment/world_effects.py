@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
-from concent_warp.train.environment.commands import CommandDynamics
+from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.task.task import Task
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ Laws = list[tuple["ForceModel", np.ndarray]]
 
 
 @dataclass(frozen=True)
-class EffectsOfWorlds:
+class WorldEffects:
     """What effects are in each of N worlds."""
 
     fields: dict[str, np.ndarray]
@@ -43,9 +43,9 @@ class EffectsOfWorlds:
     """Names of effects that have intervals and cannot be varied."""
 
 
-def effects_of_worlds(
+def sample_world_effects(
     task: Task, worlds: int, seed: int, *, draw: bool, variable: Callable[[str], bool] | None = None
-) -> EffectsOfWorlds:
+) -> WorldEffects:
     """Return the effects of a task's model in N worlds.
 
     Args:
@@ -76,7 +76,7 @@ def effects_of_worlds(
     laws = [(law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None]
     late = tuple(_following(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands)
     fields = _written_fields(bare, [added.effect for added in effects], varied, values)
-    return EffectsOfWorlds(fields, laws, late, tuple(values), tuple(kept))
+    return WorldEffects(fields, laws, late, tuple(values), tuple(kept))
 
 
 def _following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> CommandDynamics:

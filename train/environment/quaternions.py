@@ -30,7 +30,7 @@ def angle(q: torch.Tensor) -> torch.Tensor:
     return 2 * torch.atan2(torch.linalg.norm(q[..., 1:], dim=-1), q[..., 0].abs())
 
 
-def two_columns(q: torch.Tensor) -> torch.Tensor:
+def rotation_columns(q: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of the rotation matrices, one after the other, shape (..., 6).
 
     The continuous representation of Zhou et al., CVPR 2019, that the paper's observation uses.

@@ -31,7 +31,7 @@ def movable(scene: Scene) -> Scene:
     return Scene.from_spec(spec, source=scene.source)
 
 
-def mocap_of(m: mujoco.MjModel, body: int) -> int | None:
+def mocap_id(m: mujoco.MjModel, body: int) -> int | None:
     """Return which mocap body of a model a body is, None of others."""
     found = int(m.body_mocapid[body])
     return None if found < 0 else found

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from several_processes import make_run, updated
+from data_parallel_training import make_run, updated
 
 from concent_warp.cli import main
 from concent_warp.errors import TrainError
-from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.run import train_run
 
-SCRIPT = Path(__file__).with_name("several_processes.py")
+SCRIPT = Path(__file__).with_name("data_parallel_training.py")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_each_process_has_worlds_of_its_own(trained):
 
 
 def test_update_is_that_of_one_process_with_the_worlds_of_both(trained):
-    alone, shared = updated(Ranks()), loaded(trained / "updated0.pt")
+    alone, shared = updated(DistributedProcess()), loaded(trained / "updated0.pt")
     assert same(shared, loaded(trained / "updated1.pt"))
     for name, value in alone.items():
         torch.testing.assert_close(shared[name], value, rtol=1e-5, atol=1e-6)
@@ -87,12 +87,12 @@ def test_checkpoint_wants_as_many_processes_as_it_was_made_by(trained):
 
 def test_each_process_takes_a_gpu_and_seeds_of_its_own(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    processes = [Ranks(rank, 2, rank, 2) for rank in range(2)]
+    processes = [DistributedProcess(rank, 2, rank, 2) for rank in range(2)]
     assert [r.device() for r in processes] == ["cuda:0", "cuda:1"]
     assert [r.device("cpu") for r in processes] == ["cpu", "cpu"]
-    assert processes[0].seed(5) == Ranks().seed(5) == 5
-    assert len({Ranks(rank, 4).seed(seed) for rank in range(4) for seed in range(4)}) == 16
-    with pytest.raises(TrainError, match="a GPU of its own"):
+    assert processes[0].seed(5) == DistributedProcess().seed(5) == 5
+    assert len({DistributedProcess(rank, 4).seed(seed) for rank in range(4) for seed in range(4)}) == 16
+    with pytest.raises(TrainError, match="its own GPU"):
         processes[0].device("cuda:1")
 
 

@@ -1,4 +1,4 @@
-"""What each of several processes of a training does: run by torchrun, with a folder to write to."""
+"""Script of one rank of a data-parallel training: torchrun runs it with the folder to write to."""
 
 import sys
 from dataclasses import replace
@@ -11,9 +11,9 @@ from concent_warp.errors import TrainError
 from concent_warp.recording.recording import Recording
 from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.learning.distributed import Ranks
+from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import Trainer
-from concent_warp.train.resets.sample import draw_states
+from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.run import TrainingRun, train_run
 
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
@@ -31,22 +31,22 @@ def rounds(run: TrainingRun, count: int) -> TrainingRun:
     return replace(run, cfg=replace(run.cfg, ppo=replace(PPO, iterations=count)))
 
 
-def updated(ranks: Ranks) -> dict[str, torch.Tensor]:
-    """Return the weights after an update from given steps of 4 worlds, shared among the processes.
+def updated(process: DistributedProcess) -> dict[str, torch.Tensor]:
+    """Return the weights after an update from given steps of 4 worlds, distributed over the ranks.
 
-    All steps are one batch and nothing is drawn, so that it does not matter which process has which worlds.
+    All steps are one batch and none is sampled, so that the result does not depend on which rank has which worlds.
     """
     count, steps = 4, 6
-    environment = replace(SETTINGS, worlds=count // ranks.count, reset=replace(SETTINGS.reset, states=8))
+    environment = replace(SETTINGS, worlds=count // process.world_size, reset=replace(SETTINGS.reset, states=8))
     ppo = PpoCfg(steps=steps, hidden=(16,), epochs=3, batches=1, entropy=0.0)
     task = make_task(environment)
-    worlds = make_environment(task, environment, draw_states(task, environment.reset, 0), device="cpu")
-    algorithm = Trainer(worlds, TrainCfg(environment=environment, ppo=ppo), None, ranks).algorithm
+    worlds = make_environment(task, environment, sample_reset_states(task, environment.reset, 0), device="cpu")
+    algorithm = Trainer(worlds, TrainCfg(environment=environment, ppo=ppo), None, process).algorithm
     algorithm.train_mode()
     observation = worlds.get_observations()
-    mine = slice(ranks.rank * worlds.num_envs, (ranks.rank + 1) * worlds.num_envs)
+    mine = slice(process.rank * worlds.num_envs, (process.rank + 1) * worlds.num_envs)
     given = torch.Generator().manual_seed(0)
-    drawn = {
+    sampled = {
         name: torch.randn(steps, count, width, generator=given)[:, mine]
         for name, width in (
             ("observation", observation["policy"].shape[1]), ("action", worlds.num_actions), ("returns", 1), ("gain", 1)
@@ -54,35 +54,35 @@ def updated(ranks: Ranks) -> dict[str, torch.Tensor]:
     }  # fmt: skip
     none = torch.zeros(worlds.num_envs)
     with torch.inference_mode():
-        for seen, action in zip(drawn["observation"], drawn["action"].tanh(), strict=True):
+        for seen, action in zip(sampled["observation"], sampled["action"].tanh(), strict=True):
             observation["policy"] = seen.clone()
             algorithm.act(observation)
             algorithm.transition.actions = action.clone()
             algorithm.transition.actions_log_prob = algorithm.actor.get_output_log_prob(action)
             algorithm.process_env_step(observation, none, none, {})
-    algorithm.storage.returns = drawn["returns"].clone()
-    algorithm.storage.advantages = drawn["gain"].clone()
+    algorithm.storage.returns = sampled["returns"].clone()
+    algorithm.storage.advantages = sampled["gain"].clone()
     algorithm.update()
     networks = {"actor": algorithm.actor, "critic": algorithm.critic}
     return {f"{which}.{k}": v.clone() for which, network in networks.items() for k, v in network.state_dict().items()}
 
 
 def main(out: Path) -> None:
-    ranks, run = Ranks.here(), make_run()
-    with ranks.joined("cpu"):
-        trainer, last = train_run(run, out / "whole", device="cpu", ranks=ranks)
+    process, run = DistributedProcess.from_environment(), make_run()
+    with process.group("cpu"):
+        trainer, last = train_run(run, out / "whole", device="cpu", process=process)
         assert last is not None
         weights = trainer.algorithm.save()["actor_state_dict"]
-        torch.save({"weights": weights, "steps": last.steps, "log": last.log}, out / f"rank{ranks.rank}.pt")
-        torch.save(updated(ranks), out / f"updated{ranks.rank}.pt")
-        train_run(rounds(run, 2), out / "parts", device="cpu", ranks=ranks)
-        train_run(run, out / "parts", device="cpu", ranks=ranks, resume=True)
+        torch.save({"weights": weights, "steps": last.steps, "log": last.log}, out / f"rank{process.rank}.pt")
+        torch.save(updated(process), out / f"updated{process.rank}.pt")
+        train_run(rounds(run, 2), out / "parts", device="cpu", process=process)
+        train_run(run, out / "parts", device="cpu", process=process, resume=True)
         try:
-            with ranks.agreeing():
-                if not ranks.first:
+            with process.raise_together():
+                if not process.is_rank_zero:
                     raise TrainError("not in this process")
         except TrainError as error:
-            (out / f"said{ranks.rank}").write_text(str(error))
+            (out / f"said{process.rank}").write_text(str(error))
 
 
 if __name__ == "__main__":

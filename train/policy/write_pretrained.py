@@ -24,7 +24,7 @@ COMMAND = "settings.toml"
 """File of a run folder in which `concent train` writes its command."""
 
 
-def ship(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """Write a run's policy with what it needs to a folder, in one piece or not at all; return what `origin.toml` says.
 
     Args:
@@ -48,7 +48,7 @@ def ship(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any
     replace(run, recording=replace(run.recording, demonstrations=(one,))).save(partial)
     kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
     torch.save(kept, partial / CHECKPOINT)
-    length = {"rounds": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
+    length = {"iterations": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
     origin = length | _origin_of(policy.folder / COMMAND)
     write_text(partial / ORIGIN, tomli_w.dumps(origin))
     if out.exists():
