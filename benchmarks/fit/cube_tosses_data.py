@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.estimation.object_tracks import BodyTarget, Segment, measured_pose, observed_poses, whole
-from concent_warp.estimation.windows import Measured, windows
+from concent_warp.estimation.state_estimator import StateEstimator
+from concent_warp.estimation.windows import windows
 from concent_warp.model import Model
 from concent_warp.recording.formats.contactnets import EDGE
 from concent_warp.recording.recording import Recording
@@ -164,9 +165,8 @@ def free_fall(recording: Recording, names: Sequence[str]) -> tuple[float, float]
         demonstration = recording[name]
         pose = measured_pose(scene.model, demonstration, BODY)
         assert pose is not None
-        assert demonstration.qpos is not None
         time, position, _ = pose
-        contact = Measured.of(scene, demonstration, demonstration.qpos).supported((BODY,), time)
+        contact = StateEstimator.of(Model(scene), demonstration).in_contact((BODY,), time)
         frames = int(np.argmax(contact)) - 3 if contact.any() else len(time)
         if frames >= FLIGHT:
             found.append(-2 * np.polyfit(time[:frames], position[:frames, 2], 2)[0])

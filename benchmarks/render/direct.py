@@ -152,7 +152,7 @@ def seconds_of(paint: Draw, held: ImagePairs, reference: torch.Tensor, steps: in
 
 def objects_seen(held: ImagePairs, recording: Recording, device: str) -> torch.Tensor:
     """Return where the simulation sees objects, and a few pixels around, shape (N, H, W) bool."""
-    from concent_warp.estimation.measured_motion import measured_motion
+    from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
     from concent_warp.model import Model
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 
@@ -164,8 +164,8 @@ def objects_seen(held: ImagePairs, recording: Recording, device: str) -> torch.T
     geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
     engine, found = MujocoEngine(Model(scene), threads=1), []
     for demonstration in recording.demonstrations:
-        motion = measured_motion(Model(scene), demonstration, engine)
-        for state in motion.states(demonstration.image[held.camera.name].time.clip(*motion.span))[0]:
+        motion = StateEstimator.of(Model(scene), demonstration, StateEstimatorCfg("smoothing_spline"), engine=engine)
+        for state in motion.states(demonstration.image[held.camera.name].time.clip(*motion.span)).qpos:
             stage.place(state[None])
             seen = eye.render().segmentation[0, 0]
             there = torch.isin(seen, torch.tensor(geoms, device=seen.device, dtype=seen.dtype)).float()

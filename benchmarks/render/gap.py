@@ -227,7 +227,7 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     """Return what all ways of rendering share."""
     import warp as wp
 
-    from concent_warp.estimation.measured_motion import measured_motion
+    from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
     from concent_warp.model import Model
     from concent_warp.render.cameras import Camera
     from concent_warp.render.networks.pairs import drawn_scene
@@ -240,9 +240,9 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     model, states = Model(scene), []
     engine = MujocoEngine(model, threads=1)
     for demonstration in held.demonstrations:
-        motion = measured_motion(model, demonstration, engine)
+        motion = StateEstimator.of(model, demonstration, StateEstimatorCfg("smoothing_spline"), engine=engine)
         time_ = np.clip(demonstration.image[CAMERAS[0]].time, *motion.span)
-        states.append(motion.states(time_)[0])
+        states.append(motion.states(time_).qpos)
     cameras = [Camera.of(name, held.demonstrations[0].image[name]) for name in CAMERAS]
     return {
         "scene": scene,

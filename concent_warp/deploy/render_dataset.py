@@ -187,7 +187,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
 
 def _film_recording(recording: Recording, to: Destination, progress: Callable[[float], None]) -> DatasetFilming:
     """Render the measured motion of the demonstrations of a recording, each an episode."""
-    from concent_warp.estimation.measured_motion import measured_motion
+    from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
     from concent_warp.model import Model
     from concent_warp.scene.scene import Scene
     from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -204,9 +204,9 @@ def _film_recording(recording: Recording, to: Destination, progress: Callable[[f
         for k, demonstration in enumerate(recording.demonstrations):
             if writer.has(k):
                 continue
-            motion = measured_motion(model, demonstration, engine)
+            motion = StateEstimator.of(model, demonstration, StateEstimatorCfg("smoothing_spline"), engine=engine)
             time = np.arange(motion.span[0], motion.span[1], 1 / cfg.rate)
-            qpos = motion.states(time)[0]
+            qpos = motion.states(time).qpos
             ctrl = commands(compiled, demonstration, round(time[-1] / engine.timestep) + 1)
             filming.begin([k])
             for t, now in enumerate(time):

@@ -1,143 +1,267 @@
-"""States and rates from measured signals: a polynomial through the few samples around a time.
+"""Values and derivatives of a measured quantity: a polynomial fitted to the few readings around each time.
 
-A window of a recording is simulated from the state in which the recording shows the scene at its start. Positions come
-from the measurements; velocities from the change of the positions, or from velocity sensors where these say it more
-precisely. How precisely is told by the standard error of the local fits.
+Least squares over a short interval (Savitzky and Golay, Smoothing and differentiation of data by simplified least
+squares procedures, 1964), at the readings' own times. A velocity sensor replaces the derivative of the positions where
+its standard error is smaller.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
-from concent_warp.recording.recording import Channel, Demonstration
-from concent_warp.scene.scene import Scene
-
-SPAN = 0.02
-"""Samples within this time before and after count in a local fit [s]."""
-FEWEST = 2
-"""Samples before and after that count in a local fit even where they lie farther apart than that."""
-ONE_SIDED = 0.5
-"""Samples on one side of a time alone are taken where the standard error of the rate falls below this share."""
-PROBES = 40
-"""Times at which the precision of a signal is estimated."""
+from concent_warp.estimation.rotations import same_sign
+from concent_warp.estimation.sensors import Kind
+from concent_warp.estimation.signals import Estimate, OrientationEstimate, sampled
+from concent_warp.recording.recording import Channel
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A signal and its derivatives at one time."""
+class LocalPolynomialCfg:
+    """Settings of local polynomials."""
 
-    value: np.ndarray
-    """Value, shape (n,)."""
-    rate: np.ndarray
-    """First derivative [1/s], shape (n,)."""
-    second: np.ndarray
-    """Second derivative [1/s^2], shape (n,); zero for a straight line."""
-    value_error: float
-    """Standard error of a component of the value, from the scatter about the polynomial."""
-    rate_error: float
-    """Standard error of a component of the rate [1/s]."""
-    second_error: float
-    """Standard error of a component of the second derivative [1/s^2]."""
+    half_width: float = 0.02
+    """Readings within this time before and after a time count in its fit [s]."""
+    min_neighbours: int = 2
+    """Readings before and after a time that count even if they are farther away than `half_width`; a quantity needs
+    twice as many readings altogether."""
+    one_sided_ratio: float = 0.5
+    """Readings on one side of a time alone are used where that reduces the standard error of the rate to less than this
+    share: a jump of the velocity, as in an impact, lies on the other side."""
+    precision_probes: int = 40
+    """Number of times at which the standard error of a velocity sensor is compared with that of the positions."""
+
+    def signal(self, channel: Channel, velocity: Channel | None = None, kind: Kind = "other") -> LocalPolynomial | None:
+        """Return the signal of a channel; None if it has too few valid readings.
+
+        Args:
+            channel: Readings (R, n).
+            velocity: Readings of the derivative (S, n), if a sensor measured it.
+            kind: Not needed: the errors are those of the fits.
+        """
+        del kind
+        position = self._valid(channel, degree=2)
+        return None if position is None else self._with_velocity(position, velocity)
+
+    def readings(self, channel: Channel, kind: Kind = "other") -> LocalPolynomial | None:
+        """Return the readings of a rate, smoothed by straight lines; None if too few are valid.
+
+        Args:
+            channel: Readings (R, n).
+            kind: Not needed: the errors are those of the fits.
+        """
+        del kind
+        return self._valid(channel, degree=1)
+
+    def orientation(self, channel: Channel, velocity: Channel | None = None) -> LocalPolynomialOrientation | None:
+        """Return the signal of a channel of quaternions wxyz; None if it has too few valid readings.
+
+        Args:
+            channel: Orientation of a body, readings (R, 4).
+            velocity: Angular velocity in the body frame [rad/s], readings (S, 3), if a sensor measured it.
+        """
+        valid = np.isfinite(channel.value).all(axis=1)
+        if valid.sum() < 2 * self.min_neighbours:
+            return None
+        rotation = Rotation.from_quat(channel.value[valid], scalar_first=True)
+        signal = LocalPolynomialOrientation(self, channel.time[valid], rotation)
+        rate = None if velocity is None else self.readings(velocity)
+        if rate is None or not self._is_more_precise(rate, signal):
+            return signal
+        return LocalPolynomialOrientation(self, signal.time, rotation, rate)
+
+    def _with_velocity(self, position: LocalPolynomial, velocity: Channel | None) -> LocalPolynomial:
+        """Return the signal with its velocity sensor if that is more precise than the derivative of the positions."""
+        rate = None if velocity is None else self.readings(velocity)
+        if rate is None or not self._is_more_precise(rate, position):
+            return position
+        return LocalPolynomial(self, position.time, position.value, position.degree, rate)
+
+    def _valid(self, channel: Channel, degree: int) -> LocalPolynomial | None:
+        """Return the valid readings of a channel as a signal, None if they are too few."""
+        valid = np.isfinite(channel.value).all(axis=1)
+        if valid.sum() < 2 * self.min_neighbours:
+            return None
+        return LocalPolynomial(self, channel.time[valid], channel.value[valid], degree)
+
+    def _is_more_precise(self, rate: LocalPolynomial, signal: LocalPolynomial | LocalPolynomialOrientation) -> bool:
+        """Return whether a velocity sensor has a smaller median standard error than the derivative of a signal."""
+        return self._median_error(rate, 0) < self._median_error(signal, 1)
+
+    def _median_error(self, signal: LocalPolynomial | LocalPolynomialOrientation, order: int) -> float:
+        """Return the median standard error of a signal's value (`order` 0) or rate (1)."""
+        rows = np.unique(np.linspace(0, len(signal.time) - 1, self.precision_probes).astype(int))
+        return float(np.median([fit.errors[order] for fit in signal.fits(signal.time[rows])]))
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """A polynomial about one time."""
+
+    derivatives: np.ndarray
+    """Value, rate and second derivative, shape (3, n); zero beyond the degree of the polynomial."""
+    errors: tuple[float, float, float]
+    """Standard errors of a component of these, from the scatter about the polynomial."""
+    covariance: np.ndarray
+    """Covariance of these for a component, shape (3, 3)."""
     scatter: float
-    """Root mean square distance of a sample's component from the polynomial."""
+    """Root mean square distance of a component of the readings from the polynomial."""
 
 
-class Signal(Protocol):
-    """A quantity that was sampled and can be estimated, with its rate, at any time."""
+@dataclass(frozen=True)
+class LocalPolynomial:
+    """A quantity whose readings can be averaged, such as a position."""
+
+    cfg: LocalPolynomialCfg
+    time: np.ndarray
+    """Times of the readings [s], shape (R,)."""
+    value: np.ndarray
+    """Readings, finite, shape (R, n)."""
+    degree: int = 2
+    """Degree of the polynomials."""
+    velocity: LocalPolynomial | None = None
+    """Readings of the rate that are more precise than the derivative of `value`."""
 
     @property
-    def time(self) -> np.ndarray:
-        """Clock readings [s], shape (T,)."""
-        ...
+    def std(self) -> float:
+        """Noise of a component: the median scatter of the readings about their polynomials."""
+        return float(np.median(self.scatter(self.time)))
 
-    def at(self, time: float) -> Estimate:
-        """Return the estimate at a time [s]."""
-        ...
+    def fits(self, time: np.ndarray) -> list[LocalFit]:
+        """Return the polynomials about each of `time` (T,) [s]."""
+        return [self._fit(float(now)) for now in time]
+
+    def estimate(self, time: np.ndarray) -> Estimate:
+        """Return the estimate at `time` (T,) [s]."""
+        value, rate, second = np.array([fit.derivatives for fit in self.fits(time)]).transpose(1, 0, 2)
+        return Estimate(value, rate if self.velocity is None else self.velocity.estimate(time).value, second)
+
+    def covariance(self, time: np.ndarray) -> np.ndarray:
+        """Return the covariance of value, rate and second derivative of a component at `time` (T,), (T, 3, 3)."""
+        return _with_rate_sensor(self.fits(time), self.velocity, time)
+
+    def scatter(self, time: np.ndarray) -> np.ndarray:
+        """Return the root mean square distance of the readings around each time from their polynomial, shape (T,)."""
+        return np.array([fit.scatter for fit in self.fits(time)])
+
+    def acceleration(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the second derivative from readings on both sides of each time (T, n), its standard error (T,)."""
+        fits = [self._local_fit(_neighbourhoods(self.cfg, self.time, float(t), self.degree)[0], float(t)) for t in time]
+        return np.array([fit.derivatives[2] for fit in fits]), np.array([fit.errors[2] for fit in fits])
+
+    def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return value and rate at `time` (T,), then `count` samples under their errors, (1 + count, T, n)."""
+        found = self.estimate(time)
+        if rng is None or not count:
+            return found.value[None], found.rate[None]
+        return sampled(found.value, found.rate, self.covariance(time)[:, :2, :2], count, rng)
+
+    def _fit(self, now: float) -> LocalFit:
+        """Return the polynomial about a time."""
+        return _best_fit(
+            self.cfg,
+            [self._local_fit(rows, now) for rows in _neighbourhoods(self.cfg, self.time, now, self.degree)],
+        )
+
+    def _local_fit(self, rows: slice, now: float) -> LocalFit:
+        """Return the polynomial through some readings."""
+        return _local_fit(self.time[rows] - now, self.value[rows.start : rows.stop], self.degree)
 
 
 @dataclass(frozen=True)
-class Samples:
-    """A signal whose samples can be added, such as a position."""
+class LocalPolynomialOrientation:
+    """The orientation of a body; polynomials of the rotation vector from the reading nearest to each time."""
 
+    cfg: LocalPolynomialCfg
     time: np.ndarray
-    value: np.ndarray
-    """Shape (T, n), finite."""
-    degree: int = 2
-    """Degree of the local polynomial."""
+    """Times of the readings [s], shape (R,)."""
+    rotation: Rotation
+    """R rotations from body to world."""
+    velocity: LocalPolynomial | None = None
+    """Readings of the angular velocity [rad/s], body frame, that are more precise than the derivative."""
 
-    def at(self, time: float) -> Estimate:
-        """Return the estimate at a time [s]."""
-        fits = [
-            _local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
-            for rows in _neighbourhoods(self.time, time, self.degree)
+    @property
+    def value(self) -> np.ndarray:
+        """Readings as quaternions wxyz with aligned signs, shape (R, 4)."""
+        return same_sign(self.rotation.as_quat(scalar_first=True))
+
+    @property
+    def std(self) -> float:
+        """Noise of a component of the rotation vector [rad]: the median scatter of the readings."""
+        return float(np.median(self.scatter(self.time)))
+
+    def fits(self, time: np.ndarray) -> list[LocalFit]:
+        """Return the polynomials of the rotation vector [rad] about each of `time` (T,) [s]."""
+        return [self._fit(float(now)) for now in time]
+
+    def estimate(self, time: np.ndarray) -> OrientationEstimate:
+        """Return the estimate at `time` (T,) [s]; rates of the rotation vector serve as angular velocity [rad/s]."""
+        fits = self.fits(time)
+        turns = [
+            self._nearest(float(now)) * Rotation.from_rotvec(fit.derivatives[0])
+            for now, fit in zip(time, fits, strict=True)
         ]
-        return _smoothest(fits)
+        rate = np.array([fit.derivatives[1] for fit in fits])
+        return OrientationEstimate(
+            np.array([turn.as_quat(scalar_first=True) for turn in turns]),
+            rate if self.velocity is None else self.velocity.estimate(time).value,
+            np.array([fit.derivatives[2] for fit in fits]),
+        )
 
-    def through(self, time: float) -> Estimate:
-        """Return the estimate from samples on both sides of a time, even where an impact lies among them."""
-        rows = _neighbourhoods(self.time, time, self.degree)[0]
-        return _local_fit(self.time[rows] - time, self.value[rows.start : rows.stop], self.degree)
+    def covariance(self, time: np.ndarray) -> np.ndarray:
+        """Return the covariance of a component of the rotation vector and its derivatives at `time` (T,), (T, 3, 3)."""
+        return _with_rate_sensor(self.fits(time), self.velocity, time)
 
+    def scatter(self, time: np.ndarray) -> np.ndarray:
+        """Return the root mean square distance of the readings around each time from their polynomial [rad], (T,)."""
+        return np.array([fit.scatter for fit in self.fits(time)])
 
-@dataclass(frozen=True)
-class Turns:
-    """Orientations of a body; the estimate is about the rotation vector from the nearest sample, in the body frame."""
+    def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return quaternion (1 + count, T, 4) and angular velocity (1 + count, T, 3) at `time` (T,), then samples."""
+        found = self.estimate(time)
+        if rng is None or not count:
+            return found.quaternion[None], found.velocity[None]
+        zero = np.zeros_like(found.velocity)
+        turn, rate = sampled(zero, found.velocity, self.covariance(time)[:, :2, :2], count, rng)
+        middle = Rotation.from_quat(found.quaternion, scalar_first=True)
+        return np.stack([(middle * Rotation.from_rotvec(t)).as_quat(scalar_first=True) for t in turn]), rate
 
-    time: np.ndarray
-    value: Rotation
-    """T rotations from body to world."""
+    def _nearest(self, now: float) -> Rotation:
+        """Return the reading nearest to a time."""
+        return self.rotation[int(np.abs(self.time - now).argmin())]
 
-    def at(self, time: float) -> Estimate:
-        """Return the estimate at a time [s]; the rate is the angular velocity in the body frame [rad/s]."""
-        middle = self.nearest(time).inv()
-        fits = [
-            _local_fit(self.time[rows] - time, (middle * self.value[rows.start : rows.stop]).as_rotvec(), 2)
-            for rows in _neighbourhoods(self.time, time, 2)
-        ]
-        return _smoothest(fits)
-
-    def nearest(self, time: float) -> Rotation:
-        """Return the sample nearest to a time."""
-        return self.value[int(np.abs(self.time - time).argmin())]
-
-    def orientation(self, time: float) -> Rotation:
-        """Return the estimated orientation at a time."""
-        return self.nearest(time) * Rotation.from_rotvec(self.at(time).value)
-
-
-@dataclass(frozen=True)
-class BodyMotion:
-    """How a free body was seen to move."""
-
-    position: Samples
-    """Origin of the body frame [m], world frame."""
-    orientation: Turns
-    velocity: Samples | None
-    """Velocity of the origin [m/s], world frame, where a sensor measured it more precisely than the positions do."""
-    angular: Samples | None
-    """Angular velocity [rad/s], body frame, likewise."""
-
-    def state(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position and quaternion wxyz (7,), linear [world] and angular velocity [body frame] (6,)."""
-        place = self.position.at(time)
-        turning = self.orientation.at(time)
-        linear = place.rate if self.velocity is None else self.velocity.at(time).value
-        angular = turning.rate if self.angular is None else self.angular.at(time).value
-        quaternion = self.orientation.orientation(time).as_quat(scalar_first=True)
-        return np.concatenate([place.value, quaternion]), np.concatenate([linear, angular])
+    def _fit(self, now: float) -> LocalFit:
+        """Return the polynomial about a time."""
+        middle = self._nearest(now).inv()
+        return _best_fit(
+            self.cfg,
+            [
+                _local_fit(self.time[rows] - now, (middle * self.rotation[rows.start : rows.stop]).as_rotvec(), 2)
+                for rows in _neighbourhoods(self.cfg, self.time, now, 2)
+            ],
+        )
 
 
-def _neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
-    """Return the samples about a time, and as many of those after it and before it alone, where there are enough."""
+def _with_rate_sensor(fits: Sequence[LocalFit], velocity: LocalPolynomial | None, time: np.ndarray) -> np.ndarray:
+    """Return the covariances of local fits; the rate's is that of a sensor if there is one, shape (T, 3, 3)."""
+    covariance = np.array([fit.covariance for fit in fits])
+    if velocity is not None:
+        covariance[:, 1], covariance[:, :, 1] = 0, 0
+        covariance[:, 1, 1] = [fit.errors[0] ** 2 for fit in velocity.fits(time)]
+    return covariance
+
+
+def _neighbourhoods(cfg: LocalPolynomialCfg, time: np.ndarray, now: float, degree: int) -> list[slice]:
+    """Return the readings around a time, then as many of those after it and before it alone, where there are enough."""
     nearest = int(np.abs(time - now).argmin())
-    low = min(int(np.searchsorted(time, now - SPAN)), nearest - FEWEST)
-    high = max(int(np.searchsorted(time, now + SPAN, side="right")), nearest + FEWEST + 1)
+    low = min(int(np.searchsorted(time, now - cfg.half_width)), nearest - cfg.min_neighbours)
+    high = max(
+        int(np.searchsorted(time, now + cfg.half_width, side="right")),
+        nearest + cfg.min_neighbours + 1,
+    )
     count = max(high - low, degree + 2)
     centred = slice(max(low, 0), min(high, len(time)))
     sides = [slice(nearest, nearest + count), slice(nearest + 1 - count, nearest + 1)]
@@ -145,21 +269,13 @@ def _neighbourhoods(time: np.ndarray, now: float, degree: int) -> list[slice]:
     return [centred, *sides] if centred.stop - centred.start >= min(degree + 2, len(time)) else sides or [centred]
 
 
-def _smoothest(fits: list[Estimate]) -> Estimate:
-    """Return the first fit, or one of the others whose rate has less than half its standard error.
-
-    The samples on both sides of a time say the most, unless an impact lies among them.
-    """
-    best = min(fits, key=_rate_error)
-    return best if best.rate_error < ONE_SIDED * fits[0].rate_error else fits[0]
+def _best_fit(cfg: LocalPolynomialCfg, fits: Sequence[LocalFit]) -> LocalFit:
+    """Return the first fit, or another one where the standard error of its rate is far smaller."""
+    best = min(fits, key=lambda fit: fit.errors[1])
+    return best if best.errors[1] < cfg.one_sided_ratio * fits[0].errors[1] else fits[0]
 
 
-def _rate_error(estimate: Estimate) -> float:
-    """Return the standard error of the rate."""
-    return estimate.rate_error
-
-
-def _local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
+def _local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> LocalFit:
     """Fit a polynomial by least squares to values (k, n) at times `offset` (k,) from the time of interest [s]."""
     degree = min(degree, len(offset) - 1)
     scale = max(float(np.abs(offset).max()), 1e-9)
@@ -171,86 +287,10 @@ def _local_fit(offset: np.ndarray, value: np.ndarray, degree: int) -> Estimate:
     deviation = float(np.sqrt(squares.mean() / free))
     errors = [0.0, 0.0, 0.0]
     derivatives = np.zeros((3, value.shape[1]))
+    rows = np.zeros((3, len(offset)))
     for order, factor in enumerate((1.0, 1 / scale, 2 / scale**2)[: degree + 1]):
         derivatives[order] = factor * coefficient[order]
         errors[order] = factor * deviation * float(np.linalg.norm(inverse[order]))
+        rows[order] = factor * deviation * inverse[order]
     scatter = float(np.sqrt(squares.mean() / len(offset)))
-    return Estimate(
-        value=derivatives[0],
-        rate=derivatives[1],
-        second=derivatives[2],
-        value_error=errors[0],
-        rate_error=errors[1],
-        second_error=errors[2],
-        scatter=scatter,
-    )
-
-
-def _precision(signal: Signal, order: int) -> float:
-    """Return the median standard error of a signal's value (`order` 0) or rate (1)."""
-    times = signal.time[np.unique(np.linspace(0, len(signal.time) - 1, PROBES).astype(int))]
-    estimates = [signal.at(float(t)) for t in times]
-    return float(np.median([e.rate_error if order else e.value_error for e in estimates]))
-
-
-def body_motion(scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray) -> BodyMotion | None:
-    """Return how a body was seen to move, by its pose sensors or its tracked points; None where it was not.
-
-    Args:
-        scene: The scene.
-        demonstration: What was measured.
-        body: Name of a body with a free joint.
-        qpos: State at the demonstration's start, shape (nq,): says where on the body the tracked points are.
-    """
-    pose = measured_pose(scene.model, demonstration, body)
-    if pose is not None and body not in demonstration.points:
-        time, position, turn = pose
-        known = np.flatnonzero(np.isfinite(position).all(axis=1))
-        time, position, turn = time[known], position[known], Rotation.from_quat(turn.as_quat()[known])
-    else:
-        target = body_target(scene, demonstration, body, qpos)
-        if target is None:
-            return None
-        time, position, turn = _tracked_pose(target)
-    if len(time) < 2 * FEWEST:
-        return None
-    place, turning = Samples(time, position), Turns(time, turn)
-    velocity, angular = _velocity_sensors(scene.model, demonstration, body)
-    return BodyMotion(place, turning, more_precise(velocity, place), more_precise(angular, turning))
-
-
-def _tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, Rotation]:
-    """Return times [s], positions [m] and rotations of a body's frame from its observed points (Kabsch)."""
-    pose = observed_poses(target, np.arange(len(target.time)))
-    seen = np.isfinite(pose).all(axis=1)
-    return target.time[seen], pose[seen, :3], Rotation.from_quat(pose[seen, 3:], scalar_first=True)
-
-
-def _velocity_sensors(
-    model: mujoco.MjModel, demonstration: Demonstration, body: str
-) -> tuple[Samples | None, Samples | None]:
-    """Return the velocity [m/s, world] and angular velocity [rad/s, body frame] of a body's frame, as sensors say."""
-    linear = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMELINVEL)
-    for name, channel in demonstration.measured.items():
-        sensor = model.sensor(name).id
-        site = int(model.sensor_objid[sensor])
-        gyro = int(model.sensor_type[sensor]) == int(mujoco.mjtSensor.mjSENS_GYRO)
-        if gyro and int(model.site_bodyid[site]) == model.body(body).id:
-            rotation = Rotation.from_quat(model.site_quat[site], scalar_first=True)
-            return finite(linear), finite(Channel(channel.time, rotation.apply(channel.value)))
-    return finite(linear), None
-
-
-def finite(channel: Channel | None) -> Samples | None:
-    """Return the valid samples of a channel as a signal, None where they are too few."""
-    if channel is None:
-        return None
-    known = np.isfinite(channel.value).all(axis=1)
-    return Samples(channel.time[known], channel.value[known], 1) if known.sum() >= 2 * FEWEST else None
-
-
-def more_precise(sensor: Samples | None, signal: Signal) -> Samples | None:
-    """Return the sensor if it says the rate of a signal more precisely than the signal itself does, else None."""
-    if sensor is None or _precision(sensor, 0) >= _precision(signal, 1):
-        return None
-    return sensor
+    return LocalFit(derivatives, (errors[0], errors[1], errors[2]), rows @ rows.T, scatter)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from concent_warp.errors import RenderError
-from concent_warp.estimation.measured_motion import measured_motion
+from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.render.cameras import Camera, place_cameras
@@ -86,7 +86,9 @@ def pairs_of(
         )
     scene = Scene(recording.scene, source=recording.source)
     engine = MujocoEngine(Model(scene), threads=1)
-    motions = [measured_motion(Model(scene), d, engine) for d in demonstrations]
+    motions = [
+        StateEstimator.of(Model(scene), d, StateEstimatorCfg("smoothing_spline"), engine=engine) for d in demonstrations
+    ]
     found = []
     for c, name in enumerate(names):
         camera = Camera.of(name, demonstrations[0].image[name])
@@ -94,7 +96,7 @@ def pairs_of(
         shape = streams[0].rgb.shape[1:]
         if any(Camera.of(name, stream) != camera or stream.rgb.shape[1:] != shape for stream in streams):
             raise RenderError("a camera is not the same in all demonstrations", where=recording.source, found=name)
-        states = [m.states(np.clip(s.time, *m.span))[0] for m, s in zip(motions, streams, strict=True)]
+        states = [m.states(np.clip(s.time, *m.span)).qpos for m, s in zip(motions, streams, strict=True)]
         qpos = np.concatenate(states)
         shown = None if progress is None else lambda share, c=c: progress((c + share) / len(names))
         simulated, pose = _rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, shown)

@@ -4,9 +4,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.joint_motion import joint_motion
-from concent_warp.estimation.local_polynomial import Samples, body_motion
+from concent_warp.estimation.local_polynomial import LocalPolynomial, LocalPolynomialCfg, LocalPolynomialOrientation
 from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.estimation.windows import hold_out, windows
 from concent_warp.fit.fit_geometry import FitCfg, cut, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
@@ -121,19 +121,27 @@ def test_a_body_at_rest_counts_as_in_contact(scene):
     assert len(windows(scene, rest, ("cube",), LENGTH)) == 4
 
 
+def _polynomials(scene: Scene, demonstration: Demonstration) -> tuple[LocalPolynomial, LocalPolynomialOrientation]:
+    """Return the signals of the only free body."""
+    (body,) = StateEstimator.of(Model(scene), demonstration).bodies
+    assert isinstance(body.position, LocalPolynomial)
+    assert isinstance(body.orientation, LocalPolynomialOrientation)
+    return body.position, body.orientation
+
+
 def test_the_more_precise_of_velocity_sensor_and_positions_is_used(scene, recording):
     demonstration = recording.demonstrations[0]
-    motion = body_motion(scene, demonstration, "cube", demonstration.qpos)
-    assert motion.velocity is not None  # it was recorded without noise
-    assert motion.angular is not None
+    position, orientation = _polynomials(scene, demonstration)
+    assert position.velocity is not None  # it was recorded without noise
+    assert orientation.velocity is not None
     rng = np.random.default_rng(0)
     poor = {
         name: Channel(c.time, c.value + 2.0 * rng.standard_normal(c.value.shape)) if name in ("velocity", "gyro") else c
         for name, c in demonstration.measured.items()
     }
-    motion = body_motion(scene, Demonstration("demo_0", measured=poor), "cube", demonstration.qpos)
-    assert motion.velocity is None
-    assert motion.angular is None
+    position, orientation = _polynomials(scene, Demonstration("demo_0", measured=poor))
+    assert position.velocity is None
+    assert orientation.velocity is None
 
 
 def test_tracked_points_serve_as_well_as_poses(scene, recording):
@@ -166,21 +174,22 @@ def test_joints_without_sensors_follow_from_tendons_and_equalities():
     </mujoco>""")
     time = 0.01 * np.arange(50)
     both = {"width": Channel(time, (0.02 + 0.1 * time)[:, None]), "angle": Channel(time, (time**2)[:, None])}
-    position, velocity = joint_motion(scene.model, Demonstration("demo_0", measured=both)).at(0.2)
-    np.testing.assert_allclose(position, [0.04, 0.04, 0.04], atol=1e-9)
-    np.testing.assert_allclose(velocity, [0.1, 0.1, 0.4], atol=1e-9)
+    states = StateEstimator.of(Model(scene), Demonstration("demo_0", measured=both)).states(np.array([0.2]))
+    np.testing.assert_allclose(states.qpos[0], [0.04, 0.04, 0.04], atol=1e-9)
+    np.testing.assert_allclose(states.qvel[0], [0.1, 0.1, 0.4], atol=1e-9)
+    np.testing.assert_allclose(states.qacc[0], [0, 0, 2], atol=1e-7)
     with pytest.raises(RecordingError, match=r"joints were not measured.*\['arm'\]"):
-        joint_motion(scene.model, Demonstration("demo_0", measured={"width": both["width"]}))
+        StateEstimator.of(Model(scene), Demonstration("demo_0", measured={"width": both["width"]}))
 
 
 def test_a_local_fit_gives_rate_and_curvature_of_a_parabola_at_either_end():
     time = 0.01 * np.arange(30)
-    signal = Samples(time, (3 + 2 * time - 4 * time**2)[:, None])
-    for now in (0.0, 0.15, time[-1]):
-        estimate = signal.at(now)
-        assert estimate.value[0] == pytest.approx(3 + 2 * now - 4 * now**2, abs=1e-9)
-        assert estimate.rate[0] == pytest.approx(2 - 8 * now, abs=1e-7)
-        assert estimate.second[0] == pytest.approx(-8, abs=1e-5)
+    signal = LocalPolynomialCfg().signal(Channel(time, (3 + 2 * time - 4 * time**2)[:, None]))
+    now = np.array([0.0, 0.15, time[-1]])
+    estimate = signal.estimate(now)
+    np.testing.assert_allclose(estimate.value[:, 0], 3 + 2 * now - 4 * now**2, atol=1e-9)
+    np.testing.assert_allclose(estimate.rate[:, 0], 2 - 8 * now, atol=1e-7)
+    np.testing.assert_allclose(estimate.second[:, 0], -8, atol=1e-5)
 
 
 def test_windows_are_held_out_by_demonstration_where_there_are_enough(scene, recording):

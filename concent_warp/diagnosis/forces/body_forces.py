@@ -19,7 +19,8 @@ from concent_warp.diagnosis.forces.wrench import Wrenches, joined, steady_force,
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import MeasuredMotion, SmoothedBodyMotion
+    from concent_warp.estimation.signals import MeasuredBody
+    from concent_warp.estimation.state_estimator import StateEstimator
     from concent_warp.model import Model
 
 
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 class BodyRecord:
     """A body in one demonstration; K windows, n of them valid."""
 
-    motion: MeasuredMotion
+    motion: StateEstimator
     windows: Windows
-    body: SmoothedBodyMotion
+    body: MeasuredBody
     state: BodyWindows
     valid: np.ndarray
     """Windows whose forces are known, shape (K,) bool."""
@@ -43,7 +44,7 @@ class BodyRecord:
 
 
 def _body_records(
-    name: str, motions: Sequence[MeasuredMotion], windows: Sequence[Windows], cfg: LocateForcesCfg
+    name: str, motions: Sequence[StateEstimator], windows: Sequence[Windows], cfg: LocateForcesCfg
 ) -> list[BodyRecord]:
     """Return a body in each demonstration in which it was measured."""
     found = [
@@ -67,14 +68,14 @@ def _body_records(
 
 
 def body_force(
-    model: Model, name: str, motions: Sequence[MeasuredMotion], windows: Sequence[Windows], cfg: LocateForcesCfg
+    model: Model, name: str, motions: Sequence[StateEstimator], windows: Sequence[Windows], cfg: LocateForcesCfg
 ) -> BodyForce:
     """Return the unexplained force on a free body."""
     parts = _body_records(name, motions, windows, cfg)
     everything = joined([part.seen for part in parts])
     forces, torques = [], []
     for part in parts:
-        acceleration = part.motion.acceleration(part.windows.time)[:, part.body.dof : part.body.dof + 3]
+        acceleration = part.motion.states(part.windows.time).qacc[:, part.body.dof : part.body.dof + 3]
         along, about = body_force_features(part.state, acceleration, name), body_torque_features(part.state, name)
         forces.append({n: f[part.valid] for n, f in along.items()})
         torques.append({n: f[part.valid] for n, f in about.items()})

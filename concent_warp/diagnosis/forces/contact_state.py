@@ -16,7 +16,8 @@ from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import MeasuredMotion, SmoothedBodyMotion
+    from concent_warp.estimation.signals import MeasuredBody
+    from concent_warp.estimation.state_estimator import StateEstimator
 
 PUSHED, BETWEEN = "pushed", "between"
 """Further phases: the robot presses on it from one side; it starts or stops moving."""
@@ -59,16 +60,14 @@ class BodyWindows:
     """Body to world, shape (K, 3, 3)."""
 
 
-def body_windows(
-    motion: MeasuredMotion, windows: Windows, body: SmoothedBodyMotion, cfg: ContactStateCfg
-) -> BodyWindows:
+def body_windows(motion: StateEstimator, windows: Windows, body: MeasuredBody, cfg: ContactStateCfg) -> BodyWindows:
     """Return the contacts of a body in the model's simulation of each window, its phase and its free motions."""
     m = motion.compiled
     count, steps = windows.path.shape[0], windows.path.shape[1] - 1
     rotation = Rotation.from_quat(windows.qpos[:, body.qpos + 3 : body.qpos + 7], scalar_first=True)
     velocity = windows.qvel[:, body.dof : body.dof + 3]
     spin = rotation.apply(windows.qvel[:, body.dof + 3 : body.dof + 6])
-    speed_std = np.sqrt(body.position.smooth.covariance(windows.time)[:, 1, 1])
+    speed_std = np.sqrt(body.position.covariance(windows.time)[:, 1, 1])
     size = _body_size(m, body.body)
     log, owner = windows.contacts, m.geom_bodyid[windows.contacts.geom]
     first, second = np.asarray(owner[:, 0] == body.body), np.asarray(owner[:, 1] == body.body)
@@ -77,7 +76,7 @@ def body_windows(
     free = np.tile(np.eye(6), (count, 1, 1))
     sliding, heading = np.zeros((count, 3)), np.zeros((count, 3))
     instants = windows.start[:, None] + windows.length * SHARES
-    passing = motion.states(instants.ravel())[1].reshape(count, len(SHARES), -1)
+    passing = motion.states(instants.ravel()).qvel.reshape(count, len(SHARES), -1)
     for k in range(count):
         rows = np.flatnonzero((log.variant == k) & (first ^ second))
         if not len(rows):

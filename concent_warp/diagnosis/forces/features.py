@@ -16,7 +16,7 @@ from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.contact_state import BodyWindows
     from concent_warp.diagnosis.forces.window_forces import Windows
-    from concent_warp.estimation.measured_motion import MeasuredMotion
+    from concent_warp.estimation.state_estimator import StateEstimator
 
 DIRECTION, SPEED, ACCELERATION = "direction of motion", "velocity", "acceleration"
 SLOW, LIMIT = "direction of slow motion", "drive force near its peak"
@@ -26,7 +26,7 @@ SLIDING, DRAG = "direction of sliding", "velocity x speed"
 AXES = ("x", "y", "z")
 
 
-def joint_features(windows: Windows, motion: MeasuredMotion, cfg: FeatureCfg) -> dict[str, dict[str, np.ndarray]]:
+def joint_features(windows: Windows, motion: StateEstimator, cfg: FeatureCfg) -> dict[str, dict[str, np.ndarray]]:
     """Return the features of each measured joint, by its name, shape (K, 1) each.
 
     Units: "velocity" rad/s (m/s), "acceleration" rad/s^2, "direction of motion" -1..1, "position" rad about its mean,
@@ -37,8 +37,8 @@ def joint_features(windows: Windows, motion: MeasuredMotion, cfg: FeatureCfg) ->
     d = mujoco.MjData(m)
     count = len(windows.start)
     time = (windows.start[:, None] + windows.length * SHARES).ravel()
-    qpos, qvel = motion.states(time)
-    qacc = motion.acceleration(time)
+    states = motion.states(time)
+    qpos, qvel, qacc = states.qpos, states.qvel, states.qacc
     dt = m.opt.timestep
     back = max(round(cfg.rate_step / dt), 1)
     now = np.clip((time / dt).astype(int), 0, len(motion.ctrl) - 1)
@@ -59,7 +59,7 @@ def joint_features(windows: Windows, motion: MeasuredMotion, cfg: FeatureCfg) ->
     found = {}
     for joint in motion.joints:
         v = qvel[:, joint.dof]
-        std = np.sqrt(joint.position.smooth.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
+        std = np.sqrt(joint.position.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
         direction = v / np.sqrt(v**2 + (cfg.direction_standard_errors * std) ** 2)
         force, scale = drive[:, joint.dof], float(np.percentile(np.abs(v), cfg.slow_percentile))
         raw = {

@@ -16,7 +16,7 @@ from concent_warp.diagnosis.forces.features import CONTACT, joint_features
 from concent_warp.diagnosis.forces.force_data import ForceSeries, JointForce
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.forces.window_forces import Windows, window_forces, window_length
-from concent_warp.estimation.measured_motion import MeasuredMotion, measured_motion
+from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.files import write_json
 from concent_warp.simulate.select import EngineName, make_engine
 
@@ -58,7 +58,7 @@ def locate_forces(
     cfg = cfg or LocateForcesCfg()
     simulator = make_engine(engine, model)
     chosen = recording.demonstrations
-    motions = [measured_motion(model, d, simulator) for d in chosen]
+    motions = [StateEstimator.of(model, d, StateEstimatorCfg("smoothing_spline"), engine=simulator) for d in chosen]
     report = progress or _ignore
     report(0.1)
     if cfg.length is None:
@@ -90,14 +90,14 @@ def _ignore(share: float) -> None:
     del share
 
 
-def _all_joints(motions: Sequence[MeasuredMotion]) -> list[tuple[str, str, int]]:
+def _all_joints(motions: Sequence[StateEstimator]) -> list[tuple[str, str, int]]:
     """Return name, unit of force and degree of freedom of the joints measured in any demonstration."""
     return sorted(
         {(j.name, "N m" if j.unit == "rad" else "N", j.dof) for m in motions for j in m.joints}, key=lambda j: j[2]
     )
 
 
-def _all_bodies(motions: Sequence[MeasuredMotion]) -> list[str]:
+def _all_bodies(motions: Sequence[StateEstimator]) -> list[str]:
     """Return the names of the free bodies measured in any demonstration."""
     return list(dict.fromkeys(b.name for m in motions for b in m.bodies))
 

@@ -24,7 +24,8 @@ from concent_warp.errors import RecordingError
 from concent_warp.simulate.engine import ContactLog, Engine, Variants
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.measured_motion import MeasuredMotion
+    from concent_warp.estimation.signals import 
+    from concent_warp.estimation.state_estimator import StateEstimator
 
 SHARES = (np.arange(5) + 0.5) / 5
 """Instants within a window, as shares of its length, at which what forces depend on is taken."""
@@ -67,12 +68,12 @@ class Windows:
         return np.sqrt(np.einsum("kii->ki", self.covariance))
 
 
-def window_length(motion: MeasuredMotion) -> float:
+def window_length(motion: StateEstimator) -> float:
     """Return the default length of a window for what was measured [s]."""
     return float(min(max(0.12 if motion.bodies else 0.1, 8 * motion.period), 0.3))
 
 
-def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: LocateForcesCfg) -> Windows:
+def window_forces(name: str, engine: Engine, motion: StateEstimator, cfg: LocateForcesCfg) -> Windows:
     """Simulate all windows of a demonstration, by its name, and return the unexplained forces.
 
     Raises:
@@ -95,7 +96,7 @@ def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: Locate
     start = step * engine.timestep
     ctrl = motion.ctrl[np.minimum(step[:, None] + np.arange(steps), len(motion.ctrl) - 1)]
     rng = np.random.default_rng(cfg.seed)
-    qpos, qvel = motion.draws(start, cfg.extra_starts, rng)
+    qpos, qvel = motion.sample_states(start, cfg.extra_starts, rng)
     first_run = Variants(len(start), qpos=qpos[0], qvel=qvel[0])
     nominal = engine.run(first_run, ctrl, bodies=(), contacts="all").numpy()
     assert nominal.contacts is not None
@@ -107,8 +108,8 @@ def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: Locate
         path = np.concatenate([path, np.asarray(extra.qpos, dtype=float).reshape(cfg.extra_starts, *path.shape[1:])])
     speed = np.asarray(nominal.qvel, dtype=float)
     middle = start + length / 2
-    mid_qpos, mid_qvel = motion.states(middle)
-    edges = np.stack([motion.states(start)[1], motion.states(start + length)[1]])
+    mid = motion.states(middle)
+    edges = np.stack([motion.states(start).qvel, motion.states(start + length).qvel])
     force = np.full((len(start), m.nv), np.nan)
     covariance = np.zeros((len(start), m.nv, m.nv))
     solver = WindowSolver(motion, engine, length, cfg.solver)
@@ -116,6 +117,6 @@ def window_forces(name: str, engine: Engine, motion: MeasuredMotion, cfg: Locate
     edge = np.searchsorted(log.variant, np.arange(len(start) + 1))
     for k in range(len(start)):
         rows = {name: value[edge[k] : edge[k + 1]] for name, value in vars(log).items()}
-        simulated = Simulated(start[k], path[:, k], speed[k], mid_qpos[k], mid_qvel[k], ctrl[k], ContactLog(**rows))
+        simulated = Simulated(start[k], path[:, k], speed[k], mid.qpos[k], mid.qvel[k], ctrl[k], ContactLog(**rows))
         force[k], covariance[k] = solver.solve(simulated)
-    return Windows(name, start, length, mid_qpos, mid_qvel, edges, force, covariance, log, path[0])
+    return Windows(name, start, length, mid.qpos, mid.qvel, edges, force, covariance, log, path[0])

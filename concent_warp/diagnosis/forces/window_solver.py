@@ -23,12 +23,9 @@ from scipy.spatial.transform import Rotation
 from concent_warp.diagnosis.forces.cfg import WindowSolverCfg
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.measured_motion import (
-        MeasuredMotion,
-        SmoothedBodyMotion,
-        SmoothedJointMotion,
-        SmoothedSignal,
-    )
+    from concent_warp.estimation.signals import MeasuredBody, MeasuredJoint
+    from concent_warp.estimation.signals import Readings as SignalReadings
+    from concent_warp.estimation.state_estimator import StateEstimator
     from concent_warp.simulate.engine import ContactLog, Engine
 
 
@@ -68,7 +65,7 @@ class Readings:
 class WindowSolver:
     """Turns departures from simulated windows into forces."""
 
-    def __init__(self, motion: MeasuredMotion, engine: Engine, length: float, cfg: WindowSolverCfg) -> None:
+    def __init__(self, motion: StateEstimator, engine: Engine, length: float, cfg: WindowSolverCfg) -> None:
         """Prepare to solve windows of a length [s] of a motion."""
         self.motion = motion
         self.timestep = engine.timestep
@@ -107,7 +104,7 @@ class WindowSolver:
     def _body(
         self,
         window: Simulated,
-        body: SmoothedBodyMotion,
+        body: MeasuredBody,
         mass: np.ndarray,
         acceleration: np.ndarray,
         noise: np.ndarray,
@@ -140,7 +137,7 @@ class WindowSolver:
 
     def _joints(self, window: Simulated, acceleration: np.ndarray, noise: np.ndarray, known: np.ndarray) -> None:
         """Write the accelerations of the joints, solved together since they are coupled."""
-        joints: list[SmoothedJointMotion] = []
+        joints: list[MeasuredJoint] = []
         readings: list[Readings] = []
         for joint in self.motion.joints:
             path = window.path[:, :, joint.qpos, None]
@@ -164,7 +161,7 @@ class WindowSolver:
         acceleration[:, dofs] = found
         noise[np.ix_(dofs, dofs)] = covariance
 
-    def _drives(self, joints: list[SmoothedJointMotion]) -> tuple[np.ndarray, np.ndarray]:
+    def _drives(self, joints: list[MeasuredJoint]) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives of joint accelerations by positions and velocities, without constraints, (n, n) each."""
         m, d = self.model, self.data
         dofs = [j.dof for j in joints]
@@ -179,7 +176,7 @@ class WindowSolver:
         return both[:, : len(joints)], both[:, len(joints) :]
 
     def _readings(
-        self, start: float, signal: SmoothedSignal, path: np.ndarray, rows: np.ndarray, *, turning: bool
+        self, start: float, signal: SignalReadings, path: np.ndarray, rows: np.ndarray, *, turning: bool
     ) -> Readings:
         """Return the readings of a signal in a window against what was simulated, `path` (V, S + 1, dim)."""
         chosen = np.flatnonzero((signal.time >= start) & (signal.time <= start + self.length))
@@ -196,7 +193,7 @@ class WindowSolver:
         return Readings(clock, off, signal.std, rows)
 
 
-def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: SmoothedBodyMotion, min_speed: float) -> np.ndarray:
+def _sliding_damping(m: mujoco.MjModel, window: Simulated, body: MeasuredBody, min_speed: float) -> np.ndarray:
     """Return the damping of a body's motion (world frame, about its origin) by sliding on what is fixed, shape (6, 6).
 
     Friction f against the slip v, |f| fixed: df/dv = -|f| / |v| (1 - n n' - v v' / |v|^2), n the normal; |v| counts as

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.windows import Measured
+from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
 if TYPE_CHECKING:
@@ -120,7 +120,8 @@ class ObservedRecording:
             return qpos, qvel
         measured = self.measured(d)
         if measured is not None:
-            return measured.state(time)
+            states = measured.states(np.array([time]))
+            return states.qpos[0], states.qvel[0]
         if time <= 0.0:
             return qpos, qvel
         raise RecordingError(
@@ -129,10 +130,10 @@ class ObservedRecording:
             fix="record poses of all free bodies and all joints",
         )
 
-    def measured(self, d: Demonstration) -> Measured | None:
+    def measured(self, d: Demonstration) -> StateEstimator | None:
         """Return how everything was seen to move in a demonstration, None where something was not."""
         try:
-            return Measured.of(self.model.scene, d, initial_state(self.model.scene.model, d)[0])
+            return StateEstimator.of(self.model, d)
         except RecordingError:
             return None
 

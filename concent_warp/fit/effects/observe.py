@@ -11,7 +11,7 @@ import numpy as np
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import pooled_noise
 from concent_warp.estimation.sensors import kind_and_unit
-from concent_warp.estimation.windows import Measured
+from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.observation import (
     FEWEST,
     START_NOISE,
@@ -172,10 +172,10 @@ def keeps_close(
     return float(np.clip(reach, SHORTEST, span))
 
 
-def _calmest(measured: Measured, start: float, reach: float) -> float:
+def _calmest(measured: StateEstimator, start: float, reach: float) -> float:
     """Return where a reach had better end [s]: late, and not in an impact, where no velocity is to be had."""
     times = start + np.linspace(reach, 0.35 * reach, 27)
-    rough = measured.roughness(times)
+    rough = measured.scatter(times)
     calm = np.flatnonzero(rough < CALM)
     return float(times[calm[0] if len(calm) else rough.argmin()])
 

@@ -160,7 +160,7 @@ def test_picture_shows_the_object_and_the_joint(rubbing, pushed_in_flight, tmp_p
 def test_a_recording_without_motion_is_refused():
     time = np.arange(0, 1, 0.01)
     action = {"drive": Channel(time, 0 * time)}
-    with pytest.raises(RecordingError, match="no motion to locate forces in"):
+    with pytest.raises(RecordingError, match="no measured motion"):
         located(Recording(PENDULUM, (Demonstration("demo_0", action=action),)))
 
 

@@ -8,7 +8,7 @@ from concent_warp.diagnosis.forces.contact_state import _free_motions, _lasting_
 from concent_warp.diagnosis.forces.describe import _direction_words
 from concent_warp.diagnosis.forces.point_of_action import _face_words, _lever
 from concent_warp.diagnosis.forces.window_forces import window_forces
-from concent_warp.estimation.measured_motion import measured_motion
+from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -18,7 +18,10 @@ from tests.diagnosis.forces.locate_scenes import throw
 def parts(recording):
     model = Model(Scene(recording.scene))
     engine = MujocoEngine(model, threads=1)
-    motions = [measured_motion(model, d, engine) for d in recording.demonstrations]
+    motions = [
+        StateEstimator.of(model, d, StateEstimatorCfg("smoothing_spline"), engine=engine)
+        for d in recording.demonstrations
+    ]
     pairs = zip(recording.demonstrations, motions, strict=True)
     windows = [window_forces(d.name, engine, motion, LocateForcesCfg(extra_starts=0)) for d, motion in pairs]
     return _body_records("block", motions, windows, LocateForcesCfg())

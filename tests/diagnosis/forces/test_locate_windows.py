@@ -6,8 +6,8 @@ from concent_warp.diagnosis.forces.cfg import FeatureCfg, LocateForcesCfg
 from concent_warp.diagnosis.forces.features import DIRECTION, joint_features
 from concent_warp.diagnosis.forces.window_forces import window_forces
 from concent_warp.diagnosis.forces.window_solver import _misfit, _response
-from concent_warp.estimation.measured_motion import _turning, measured_motion
-from concent_warp.estimation.smoothing_spline import smooth
+from concent_warp.estimation.smoothing_spline import ChannelReadings, angular_velocity, fit_spline
+from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -18,7 +18,7 @@ from tests.diagnosis.forces.locate_scenes import swing, throw
 def windows_of(recording, cfg=None, which=0):
     model = Model(Scene(recording.scene))
     engine = MujocoEngine(model, threads=1)
-    motion = measured_motion(model, recording[which], engine)
+    motion = StateEstimator.of(model, recording[which], StateEstimatorCfg("smoothing_spline"), engine=engine)
     return window_forces(recording[which].name, engine, motion, cfg or LocateForcesCfg(extra_starts=1)), motion
 
 
@@ -34,7 +34,7 @@ def test_smoothed_motion_and_its_errors_agree_with_the_truth():
     truth = np.stack([0.5 * np.sin(3 * at), 1.5 * np.cos(3 * at), -4.5 * np.sin(3 * at)])
     off = []
     for seed in range(8):
-        found = smooth(*wave(seed), 1e-3)
+        found = fit_spline(*wave(seed), 1e-3)
         std = np.sqrt(np.einsum("tii->it", found.covariance(at)))
         off.append([(found.at(at, k)[:, 0] - truth[k]) / std[k] for k in range(3)])
     spread = np.sqrt(np.mean(np.square(off), axis=(0, 2)))
@@ -46,7 +46,7 @@ def test_smoothed_motion_and_its_errors_agree_with_the_truth():
 def test_readings_of_the_velocity_make_it_more_certain():
     time, value = wave(0)
     speed = 1.5 * np.cos(3 * time)[:, None] + np.random.default_rng(1).normal(0, 5e-3, (len(time), 1))
-    alone, both = smooth(time, value, 1e-3), smooth(time, value, 1e-3, (time, speed, 5e-3))
+    alone, both = fit_spline(time, value, 1e-3), fit_spline(time, value, 1e-3, ChannelReadings(time, speed, 5e-3))
     at = np.array([1.0, 2.0])
     assert (both.covariance(at)[:, 1, 1] < 0.5 * alone.covariance(at)[:, 1, 1]).all()
     assert both.at(at, 1)[:, 0] == pytest.approx(1.5 * np.cos(3 * at), abs=5e-3)
@@ -55,14 +55,14 @@ def test_readings_of_the_velocity_make_it_more_certain():
 def test_gaps_are_bridged_with_larger_errors():
     time, value = wave(0)
     value[(time > 1.5) & (time < 1.8)] = np.nan
-    found = smooth(time, value, 1e-3)
+    found = fit_spline(time, value, 1e-3)
     inside, outside = found.covariance(np.array([1.65, 1.0]))[:, 0, 0]
     assert inside > 4 * outside
     assert np.isfinite(found.at(np.array([1.65]))).all()
 
 
 def test_too_few_readings_are_not_smoothed():
-    assert smooth(np.arange(4.0), np.zeros((4, 1)), 1e-3) is None
+    assert fit_spline(np.arange(4.0), np.zeros((4, 1)), 1e-3) is None
 
 
 def test_angular_velocity_follows_from_the_quaternion_and_its_rate():
@@ -70,7 +70,7 @@ def test_angular_velocity_follows_from_the_quaternion_and_its_rate():
     start = Rotation.from_euler("xyz", [0.4, 0.2, -1.0])
     ends = [start * Rotation.from_rotvec(s * omega) for s in (-step, step)]
     rate = (ends[1].as_quat(scalar_first=True) - ends[0].as_quat(scalar_first=True)) / (2 * step)
-    assert _turning(start.as_quat(scalar_first=True), rate) == pytest.approx(omega, abs=1e-6)
+    assert angular_velocity(start.as_quat(scalar_first=True), rate) == pytest.approx(omega, abs=1e-6)
 
 
 def test_departures_of_a_spring_swing_and_settle_about_its_sag():

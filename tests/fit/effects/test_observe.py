@@ -72,7 +72,7 @@ def test_motion_from_the_top_keeps_close_to_its_start_for_a_shorter_time():
 
 def test_a_window_ends_late_but_before_an_impact():
     class Rough:
-        def roughness(self, times):
+        def scatter(self, times):
             return np.where(times > 0.8, 10.0, 1.0)
 
     found = _calmest(Rough(), 0.0, 1.0)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,145 @@
+"""Measured motion of free bodies: by pose sensors, velocity sensors and tracked points."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from concent_warp.errors import RecordingError
+from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
+from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
+from concent_warp.estimation.signals import MeasuredBody, OrientationSignal, Signal
+from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
+from concent_warp.recording.recording import Channel
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Demonstration
+    from concent_warp.scene.scene import Scene
+
+SENSOR = mujoco.mjtSensor
+
+
+def polynomial_bodies(
+    scene: Scene, demonstration: Demonstration, cfg: LocalPolynomialCfg, qpos: np.ndarray
+) -> tuple[MeasuredBody, ...]:
+    """Return all free bodies, by pose and velocity sensors of the body frame or by tracked points.
+
+    Args:
+        scene: The scene.
+        demonstration: What was measured.
+        cfg: How readings are smoothed.
+        qpos: State at the start of the demonstration, shape (nq,): locates the tracked points on the body.
+
+    Raises:
+        RecordingError: A free body was not measured.
+    """
+    m = scene.model
+    found = []
+    for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        body = int(m.jnt_bodyid[joint])
+        name = m.body(body).name
+        signals = _polynomial_signals(scene, demonstration, name, cfg, qpos)
+        if signals is None:
+            raise RecordingError(
+                "a window cannot start where a free body was not seen",
+                where=demonstration.name,
+                expected=f"points, or position and orientation sensors, of {name!r}",
+                fix="record them, or fit whole demonstrations",
+            )
+        found.append(MeasuredBody(name, body, int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint]), *signals))
+    return tuple(found)
+
+
+def _polynomial_signals(
+    scene: Scene, demonstration: Demonstration, body: str, cfg: LocalPolynomialCfg, qpos: np.ndarray
+) -> tuple[Signal, OrientationSignal] | None:
+    """Return position and orientation of a body; None if it was not measured."""
+    pose = measured_pose(scene.model, demonstration, body)
+    if pose is not None and body not in demonstration.points:
+        time, position, rotation = pose
+        valid = np.flatnonzero(np.isfinite(position).all(axis=1))
+        time, position = time[valid], position[valid]
+        quaternion = rotation.as_quat(scalar_first=True)[valid]
+    else:
+        target = body_target(scene, demonstration, body, qpos)
+        if target is None:
+            return None
+        time, position, quaternion = _tracked_pose(target)
+    linear, angular = _velocity_channels(scene.model, demonstration, body)
+    signal = cfg.signal(Channel(time, position), linear)
+    orientation = cfg.orientation(Channel(time, quaternion), angular)
+    return None if signal is None or orientation is None else (signal, orientation)
+
+
+def _tracked_pose(target: BodyTarget) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times (T,) [s], positions (T, 3) [m] and quaternions wxyz (T, 4) of a body from its observed points."""
+    pose = observed_poses(target, np.arange(len(target.time)))
+    seen = np.isfinite(pose).all(axis=1)
+    return target.time[seen], pose[seen, :3], pose[seen, 3:]
+
+
+def _velocity_channels(
+    m: mujoco.MjModel, demonstration: Demonstration, body: str
+) -> tuple[Channel | None, Channel | None]:
+    """Return the measured velocity [m/s, world] and angular velocity [rad/s, body frame] of a body's frame."""
+    linear = frame_channel(m, demonstration, body, SENSOR.mjSENS_FRAMELINVEL)
+    for name, channel in demonstration.measured.items():
+        sensor = m.sensor(name).id
+        site = int(m.sensor_objid[sensor])
+        if int(m.sensor_type[sensor]) == int(SENSOR.mjSENS_GYRO) and int(m.site_bodyid[site]) == m.body(body).id:
+            rotation = Rotation.from_quat(m.site_quat[site], scalar_first=True)
+            return linear, Channel(channel.time, rotation.apply(channel.value))
+    return linear, None
+
+
+def spline_bodies(m: mujoco.MjModel, demonstration: Demonstration, cfg: SmoothingSplineCfg) -> tuple[MeasuredBody, ...]:
+    """Return the free bodies whose position was measured, by sensors of a frame anywhere on the body."""
+    found: dict[int, MeasuredBody] = {}
+    posed: dict[int, dict[int, tuple[Channel, np.ndarray, Rotation]]] = {}
+    for name, channel in demonstration.measured.items():
+        row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        kind = int(m.sensor_type[row]) if row >= 0 else -1
+        if kind in (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT)) and m.sensor_refid[row] < 0:
+            frame = _frame_in_body(m, row)
+            if frame is not None:
+                posed.setdefault(frame[0], {}).setdefault(kind, (channel, frame[1], frame[2]))
+    for body, channels in posed.items():
+        joint = m.body_jntadr[body]
+        if joint < 0 or m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE or int(SENSOR.mjSENS_FRAMEPOS) not in channels:
+            continue
+        orientation = None
+        if int(SENSOR.mjSENS_FRAMEQUAT) in channels:
+            channel, _, turn = channels[int(SENSOR.mjSENS_FRAMEQUAT)]
+            orientation = cfg.orientation(channel, turn)
+        channel, offset, _ = channels[int(SENSOR.mjSENS_FRAMEPOS)]
+        shift = None
+        if np.any(offset):
+            if orientation is None:
+                continue
+            quaternion = orientation.spline.at(channel.time)
+            shift = Rotation.from_quat(quaternion, scalar_first=True).apply(offset)
+        position = cfg.signal(channel, kind="position", offset=shift)
+        if position is not None:
+            name = m.body(body).name or f"body{body}"
+            addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
+            found[body] = MeasuredBody(name, body, *addresses, position, orientation)
+    return tuple(found[body] for body in sorted(found))
+
+
+def _frame_in_body(m: mujoco.MjModel, row: int) -> tuple[int, np.ndarray, Rotation] | None:
+    """Return the body of a frame sensor, the frame's origin on it [m, body frame] and rotation from frame to body."""
+    target, kind = int(m.sensor_objid[row]), int(m.sensor_objtype[row])
+    if kind == mujoco.mjtObj.mjOBJ_XBODY:
+        return target, np.zeros(3), Rotation.identity()
+    if kind == mujoco.mjtObj.mjOBJ_BODY:
+        body, offset, turn = target, m.body_ipos[target], m.body_iquat[target]
+    elif kind == mujoco.mjtObj.mjOBJ_SITE:
+        body, offset, turn = int(m.site_bodyid[target]), m.site_pos[target], m.site_quat[target]
+    elif kind == mujoco.mjtObj.mjOBJ_GEOM:
+        body, offset, turn = int(m.geom_bodyid[target]), m.geom_pos[target], m.geom_quat[target]
+    else:
+        return None
+    return body, np.array(offset), Rotation.from_quat(turn, scalar_first=True)

@@ -1,0 +1,192 @@
+"""Measured motion of hinges and slides: by their own sensors, and by the tendons and equalities that couple them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.errors import RecordingError
+from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
+from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sampled
+from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Channel, Demonstration
+
+SENSOR = mujoco.mjtSensor
+HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+RATE_SENSORS = {SENSOR.mjSENS_JOINTPOS: SENSOR.mjSENS_JOINTVEL, SENSOR.mjSENS_TENDONPOS: SENSOR.mjSENS_TENDONVEL}
+"""The sensor that measures the rate of what another one measures."""
+SmootherCfg = LocalPolynomialCfg | SmoothingSplineCfg
+
+
+@dataclass(frozen=True)
+class CoupledJoints:
+    """Joint positions as the least-squares solution of linear equations: readings, and equalities of the scene."""
+
+    qpos: np.ndarray
+    """Addresses of the joints in qpos, shape (J,)."""
+    dof: np.ndarray
+    """Addresses in qvel, shape (J,)."""
+    coefficients: np.ndarray
+    """Coefficients of the joints in each equation, readings first, shape (E, J)."""
+    readings: tuple[Signal, ...]
+    """What was measured of the first equations' sums."""
+    constants: np.ndarray
+    """What the sums of the other equations are constantly."""
+
+    def estimate(self, time: np.ndarray) -> Estimate:
+        """Return positions and their derivatives at `time` (T,), shape (T, J)."""
+        found = [signal.estimate(time) for signal in self.readings]
+        inverse = np.linalg.pinv(self.coefficients)
+        still = np.zeros((len(time), len(self.constants)))
+        constant = np.broadcast_to(self.constants, still.shape)
+        value, rate, second = (
+            np.concatenate([*parts, rest], axis=1)
+            for parts, rest in (
+                ([e.value for e in found], constant),
+                ([e.rate for e in found], still),
+                ([e.second for e in found], still),
+            )
+        )
+        # One product for each time: a product of matrices rounds otherwise.
+        return Estimate(*(np.array([inverse @ row for row in rows]) for rows in (value, rate, second)))
+
+    def covariance(self, time: np.ndarray) -> np.ndarray:
+        """Return the covariance of position, velocity and acceleration of each joint, shape (T, J, 3, 3)."""
+        inverse = np.linalg.pinv(self.coefficients)[:, : len(self.readings)]
+        if not self.readings:
+            return np.zeros((len(time), len(self.qpos), 3, 3))
+        return np.einsum("jr,rtik->tjik", inverse**2, np.array([s.covariance(time) for s in self.readings]))
+
+    def sample(self, time: np.ndarray, count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and velocity at `time` (T,), followed by `count` samples, shapes (1 + count, T, J)."""
+        found = self.estimate(time)
+        if rng is None or not count:
+            return found.value[None], found.rate[None]
+        covariance = self.covariance(time)[:, :, :2, :2]
+        columns = [
+            sampled(found.value[:, j : j + 1], found.rate[:, j : j + 1], covariance[:, j], count, rng)
+            for j in range(len(self.qpos))
+        ]
+        return np.concatenate([c[0] for c in columns], axis=2), np.concatenate([c[1] for c in columns], axis=2)
+
+
+def joint_signals(m: mujoco.MjModel, demonstration: Demonstration, smoother: SmootherCfg) -> tuple[MeasuredJoint, ...]:
+    """Return the hinges and slides whose position a sensor measured."""
+    found = []
+    signals = _signals(m, demonstration, SENSOR.mjSENS_JOINTPOS, smoother)
+    for joint in np.flatnonzero(np.isin(m.jnt_type, HINGE_OR_SLIDE)):
+        if (pair := signals.get(int(joint))) is not None:
+            unit = "rad" if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else "m"
+            position, rate = pair
+            velocity = None if rate is None else smoother.readings(rate, "joint")
+            addresses = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
+            found.append(MeasuredJoint(m.joint(joint).name or f"joint{joint}", unit, *addresses, position, velocity))
+    return tuple(found)
+
+
+def coupled_joints(
+    m: mujoco.MjModel,
+    demonstration: Demonstration,
+    smoother: SmootherCfg,
+    measured: Sequence[MeasuredJoint],
+    min_singular: float,
+) -> CoupledJoints:
+    """Return the positions of all hinges and slides, from joint and tendon sensors and from the scene's equalities.
+
+    Args:
+        m: The compiled scene.
+        demonstration: What was measured.
+        smoother: How readings are smoothed.
+        measured: The joints whose position a sensor measured.
+        min_singular: Smallest singular value of equations that determine all joints.
+
+    Raises:
+        RecordingError: The measurements do not determine a joint, or there is a ball joint.
+    """
+    if (m.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)).any():
+        raise RecordingError("windows cannot start in a scene with ball joints", where=demonstration.name)
+    joints = np.flatnonzero(np.isin(m.jnt_type, HINGE_OR_SLIDE))
+    column = {int(joint): i for i, joint in enumerate(joints)}
+    by_dof = {joint.dof: joint.position for joint in measured}
+    equations: list[np.ndarray] = []
+    readings: list[Signal] = []
+    for joint in _channels(m, demonstration, SENSOR.mjSENS_JOINTPOS):
+        if joint in column and int(m.jnt_dofadr[joint]) in by_dof:
+            equations.append(np.eye(len(joints))[column[joint]])
+            readings.append(by_dof[int(m.jnt_dofadr[joint])])
+    for tendon, (signal, _) in _signals(m, demonstration, SENSOR.mjSENS_TENDONPOS, smoother).items():
+        if (coefficients := _tendon_coefficients(m, tendon, column)) is not None:
+            equations.append(coefficients)
+            readings.append(signal)
+    couplings = _equalities(m, column)
+    equations += [coefficients for coefficients, _ in couplings]
+    rows = np.array(equations) if equations else np.zeros((0, len(joints)))
+    if len(joints) and (len(rows) < len(joints) or np.linalg.svd(rows, compute_uv=False)[-1] < min_singular):
+        loose = np.abs(np.eye(len(joints)) - np.linalg.pinv(rows) @ rows).max(axis=1) > min_singular
+        raise RecordingError(
+            "a window cannot start where joints were not measured",
+            where=demonstration.name,
+            expected=f"readings of {[m.joint(int(j)).name for j in joints[loose]]}",
+            fix="record joint position sensors, or fit whole demonstrations",
+        )
+    constants = np.array([constant for _, constant in couplings])
+    return CoupledJoints(m.jnt_qposadr[joints], m.jnt_dofadr[joints], rows, tuple(readings), constants)
+
+
+def _signals(
+    m: mujoco.MjModel, demonstration: Demonstration, kind: mujoco.mjtSensor, smoother: SmootherCfg
+) -> dict[int, tuple[Signal, Channel | None]]:
+    """Return what the sensors of a kind measured, and the channel of the rate, by the id of the joint or tendon."""
+    result = {}
+    rates = _channels(m, demonstration, RATE_SENSORS[kind])
+    for target, channel in _channels(m, demonstration, kind).items():
+        rate = rates.get(target)
+        if (signal := smoother.signal(channel, rate, "joint")) is not None:
+            result[target] = (signal, rate)
+    return result
+
+
+def _channels(m: mujoco.MjModel, demonstration: Demonstration, kind: mujoco.mjtSensor) -> dict[int, Channel]:
+    """Return the channels of the sensors of a kind by the id of their joint or tendon; the first of several alike."""
+    found: dict[int, Channel] = {}
+    for name, channel in demonstration.measured.items():
+        row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if row >= 0 and int(m.sensor_type[row]) == int(kind):
+            found.setdefault(int(m.sensor_objid[row]), channel)
+    return found
+
+
+def _tendon_coefficients(m: mujoco.MjModel, tendon: int, column: dict[int, int]) -> np.ndarray | None:
+    """Return the coefficients (J,) of the joints in the length of a tendon; None if sites guide it."""
+    result = np.zeros(len(column))
+    start = int(m.tendon_adr[tendon])
+    for wrap in range(start, start + int(m.tendon_num[tendon])):
+        if int(m.wrap_type[wrap]) != int(mujoco.mjtWrap.mjWRAP_JOINT):
+            return None
+        result[column[int(m.wrap_objid[wrap])]] += m.wrap_prm[wrap]
+    return result
+
+
+def _equalities(m: mujoco.MjModel, column: dict[int, int]) -> list[tuple[np.ndarray, float]]:
+    """Return the sums of joint positions that active linear joint equalities keep constant: coefficients, constant."""
+    result = []
+    for row in range(m.neq):
+        first, second = int(m.eq_obj1id[row]), int(m.eq_obj2id[row])
+        constant, slope, *curved = m.eq_data[row, :5]
+        linear = int(m.eq_type[row]) == int(mujoco.mjtEq.mjEQ_JOINT) and not np.any(curved)
+        if not (linear and m.eq_active0[row] and first in column):
+            continue
+        coefficients = np.zeros(len(column))
+        coefficients[column[first]] = 1.0
+        total = m.qpos0[m.jnt_qposadr[first]] + constant
+        if second >= 0:
+            coefficients[column[second]] = -slope
+            total -= slope * m.qpos0[m.jnt_qposadr[second]]
+        result.append((coefficients, float(total)))
+    return result
