@@ -78,7 +78,7 @@ def test_departures_from_the_truth_are_as_large_as_the_standard_errors(cfg):
             ]
         )
     # The median of a squared standard normal deviate is 0.455. Polynomials estimate the noise from few readings;
-    # splines allow for a jerk of white noise, which this motion does not have: their errors are at most 3 times too large.
+    # splines allow for a jerk of white noise, which this motion lacks: their errors are at most 3 times too large.
     ratio = np.median(np.array(squares), axis=(0, 2)) / 0.455
     assert np.all(ratio > 1 / 9)
     assert np.all(ratio < 3)

@@ -24,7 +24,6 @@ from concent_warp.errors import RecordingError
 from concent_warp.simulate.engine import ContactLog, Engine, Variants
 
 if TYPE_CHECKING:
-    from concent_warp.estimation.signals import 
     from concent_warp.estimation.state_estimator import StateEstimator
 
 SHARES = (np.arange(5) + 0.5) / 5
