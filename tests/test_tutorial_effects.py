@@ -94,9 +94,9 @@ def test_the_front_page_tells_the_same_figures():
     (found,) = re.findall(r"Missing: joint_friction \(torque\[hinge\] (.*? N m)\)", PAGE)
     assert f"# joint friction, {found}\n" in front
     (before,) = re.findall(r"hinge_position .*│ +([\d.]+) x │\n├.*\n│ marker_position .* 1.4 x", PAGE)
-    assert f"# the encoder sees {before} x its noise\n" in front
+    assert f"# the encoder is off by {before} x its noise\n" in front
     (change, after) = re.findall(r"hinge_position .* (-\d+ %) .*│ +([\d.]+) x │\n", PAGE)[0]
-    assert f"# {after} x noise: {change}\n" in front
+    assert f"# {after} x noise, {change}\n" in front
     assert "](docs/images/hidden_effect.png)" in front
 
 

@@ -46,7 +46,8 @@ class Residual:
     """How far off, shape (T,): Euclidean norm, rotation angle, mean distance of the visible points from where the model
     has them; NaN where nothing was measured, infinite where the model has diverged."""
     noise: float | None
-    """Mean error that the measurement noise alone would leave with a perfect model, where it can be told."""
+    """RMS error that the measurement noise alone would leave with a perfect model, in `unit`: the noise floor. Of
+    points the mean distance, which hardly varies over time. None where the noise is unknown."""
     std: float | None = None
     """Standard deviation of the noise of each component of `value`, where it can be told; of points that of one."""
     source: Source = "unknown"
@@ -58,7 +59,7 @@ class Residual:
 
     @property
     def ratio(self) -> np.ndarray | None:
-        """Error over the noise floor [-], shape (T,); 1 on average where the model is right. None without a floor."""
+        """Error over the noise floor [-], shape (T,); RMS 1 where the model is right. None without a floor."""
         return self.error / self.noise if self.noise else None
 
 
@@ -145,7 +146,7 @@ def _sensor_residual(
         time=channel.time,
         value=value,
         error=_lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
-        noise=None if std is None else std * _mean_norm(value.shape[1]),
+        noise=None if std is None else std * float(np.sqrt(value.shape[1])),
         std=std,
         source=noise.source,
         extent=_extent(channel.value, kind),

@@ -45,9 +45,9 @@ class Summary:
     """95th percentile."""
     max: float
     noise: float | None
-    """Mean error that the measurement noise alone would leave, where it can be told."""
+    """RMS error that the measurement noise alone would leave, in `unit`; None where the noise is unknown."""
     ratio: float | None
-    """Mean over that noise floor [-]."""
+    """RMS error over that noise floor [-]: "x noise"."""
     source: Source
     """Where the noise is from."""
 
@@ -85,8 +85,8 @@ class Comparison:
         >>> comparison = cw.compare(cw.Model.from_recording(recording), recording)
         >>> comparison.channels
         ('hinge_position', 'marker_position')
-        >>> round(comparison.summarise("model", "hinge_position").ratio)  # error over noise
-        8
+        >>> round(comparison.summarise("model", "hinge_position").ratio)  # RMS error over noise
+        7
     """
 
     models: Mapping[str, Model]
@@ -180,8 +180,8 @@ class Comparison:
         noises = [(r.noise, mask.sum()) for r, mask in found if r.noise is not None]
         weight = sum(n for _, n in noises)
         sources: list[Source] = [r.source for r, _ in found if r.noise is not None]
-        noise = float(sum(noise * n for noise, n in noises) / weight) if weight else None
-        mean = _statistic(np.mean, pooled)
+        noise = float(np.sqrt(sum(noise**2 * n for noise, n in noises) / weight)) if weight else None
+        rms = _statistic(lambda e: np.sqrt(np.mean(e**2)), pooled)
         return Summary(
             model=model,
             channel=channel,
@@ -189,14 +189,14 @@ class Comparison:
             unit=found[0][0].unit,
             count=len(pooled),
             effective=effective_count([p for p in parts if np.isfinite(p).all()]),
-            mean=mean,
+            mean=_statistic(np.mean, pooled),
             low=low,
             high=high,
-            rms=_statistic(lambda e: np.sqrt(np.mean(e**2)), pooled),
+            rms=rms,
             p95=_statistic(lambda e: np.percentile(e, 95), pooled),
             max=_statistic(np.max, pooled),
             noise=noise,
-            ratio=mean / noise if noise else None,
+            ratio=rms / noise if noise else None,
             source=sources[0] if sources else "unknown",
         )
 

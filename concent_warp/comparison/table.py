@@ -27,7 +27,7 @@ def _cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[s
     Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
 
     Per channel and phase: number of samples, mean error of each model with its 95 % interval, RMS, 95th percentile and
-    largest error of the last, noise floor and how many times that the mean is; with two models or more also the change
+    largest error of the last, noise floor and the RMS error over it; with two models or more also the change
     of the mean, with its interval.
     """
     several = len(comparison.models) > 1

@@ -1,9 +1,9 @@
-"""The section of a report that shows a diagnosis: what is missing, how sure that is, and what to measure next.
+"""The section of a report that shows a diagnosis: what is missing with its evidence, and what to measure next.
 
 It reads the JSON object that a diagnosis prints: `verdict` ("effect", "group", "none_needed" or "none_of_these");
-`effects`, the best first, each with `name`, `family`, `gain` (share of the held-out error that it takes away) with
+`effects`, the best first, each with `name`, `family`, `gain` (share of the held-out error that it removes) with
 `interval`, `p`, `parameters` with `value`, `interval` and `unit`, and whether it was `accepted`; `groups` of names that
-the data cannot tell apart; `where`; `unexplained` (share); `detectable`; `next_experiment`. What is not there is left
+the data cannot distinguish; `where`; `unexplained` (share); `detectable`; `next_experiment`. What is not there is left
 out of the section.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.comparison.units import words
+from concent_warp.comparison.units import p_value_text, words
 from concent_warp.report.tables import Row, table
 
 MOST_EFFECTS = 10
@@ -41,7 +41,7 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     if groups := [group for group in diagnosis.get("groups") or [] if len(group) > 1]:
         found += [f"<p>{escape(_group_sentence(group))}</p>" for group in groups]
     if effects:
-        found += ["<h3>Held-out error that each effect takes away</h3>", _bars(effects)]
+        found += ["<h3>Held-out error that each effect removes</h3>", _bars(effects)]
     if parameters := _parameter_rows(effects):
         found += [
             "<h3>Parameters</h3>",
@@ -50,7 +50,7 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     if where := _places(diagnosis.get("where")):
         found += ["<h3>Where it shows</h3>", bullet_list(where)]
     if limits := _detectable_rows(diagnosis.get("detectable")):
-        about = "<summary>Smallest effects that would have been seen</summary>"
+        about = "<summary>Smallest detectable effects</summary>"
         opened = " open" if diagnosis.get("verdict") == "none_needed" else ""
         found.append(f"<details{opened}>{about}{table(['effect', 'size', 'unit'], limits, 1)}</details>")
     if experiment := _sentences(diagnosis.get("next_experiment")):
@@ -76,8 +76,8 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
             return f"The model lacks {names}. {_gain_sentence(best)}{left}"
         case "group":
             group = next((g for g in diagnosis.get("groups") or [] if len(g) > 1), [e["name"] for e in effects])
-            names = _listed([words(name) for name in group], "or")
-            return f"The model lacks something, and the data cannot tell whether it is {names}.{left}"
+            names = _listed([words(name) for name in group])
+            return f"The model lacks something, and the data cannot distinguish between {names}.{left}"
         case "none_needed":
             return "No discrepancy was detected: the model explains the measurements down to their noise."
         case "none_of_these" if any(_accepted(e) for e in effects):
@@ -92,15 +92,15 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
 
 
 def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
-    """Return what the first effects gain on data that their fits have not seen."""
+    """Return a sentence on the held-out gains of effects."""
     parts = []
     for e in effects:
         value, interval = _estimate(e.get("gain"), e)
         if value is not None:
             what = f"{words(str(e['name']))} " if len(effects) > 1 else "it "
-            p = _p_text(e.get("p"))
+            p = _p_text(e)
             parts.append(
-                f"{what}takes away {_share(value)}{_interval_text(interval)} of the error{f' ({p})' if p else ''}"
+                f"{what}removes {_share(value)}{_interval_text(interval)} of the error{f' ({p})' if p else ''}"
             )
     return f"On data that the fit has not seen, {', '.join(parts)}." if parts else ""
 
@@ -112,8 +112,8 @@ def _family_text(effect: Mapping[str, Any]) -> str:
 
 
 def _group_sentence(group: Sequence[str]) -> str:
-    """Return a sentence on effects that cannot be told apart."""
-    return f"These data cannot tell {_listed([words(name) for name in group], 'from')} apart."
+    """Return a sentence on effects that the data cannot distinguish."""
+    return f"These data cannot distinguish between {_listed([words(name) for name in group])}."
 
 
 def _accepted(effect: Mapping[str, Any]) -> bool:
@@ -162,7 +162,7 @@ def _bars(effects: Sequence[Mapping[str, Any]]) -> str:
         name = escape(words(str(e.get("name", "?"))))
         rows.append(
             f'<div class="effect {style}"><span class="name">{name}</span><span class="track">{marks}</span>'
-            f'<span class="figure">{text} <span class="quiet">{_p_text(e.get("p"))}</span></span></div>'
+            f'<span class="figure">{text} <span class="quiet">{escape(_p_text(e))}</span></span></div>'
         )
     shown = f'<div class="bars">{"".join(rows[:MOST_EFFECTS])}</div>'
     if rest := rows[MOST_EFFECTS:]:
@@ -187,7 +187,7 @@ def _parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _detectable_rows(given: Any) -> list[Row]:
-    """Return the rows of the table of the smallest effects that would have been seen."""
+    """Return the rows of the table of the smallest detectable effects."""
     if isinstance(given, Mapping):
         given = [{"name": name, **(v if isinstance(v, Mapping) else {"value": v})} for name, v in given.items()]
     rows: list[Row] = []
@@ -199,7 +199,7 @@ def _detectable_rows(given: Any) -> list[Row]:
 
 
 def _places(given: Any) -> list[str]:
-    """Return where a diagnosis sees the effect as sentences: objects with a channel, a phase, a time span and so on."""
+    """Return where the model fails as sentences, from objects with a channel, a phase, a time span and so on."""
     items = [given] if isinstance(given, Mapping | str) else list(given or [])
     found = []
     for item in items:
@@ -258,8 +258,9 @@ def _interval_text(interval: tuple[float, float] | None) -> str:
     return "" if interval is None else f" [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
 
 
-def _p_text(p: Any) -> str:
-    """Return a p value as text."""
+def _p_text(effect: Mapping[str, Any]) -> str:
+    """Return the p-value of an effect as text, empty where it has none."""
+    p, smallest = effect.get("p"), effect.get("p_smallest")
     if not isinstance(p, int | float):
         return ""
-    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+    return p_value_text(p, smallest if isinstance(smallest, int | float) else 0.0)

@@ -15,9 +15,11 @@ from concent_warp.events.sequence import ContactEventSequence
 NULL = "no contact"
 """Name of the model whose objects do not touch one another, where a comparison has one."""
 AT_NOISE = 1.2
-"""A mean error below this many times the noise floor is as good as the floor."""
+"""RMS error over the noise below which an error counts as noise [-]."""
 ENOUGH_OVERLAP = 0.8
-"""Overlap of contact frames with the truth from which the contact counts as reproduced."""
+"""Overlap of contact frames with the truth above which the contact counts as reproduced [-]."""
+OVERLAP_STEP = 0.02
+"""Change of the overlap above which it counts as risen or fallen [-]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def cards(
         ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
         if ends:
             figure = _arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
-            found.append(Card("Overlap (IoU) of object contact with the truth; 1 is perfect", figure))
+            what = "Overlap (IoU) of the contact times with the truth; 1 is perfect"
+            found.append(Card(what, figure, _overlap_note(ends[0], ends[-1])))
     if comparison.staged and any(sequence.stages for sequence in events.values()):
         counts = sorted({len(sequence.stages) for sequence in events.values()})
         names = " · ".join(dict.fromkeys(stage.name for s in events.values() for stage in s.stages))
@@ -69,22 +72,34 @@ def cards(
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)
         figure = f"{shown(null.mean, null.unit)} <small>{unit_shown(null.unit)}</small>"
-        note = f"Measurement noise alone would leave {noise}." if noise else ""
+        note = f"Measurement noise alone would leave {noise} (RMS)." if noise else ""
         found.insert(
             bool(seen) + bool(unseen), Card("The same error if objects did not touch one another", figure, note)
         )
     elif noise:
-        found.append(Card("Error that the measurement noise alone would leave", noise))
+        found.append(Card("RMS error that the measurement noise alone would leave", noise))
     return found
 
 
 def _above_noise(summary: Summary) -> str:
-    """Return how far a mean error stands above the noise, as the end of a sentence; empty where it cannot be told."""
+    """Return the RMS error over the noise, as the end of a sentence; empty where the noise is unknown."""
     if summary.ratio is None or not np.isfinite(summary.ratio):
         return ""
     if summary.ratio < AT_NOISE:
-        return ", as much as the measurement noise alone would leave"
-    return f", {times(summary.ratio)} what the measurement noise alone would leave"
+        return f", at the level of the measurement noise ({times(summary.ratio)} noise)"
+    return f" ({times(summary.ratio)} noise)"
+
+
+def _overlap_note(before: float, after: float) -> str:
+    """Return what a change of the overlap of contact means, as HTML; empty where it stays."""
+    if after < before - OVERLAP_STEP:
+        return (
+            '<b class="bad">It falls:</b> the objects of the fitted model touch at other times than in truth, so that '
+            "the motion is reproduced with less realistic contact."
+        )
+    if after > before + OVERLAP_STEP:
+        return '<b class="good">It rises:</b> the objects touch more nearly at the true times.'
+    return ""
 
 
 def _error_card(
@@ -145,7 +160,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
             text += ": this error alone does not show that the contact is right."
     ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
     if ends and ends[-1] < ENOUGH_OVERLAP:
-        text += f" The contact itself overlaps with the truth by only {ends[-1]:.2f}."
+        text += f" The contact times overlap with the truth by only {ends[-1]:.2f}."
     if unseen := tuple(d for d in comparison.demonstrations if fitted and d not in fitted):
         held = comparison.difference(channel, phases, unseen)
         if held.verdict != "fallen":

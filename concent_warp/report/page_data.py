@@ -14,6 +14,7 @@ from concent_warp.comparison.worst_spans import WorstSpan
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.motion_data import motion_data
+from concent_warp.report.opening import first_demonstration, openings
 from concent_warp.report.scene_data import geometry_data, packed, scene_bodies
 from concent_warp.report.where import numbered
 from concent_warp.simulate.replay import initial_state
@@ -42,6 +43,7 @@ def page_data(
     bodies, meshes = scene_bodies(last.scene.model)
     names = [body["name"] for body in bodies]
     engines = {name: make_engine("mujoco", model) for name, model in models.items()}
+    opened = openings(comparison, [d.name for d in demonstrations])
     found = [
         {
             "name": d.name,
@@ -51,12 +53,14 @@ def page_data(
             "channels": _channel_lines(comparison, d.name),
             "schedule": _schedule_data(events[d.name]) if d.name in events else None,
             "motion": motion_data(models, engines, d, names),
+            "opening": {"channel": opened[d.name].channel, "time": opened[d.name].time},
         }
         for d in demonstrations
     ]
     return {
         "models": [{"name": name, "kind": kind_of(comparison, name)} for name in comparison.models],
         "shown": list(models),
+        "first": first_demonstration(opened),
         "bodies": [{"name": body["name"], "geoms": body["geoms"]} for body in bodies],
         "meshes": meshes,
         "geometry": geometry_data(models, events),

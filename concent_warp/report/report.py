@@ -104,8 +104,9 @@ def write_report(
         "geometry": _geometry_section(data, comparison, shown_models),
         "fit": _fit_section(fit),
         "tables_about": escape(
-            f"Mean error over time with its 95 % interval ({RULE}); RMS, 95th percentile, largest error and noise "
-            f"floor of “{comparison.after}”. Green and red changes are those whose interval excludes none."
+            f"Mean error over time with its 95 % interval ({RULE}); RMS, 95th percentile, largest error, noise floor "
+            f"(RMS) and RMS error over it (x noise) of “{comparison.after}”. Green and red changes are those whose "
+            "interval excludes none."
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),

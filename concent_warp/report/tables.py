@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.result import Comparison, Summary
-from concent_warp.comparison.units import percent, shown, unit_shown
+from concent_warp.comparison.units import percent, shown, times, unit_shown
 
 Row = tuple[str, Sequence[str]]
 """Class of a table row and its cells as HTML."""
@@ -52,7 +52,7 @@ def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool
     several = len(comparison.models) > 1
     header = ["channel", "unit", "samples", *(f"mean, {escape(name)}" for name in comparison.models)]
     header += ["change"] if several else []
-    header += ["RMS", "p95", "max", "noise"]
+    header += ["RMS", "p95", "max", "noise", "x noise"]
     rows: list[Row] = []
     for channel, phase in comparison.rows():
         if channel not in channels or (phase and not phases):
@@ -65,6 +65,7 @@ def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool
         cells = [name, unit_shown(last.unit), str(last.count), *map(_mean_cell, summaries)]
         cells += [_change_cell(comparison, channel, phase)] if several else []
         cells += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
+        cells.append("-" if last.ratio is None else times(last.ratio))
         rows.append(("phase-row" if phase else "", cells))
     return table(header, rows, 2)
 

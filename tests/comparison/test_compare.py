@@ -74,7 +74,7 @@ def comparison():
 
 def test_the_true_model_is_off_by_no_more_than_the_noise(comparison):
     summary = comparison.summarise("right", "rail")
-    assert summary.mean == pytest.approx(summary.noise, rel=0.15)
+    assert summary.rms == pytest.approx(summary.noise, rel=0.15)
     assert summary.low < summary.mean < summary.high
     assert summary.count == 2 * len(TIME)
     assert comparison.summarise("right", "cart").max < 1e-9
@@ -217,7 +217,7 @@ def test_without_stages_the_ways_of_moving_are_the_phases():
 
 def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):
     wrong, right = (comparison.summarise(name, "rail") for name in ("wrong", "right"))
-    assert wrong.ratio == pytest.approx(wrong.mean / wrong.noise)
+    assert wrong.ratio == pytest.approx(wrong.rms / wrong.noise)
     assert right.ratio == pytest.approx(1, rel=0.15)
     assert (wrong.source, comparison.summarise("wrong", "cart").source) == ("stated", "differences")
     assert "| x noise |" in markdown_table(comparison)

@@ -23,7 +23,7 @@ def effect(name, gain, p, **rest):
 
 NAMED = {
     "verdict": "effect",
-    "effects": [effect("joint_friction", 0.62, 0.0004), effect("armature", 0.04, 0.4)],
+    "effects": [effect("joint_friction", 0.62, 1 / 401, p_smallest=1 / 401), effect("armature", 0.04, 0.4)],
     "groups": [],
     "where": [{"channel": "hinge_position", "phase": "free", "start": 1.2, "end": 2.5, "direction": "against motion"}],
     "unexplained": 0.043,
@@ -39,7 +39,7 @@ def words_of(section):
 def test_an_effect_is_named_with_its_gain_interval_p_and_parameter():
     text = words_of(diagnosis_section(NAMED))
     assert "The model lacks joint friction (joints and drives)." in text
-    assert "it takes away 62 % [52, 72] of the error (p < 0.001)" in text
+    assert "it removes 62 % [52, 72] of the error (p <= 0.0025)" in text
     assert "4 % of the error stays unexplained" in text
     assert "torque[hinge] 0.02134 0.0195 to 0.0231 N m" in text
     assert "hinge position, free phase, 1.20-2.50 s, against motion" in text
@@ -51,15 +51,15 @@ def test_several_accepted_effects_are_all_named():
     both = {**NAMED, "effects": [effect("joint_friction", 0.4, 0.001), effect("load_friction", 0.3, 0.01)]}
     text = _headline(both)
     assert "lacks joint friction (joints and drives) and load friction (joints and drives)." in text
-    assert "joint friction takes away 40 % [30, 50] of the error (p = 0.001), load friction takes away 30 %" in text
+    assert "joint friction removes 40 % [30, 50] of the error (p = 0.001), load friction removes 30 %" in text
 
 
 def test_a_group_is_never_told_as_one_winner():
     tied = {**NAMED, "verdict": "group", "groups": [["sliding_friction", "mass"]]}
     tied["next_experiment"] = {"sentence": "Push the block empty and loaded."}
     text = words_of(diagnosis_section(tied))
-    assert "cannot tell whether it is sliding friction or mass" in text
-    assert "These data cannot tell sliding friction from mass apart." in text
+    assert "cannot distinguish between sliding friction and mass" in text
+    assert "These data cannot distinguish between sliding friction and mass." in text
     assert "Next experiment Push the block empty and loaded." in text
     assert "The model lacks joint friction" not in text
 
@@ -81,7 +81,7 @@ def test_what_was_found_is_named_beside_what_no_effect_explains():
         "none of the effects in the library explains, beside what joint friction or mass and drag can account" in text
     )
     assert "lacks joint friction" not in text
-    assert "joint friction takes away 50 % [40, 60] of the error (p = 0.001), drag takes away 20 %" in text
+    assert "joint friction removes 50 % [40, 60] of the error (p = 0.001), drag removes 20 %" in text
     assert "wind" not in text
     assert "30 % of the error stays unexplained" in text
 
@@ -109,7 +109,7 @@ def test_missing_entries_and_flat_forms_are_taken():
     flat = {"verdict": "effect", "effects": [{"name": "mass", "gain": 0.2, "gain_interval": [0.1, 0.3], "p": 0.01}]}
     flat["effects"][0]["parameters"] = {"scale": {"value": 1.2, "interval": [1.1, 1.3], "unit": "-"}}
     text = words_of(diagnosis_section(flat))
-    assert "it takes away 20 % [10, 30] of the error" in text
+    assert "it removes 20 % [10, 30] of the error" in text
     assert "scale 1.2 1.1 to 1.3" in text
     assert diagnosis_section(None) == ""
     assert "ended with" in words_of(diagnosis_section({"verdict": "odd"}))

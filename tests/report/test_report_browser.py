@@ -7,6 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
+from concent_warp.report.opening import first_demonstration, openings
+
 BROWSER = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
@@ -36,6 +38,14 @@ def test_the_console_is_silent_and_the_scripts_come_to_their_end(opened):
     dom, messages = opened
     assert messages == []
     assert 'data-ready="yes"' in dom
+
+
+def test_the_page_opens_on_the_channel_farthest_above_its_noise_at_its_largest_error(opened, case):
+    dom, _ = opened
+    found = openings(case.comparison, ["demo_0", "demo_1"])
+    expected = found[first_demonstration(found)]
+    assert re.search(r'id="errors-title">Error of (\S+) \[', dom)[1] == expected.channel
+    assert re.search(r'id="clock">([\d.]+) s', dom)[1] == f"{expected.time:.2f}"
 
 
 def test_charts_are_drawn_with_phases_noise_floor_and_every_model(opened, case):

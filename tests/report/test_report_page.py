@@ -1,6 +1,7 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from html import escape
 from itertools import pairwise
 
@@ -12,6 +13,8 @@ from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.units import shown
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.report.headline import _overlap_note
+from concent_warp.report.opening import first_demonstration, openings
 from concent_warp.report.report import _filled, write_report
 from concent_warp.report.scene_data import scene_bodies
 from concent_warp.report.where import numbered, shown_demonstrations
@@ -194,7 +197,7 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     models = {"model": Model(Scene(PENDULUM))}
     write_report(tmp_path / "r.html", recording, compare_replays(models, recording, "mujoco"))
     text = (tmp_path / "r.html").read_text()
-    assert "as much as the measurement noise alone would leave" in text
+    assert "at the level of the measurement noise (" in text
     assert "Nowhere does the error stand above 3 times the noise" in text
     assert "Noise: stated in the recording." in text
     assert embedded(tmp_path / "r.html")["places"] == []
@@ -255,3 +258,37 @@ def test_meshes_of_any_size_stay_small(tmp_path):
 
 def test_what_is_put_into_a_template_is_not_looked_at_again():
     assert _filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"
+
+
+def test_the_page_opens_on_the_channel_farthest_above_its_noise_at_its_largest_error(case):
+    found = openings(case.comparison, ["demo_0", "demo_1"])
+    for name, opening in found.items():
+        ratios = {
+            r.channel: float(np.sqrt(np.nanmean(r.error**2)) / r.noise)
+            for r in case.comparison.residuals["after", name]
+            if r.noise
+        }
+        assert opening.channel == max(ratios, key=ratios.__getitem__)
+        assert opening.ratio == pytest.approx(ratios[opening.channel])
+        residual = case.comparison.residual("after", name, opening.channel)
+        assert opening.time == residual.time[np.nanargmax(residual.error)]
+    assert first_demonstration(found) == max(found, key=lambda name: found[name].ratio)
+
+
+def test_where_the_last_model_is_at_the_noise_the_page_opens_on_the_error_of_the_first(case):
+    right = replace(case.comparison, models={"before": case.before, "no contact": case.after})
+    quiet = {
+        key: tuple(replace(r, error=0 * r.error) for r in rows) if key[0] == "no contact" else rows
+        for key, rows in case.comparison.residuals.items()
+    }
+    found = openings(replace(right, residuals=quiet), ["demo_0"])["demo_0"]
+    assert found.ratio > 3
+    residual = case.comparison.residual("before", "demo_0", found.channel)
+    assert found.time == residual.time[np.nanargmax(residual.error)]
+
+
+@pytest.mark.parametrize(("after", "note"), [(0.3, "It falls:"), (0.6, "It rises:"), (0.41, "")])
+def test_the_overlap_card_says_what_a_change_means(after, note):
+    found = _overlap_note(0.41, after)
+    assert note in found
+    assert bool(found) == bool(note)

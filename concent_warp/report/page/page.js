@@ -278,10 +278,8 @@ function drawFit() {
 function setDemonstration(name) {
   state.demonstration = data.demonstrations.find((d) => d.name === name);
   $("time").max = state.demonstration.duration;
-  const worst = placesHere()[0];
-  const main = state.demonstration.channels[0].name;
-  if (worst) $("channel").value = worst.channels.includes(main) ? main : worst.channels[0];
-  drawTimeline(); drawErrors(); drawSchedule(); setTime(worst ? worst.peak : state.demonstration.measured_until); aimReplay();
+  $("channel").value = state.demonstration.opening.channel;
+  drawTimeline(); drawErrors(); drawSchedule(); setTime(state.demonstration.opening.time); aimReplay();
 }
 function showPlace(place) {
   setPlaying(false);
@@ -307,7 +305,6 @@ setUpGeometry();
 setUpForces();
 drawFit();
 state.log = $("log").checked;
-const first = data.demonstrations.find((d) => d.name === data.places[0]?.demonstration) || data.demonstrations[0];
-$("demonstration").value = first.name;
-setDemonstration(first.name);
+$("demonstration").value = data.first;
+setDemonstration(data.first);
 document.documentElement.dataset.ready = "yes";
