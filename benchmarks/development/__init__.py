@@ -1,0 +1,1 @@
+"""The project as software: what its tests notice."""
