@@ -1,7 +1,7 @@
 """A robot, objects and a log of one's own: from arrays to a recording, a fitted model and its contact events.
 
-The robot is a gantry with two fingers; it picks up a block and pushes it into the corner of a bracket. No such gantry
-is at hand, so plain MuJoCo with exact boxes plays it and keeps the log. With a real one, only `read_log` changes.
+The robot is a gantry with two fingers; it picks up a block and pushes it into the corner of a bracket. Plain
+MuJoCo with exact boxes plays the gantry and keeps the log. With a real one, only `read_log` changes.
 
     python examples/own_robot.py [FOLDER]
 """
@@ -95,13 +95,12 @@ def read_log() -> Demonstration:
     readings = []
     for row in command:
         data.ctrl[:] = row
-        mujoco.mj_step(model, data)
+        mujoco.mj_step(model, data)  # leaves the readings of the state before the step
         readings.append(data.sensordata + rng.normal(0, 2e-4, model.nsensordata))
-    after = time + model.opt.timestep
     measured = {}
     for i in range(model.nsensor):
         rows = slice(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i])
-        measured[model.sensor(i).name] = Channel(after, np.array(readings)[:, rows])
+        measured[model.sensor(i).name] = Channel(time, np.array(readings)[:, rows])
     action = {model.actuator(i).name: Channel(time, command[:, i]) for i in range(model.nu)}
     task = "push the block into the corner of the bracket"
     return Demonstration("demo_0", task, qpos=qpos, qvel=qvel, action=action, measured=measured)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+
+import concent_warp
 
 HEAVY = {
     *("torch", "warp", "mujoco_warp", "newton", "rsl_rl"),
@@ -55,6 +58,14 @@ def loaded_by(*names: str) -> set[str]:
     """Return the top-level packages that an interpreter holds after importing modules."""
     lines = [f"import {name}" for name in names]
     return set(python("-c", "\n".join([*lines, "import sys", "print(*sys.modules)"])).split())
+
+
+def test_api_reference_lists_every_public_name_once(root):
+    pages = [path.read_text() for path in (root / "docs" / "api").glob("*.md")]
+    listed = re.findall(r"^::: concent_warp\.(\w+)$", "\n".join(pages), re.MULTILINE)
+    assert sorted(listed) == sorted(name for name in concent_warp.__all__ if not name.startswith("_"))
+    index = (root / "docs" / "api" / "index.md").read_text()
+    assert [name for name in listed if f"`{name}`" not in index] == []
 
 
 def test_package_imports_within_a_second_and_loads_nothing_heavy():

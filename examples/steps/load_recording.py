@@ -1,8 +1,8 @@
-"""What a recording holds: demonstrations, channels, rates and gaps.
+"""Load a recording: its demonstrations, channels, rates and gaps.
 
-    python examples/read_recording.py RECORDING
+    python examples/steps/load_recording.py [RECORDING]
 
-The recording is an HDF5 file, a folder of CSV files, or ContactNets tosses; `concent record` writes one to look at.
+The recording is a file or folder in any format of docs/recording.md; by default one that comes with the package.
 """
 
 import sys
@@ -10,15 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from concent_warp.errors import ConcentError
-from concent_warp.recording.load import load_recording
-from concent_warp.scene.scene import Scene
+import concent_warp as cw
 
 
 def main(path: Path) -> None:
     """Print a line for each channel."""
-    recording = load_recording(path)
-    print(f"{path}: objects {', '.join(Scene(recording.scene).objects())}")
+    recording = cw.load_recording(path)
+    print(f"{path}: objects {', '.join(cw.Scene(recording.scene).objects())}")
     for demonstration in recording.demonstrations:
         print(f"{demonstration.name}: {demonstration.task or 'no task given'}, {demonstration.duration:.2f} s")
         for kind in ("action", "measured", "points", "image"):
@@ -34,6 +32,6 @@ def main(path: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        main(Path(sys.argv[1]))
-    except ConcentError as error:
+        main(Path(sys.argv[1]) if len(sys.argv) > 1 else cw.example("servo"))
+    except cw.ConcentError as error:
         sys.exit(str(error))
