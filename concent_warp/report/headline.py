@@ -22,6 +22,19 @@ OVERLAP_STEP = 0.02
 """Change of the overlap above which it counts as risen or fallen [-]."""
 
 
+def headline_channel(comparison: Comparison) -> str:
+    """Return the channel that the headline is about.
+
+    With contact stages the main channel, the motion of an object; otherwise the one farthest above its noise in the
+    first model.
+    """
+    if comparison.staged:
+        return comparison.main_channel()
+    ratios = {channel: comparison.summarise(comparison.before, channel).ratio for channel in comparison.channels}
+    known = {channel: ratio for channel, ratio in ratios.items() if ratio is not None and not np.isnan(ratio)}
+    return max(known, key=lambda channel: known[channel]) if known else comparison.main_channel()
+
+
 @dataclass(frozen=True)
 class Card:
     """One figure; `figure` and `note` are HTML."""
@@ -46,7 +59,7 @@ def cards(
     overlap: Mapping[str, Mapping[str, float]],
 ) -> list[Card]:
     """Return the cards of a report."""
-    channel, phases = comparison.main_channel(), comparison.contact_phases()
+    channel, phases = headline_channel(comparison), comparison.contact_phases()
     where = f"Mean error of {words(channel)}" + (f", {' + '.join(phases)}" if phases else "")
     unseen = tuple(d for d in comparison.demonstrations if fitted and d not in fitted)
     seen = tuple(d for d in comparison.demonstrations if d not in unseen)
@@ -131,7 +144,7 @@ def _arrow(ends: Sequence[str], unit: str) -> str:
 
 def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
     """Return what the figures mean, in one or two sentences."""
-    channel, phases = comparison.main_channel(), comparison.contact_phases()
+    channel, phases = headline_channel(comparison), comparison.contact_phases()
     after = comparison.summarise(comparison.after, channel, phases)
     unit = unit_shown(after.unit)
     during = f" during {' and '.join(phases)}" if phases else ""

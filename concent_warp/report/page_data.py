@@ -13,6 +13,7 @@ from concent_warp.comparison.units import SHOWN, unit_shown, words
 from concent_warp.comparison.worst_spans import WorstSpan
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.report.headline import headline_channel
 from concent_warp.report.motion_data import motion_data
 from concent_warp.report.opening import first_demonstration, openings
 from concent_warp.report.scene_data import geometry_data, packed, scene_bodies
@@ -195,8 +196,8 @@ def _extent(compiled: mujoco.MjModel, body: int) -> float:
 
 
 def ordered_channels(comparison: Comparison) -> list[str]:
-    """Return the channels with the main one first."""
-    main = comparison.main_channel()
+    """Return the channels with the headline one first."""
+    main = headline_channel(comparison)
     return [main, *(channel for channel in comparison.channels if channel != main)]
 
 

@@ -17,7 +17,7 @@ from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_text
 from concent_warp.report.diagnosis import bullet_list, diagnosis_section
-from concent_warp.report.headline import cards, verdict
+from concent_warp.report.headline import cards, headline_channel, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
 from concent_warp.report.where import noise_words, place_list, shown_demonstrations
@@ -94,7 +94,7 @@ def write_report(
         ),
         "schedule": _page_file("schedule.html") if events else "",
         "replay_about": (
-            "The recorded commands, replayed open loop from the recorded initial state. "
+            "The recorded commands, simulated open loop from the recorded initial state. "
             "Green: the measured pose of the objects, or the tracked points where no pose was measured."
         ),
         "follow_options": _options(_follow_order(data, comparison)) + '<option value="">the scene</option>',
@@ -119,8 +119,8 @@ def write_report(
 
 
 def _follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
-    """Return the objects that the camera can go with, first the one that the main channel is about."""
-    main = comparison.main_channel()
+    """Return the objects that the camera can follow, first the one that the headline channel measures."""
+    main = headline_channel(comparison)
     about = {r.body for d in comparison.demonstrations if (r := comparison.residual(comparison.before, d, main))}
     return sorted(data["view"]["bodies"], key=lambda name: name not in about)
 
@@ -131,7 +131,7 @@ def _where_section(comparison: Comparison, shown: Sequence[str]) -> str:
     if len(comparison.models) > 1:
         strips = f" The upper strip is “{comparison.before}”, the lower one “{comparison.after}”."
     about = (
-        f"Every channel over time, coloured by how far its error stands above the measurement noise.{strips} Bands are "
+        f"Every channel over time, coloured by its error over the measurement noise.{strips} Bands are "
         f"{_bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
     )
     return _filled(_page_file("where.html"), {"about": escape(about), "places": place_list(comparison, shown)})
@@ -139,7 +139,7 @@ def _where_section(comparison: Comparison, shown: Sequence[str]) -> str:
 
 def _bands(comparison: Comparison) -> str:
     """Return what the phases of a comparison are."""
-    return "the contact stages" if comparison.staged else "the ways of moving"
+    return "the contact stages" if comparison.staged else "the phases of motion"
 
 
 def _forces(data: Mapping[str, Any], location: Mapping[str, Any] | None) -> list[dict[str, Any]]:
@@ -178,14 +178,15 @@ def _fit_section(fit: FitResult | None) -> str:
 
 
 def _tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
-    """Return all tables: objects by phase, demonstrations, and everything else folded away."""
-    objects = comparison.object_channels
-    others = [c for c in comparison.channels if c not in objects]
-    parts = [error_table(comparison, objects or others, phases=True)]
+    """Return all tables: headline channel and objects by phase, demonstrations, and other channels folded away."""
+    first = {headline_channel(comparison), *comparison.object_channels}
+    shown = [c for c in comparison.channels if c in first]
+    others = [c for c in comparison.channels if c not in first]
+    parts = [error_table(comparison, shown, phases=True)]
     if len(comparison.demonstrations) > 1:
         parts.append("<h3 style='margin-top:18px'>By demonstration</h3>")
         parts.append(demonstration_table(comparison, fitted, overlap))
-    if objects and others:
+    if others:
         parts.append(
             f"<details><summary>{len(others)} further channels</summary>"
             f"{error_table(comparison, others, phases=True)}</details>"

@@ -11,6 +11,7 @@ import numpy as np
 
 from concent_warp.comparison.result import Comparison, Summary
 from concent_warp.comparison.units import percent, shown, times, unit_shown
+from concent_warp.report.headline import headline_channel
 
 Row = tuple[str, Sequence[str]]
 """Class of a table row and its cells as HTML."""
@@ -73,8 +74,8 @@ def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool
 def demonstration_table(
     comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]
 ) -> str:
-    """Return the table of the main channel's error by demonstration."""
-    channel, phases = comparison.main_channel(), comparison.contact_phases()
+    """Return the table of the headline channel's error by demonstration."""
+    channel, phases = headline_channel(comparison), comparison.contact_phases()
     several = len(comparison.models) > 1
     unit = unit_shown(comparison.summarise(comparison.after, channel, phases).unit)
     header = ["demonstration", "", *(f"mean, {escape(name)} [{unit}]" for name in comparison.models)]

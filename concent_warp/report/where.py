@@ -35,7 +35,7 @@ def place_list(comparison: Comparison, shown: Collection[str]) -> str:
     """Return the worst places as a list; those in a demonstration that is `shown` can be clicked."""
     places = numbered(comparison)
     if not places:
-        return f"<p>Nowhere does the error stand above {LEAST:g} times the noise for long.</p>"
+        return f"<p>The error is nowhere above {LEAST:g} x noise.</p>"
     several = len(comparison.demonstrations) > 1
     items = []
     for number, place in places:

@@ -4,12 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment, SuggestedMotion, TimeSeries
+from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, _joined, _number
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from tests.scenes.swinging import swing_scene
+from tests.scenes.swinging import drawing, swing_scene, swung
 
 FRICTION = FittedParameter("torque[hinge]", 0.03, 0.029, 0.031, "N m", 0.0)
 EXPERIMENT = SuggestedExperiment(
@@ -136,3 +138,12 @@ def test_numbers_and_lists_of_names():
     assert _number(np.float64(1.5)) == 1.5
     assert _number(np.inf) is None
     assert [_joined(["a"]), _joined(["a", "b"]), _joined(["a", "b", "c"])] == ["a", "a or b", "a, b or c"]
+
+
+def test_the_suggested_experiment_is_written_with_its_motion(tmp_path, monkeypatch):
+    recording = swung(seconds=0.5)
+    monkeypatch.setattr(Procedure, "run", lambda _: diagnosis(next_experiment=EXPERIMENT))
+    found = diagnose(drawing(recording), recording, out=tmp_path / "kept")
+    assert found.next_experiment is EXPERIMENT
+    document = json.loads((tmp_path / "kept" / "next_experiment.json").read_text())
+    assert document == json.loads(json.dumps(EXPERIMENT.to_json()))

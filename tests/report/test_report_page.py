@@ -198,7 +198,7 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     write_report(tmp_path / "r.html", recording, compare_replays(models, recording, "mujoco"))
     text = (tmp_path / "r.html").read_text()
     assert "at the level of the measurement noise (" in text
-    assert "Nowhere does the error stand above 3 times the noise" in text
+    assert "The error is nowhere above 3 x noise" in text
     assert "Noise: stated in the recording." in text
     assert embedded(tmp_path / "r.html")["places"] == []
 

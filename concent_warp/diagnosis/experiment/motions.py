@@ -87,7 +87,8 @@ class RecordedRange:
         found = list(self.starts)
         for d in self.recording.demonstrations:
             if (measured := self.source.measured(d)) is not None:
-                found += [measured.state(t) for t in np.linspace(0, d.duration, self.cfg.instants + 2)[1:-1]]
+                states = measured.states(np.linspace(0, d.duration, self.cfg.instants + 2)[1:-1])
+                found += list(zip(states.qpos, states.qvel, strict=True))
         return found
 
     def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ def motion_trajectory(model: Model, motion: ProposedMotion, engine: EngineName, 
     rollout = simulator.run(start, ctrl, record=record, bodies=[]).numpy()
     time, qpos, qvel = dt * np.array(record), rollout.qpos[0], rollout.qvel[0]
     joints = {
-        m.joint(j).name: TimeSeries(time, qpos[:, m.jnt_qposadr[j]], joint_unit(m, j))
+        m.joint(j).name: TimeSeries(time, qpos[:, m.jnt_qposadr[j]], joint_unit(m, int(j)))
         for j in np.flatnonzero(np.isin(m.jnt_type, SINGLE))
     }
     objects = {
