@@ -1,18 +1,17 @@
-"""A diagnosis against its alternatives, same data, same split: what do they predict, and what do they blame?
+"""A diagnosis against its alternatives, same data, same split: prediction error and blamed effects.
 
-Three ways to mend a model that lacks something:
+Three methods correct a model that lacks an effect:
 
-- *diagnosis*: `concent diagnose` with its default settings, and the model with all that it accepts;
+- *diagnosis*: `concent diagnose` with its default settings, and the model with all accepted effects;
 - *everything at once*: the parameters of all candidate effects of the library, fitted together with the initial states
-  by bounded robust least squares, and nothing left out afterwards;
+  by bounded robust least squares, without a selection;
 - *sysid toolbox*: MuJoCo's own `mujoco.sysid` (residual, `optimize`, `calculate_intervals`), which fits what a user
-  names; here everything of the scene that is a plain number in MuJoCo and that one would think of (`PLAIN`), from the
-  measured initial states.
+  names; here the plain numbers of the scene that are listed in `PLAIN`, from the measured initial states.
 
-A cause is *blamed* where the 95 % interval of one of its parameters leaves out the value at which it does nothing (for
-the diagnosis: where it is accepted; a group counts as right if the hidden effect is in it). The data sets are of
-`hidden_effects_data.py`, with seeds of their own; what judges is another recording of the same experiment, with another
-seed: windows of it are predicted, each from the measured state as corrected by the first 30 % of the window. The
+An effect is *blamed* where the 95 % interval of one of its parameters excludes its null value (for the diagnosis: where
+it is accepted; a group counts as right if the hidden effect is in it). The data sets are of
+`hidden_effects_data.py`, with other seeds; another recording of the same experiment, with another seed, is used for
+scoring: windows of it are predicted, each from the measured state as corrected by the first 30 % of the window. The
 measured data, their judges and diagnoses are those of `real.py`, which comes first.
 
     python -m benchmarks.diagnose.alternatives                      # what is not done yet, then the page
@@ -156,15 +155,15 @@ def real_cases(args: Args) -> dict[str, Callable[[], Case]]:
 
 
 def keep(name: str, row: dict[str, Any]) -> None:
-    """Keep what came out of a data set."""
+    """Keep the result of a data set."""
     rows = {**read_data(NAME).get("rows", {}), name: row}
     write_data(NAME, {"machine": machine(), "rows": rows})
     errors = ", ".join(f"{way} {r['error']:.2f} {r['blamed']} {r['seconds']:.0f} s" for way, r in row["ways"].items())
-    print(f"{name}: drawing {row['drawing']:.2f}, floor {row['floor']}, {errors}", flush=True)
+    print(f"{name}: nominal {row['nominal']:.2f}, floor {row['floor']}, {errors}", flush=True)
 
 
 def synthetic(case: DataSet) -> dict[str, Any]:
-    """Try all ways on a data set with a hidden effect."""
+    """Try all methods on a data set with a hidden effect."""
     data = make(replace(case, seed=case.seed + SHIFT))
     fresh = make(replace(case, seed=case.seed + FRESH))
     model = Model(data.scene)
@@ -180,7 +179,7 @@ def synthetic(case: DataSet) -> dict[str, Any]:
 
 
 def measured(case: Case) -> dict[str, Any]:
-    """Try all ways on measured data, whose truth nobody knows; the diagnosis is that of `real.py`."""
+    """Try all methods on measured data, whose truth is unknown; the diagnosis is that of `real.py`."""
     judge = case.judges[0]
 
     def error(m: Model) -> float:
@@ -213,7 +212,7 @@ def tried(
     hidden: Sequence[str] | None,
     chosen: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return what each way makes of a recording: error on held-out data, what it blames, time."""
+    """Return for each method: error on held-out data, blamed effects, time."""
     ways = {}
     for name in chosen or WAYS:
         mend = WAYS[name]
@@ -225,7 +224,7 @@ def tried(
             row["right"] = sorted({h for h in hidden for b in blamed if h in b.group})
             row["wrong"] = sorted({b.name for b in blamed if not set(b.group) & set(hidden)})
         ways[name] = row
-    return {"drawing": error(model), "ways": ways}
+    return {"nominal": error(model), "ways": ways}
 
 
 if __name__ == "__main__":

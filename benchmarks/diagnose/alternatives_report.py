@@ -31,37 +31,39 @@ def page(data: dict[str, Any]) -> str:
 
 Written by `benchmarks/diagnose/alternatives.py`; do not edit. {machine_line(data["machine"])}
 
-Three ways to mend a model that lacks something, on the same recordings and judged on the same other recordings:
+`python -m benchmarks.diagnose.alternatives`: three methods correct a model that lacks an effect, on the same recordings,
+and are scored on the same other recordings:
 
-- *diagnosis*: `concent diagnose` with its default settings, and the model with all that it accepts;
-- *everything at once*: the parameters of all candidate effects of the library, fitted together with the initial states
-  by bounded robust least squares, nothing left out afterwards;
-- *sysid toolbox*: MuJoCo's own `mujoco.sysid`, fitting every plain number of the scene that one would think of:
-  friction, damping and armature of joints, gains of drives, masses, inertias, friction and compliance of contacts. What
-  its user would have to write is left out: initial states, lag, play, tilt, instruments.
+- *diagnosis*: `concent diagnose` with default settings; the model with all accepted effects;
+- *everything at once*: the parameters of all candidate effects of the library and the initial states, fitted together
+  by bounded robust least squares without a selection;
+- *sysid toolbox*: `mujoco.sysid`, fitting friction, damping and armature of joints, gains of drives, masses, inertias,
+  friction and compliance of contacts. Initial states, lag, backlash, tilt and sensors are not fitted: a user of the
+  toolbox would have to write these models.
 
-A cause is *blamed* where the 95 % interval of one of its parameters leaves out the value at which it does nothing; for
-the diagnosis, where it is accepted (a group is right if what is hidden is in it).
+An effect is *blamed* where the 95 % interval of one of its parameters excludes its null value; for the diagnosis, where
+it is accepted (a group counts as right if the hidden effect is in it).
 
 ## Data with a known truth
 
-{len(known)} data sets of Reality, each with a second recording by which all are judged.
+{len(known)} data sets of Reality, each with a second recording for scoring. Twelve data sets do not show which method is
+better on a single effect.
 """
     head = ["", *WAYS]
     text += "\n" + table(head, summary(known)) if known else ""
     text += """
-*Error over floor*: geometric mean over the data sets of the error on the other recording, over that of the model with
-the library's effects at their true values. *Wrong cause blamed*: share of all data sets in which something is blamed
-that is not there. *Hidden effect blamed*: share of those with a hidden effect in which it is. Intervals are 95 %:
-bootstrapped over the data sets, and Wilson's for shares.
+*Error over floor*: geometric mean over the data sets of the error on the other recording, divided by that of the model
+with the library's effects at their true values. *Wrong cause blamed*: share of all data sets in which an effect is
+blamed that is not hidden. *Hidden effect blamed*: share of the data sets with a hidden effect in which it is blamed.
+Intervals are 95 %: bootstrapped over the data sets, Wilson's for shares.
 
 ![Errors of each way over the floor](diagnose_alternatives.png)
 
 Errors on the other recording, residual over noise:
 
 """
-    text += table(["data set", "drawing", "truth", *WAYS], [errors(name, row) for name, row in known.items()])
-    text += "\nWhat is blamed (in bold what is hidden; *or*: named as what the data cannot tell from it):\n\n"
+    text += table(["data set", "nominal model", "truth", *WAYS], [errors(name, row) for name, row in known.items()])
+    text += "\nBlamed effects (hidden ones in bold; *or*: named as a group that the data do not distinguish):\n\n"
     text += table(["data set", *WAYS], [blame(name, row) for name, row in known.items()])
     if real:
         text += """
@@ -72,7 +74,7 @@ in millimetres over windows of other tosses.
 
 """
         text += table(["data", "unit", "as published", *WAYS], [measured(name, row) for name, row in real.items()])
-        text += "\nWhat is blamed:\n\n" + table(["data", *WAYS], [blame(name, row) for name, row in real.items()])
+        text += "\nBlamed effects:\n\n" + table(["data", *WAYS], [blame(name, row) for name, row in real.items()])
     return text
 
 
@@ -113,29 +115,29 @@ def share(hits: Sequence[bool]) -> str:
 def errors(name: str, row: dict[str, Any]) -> list[str]:
     """Return the errors on one data set."""
     floor = "-" if row["floor"] is None else f"{row['floor']:.2f}"
-    return [name, f"{row['drawing']:.2f}", floor, *(f"{row['ways'][way]['error']:.2f}" for way in WAYS)]
+    return [name, f"{row['nominal']:.2f}", floor, *(f"{row['ways'][way]['error']:.2f}" for way in WAYS)]
 
 
 def measured(name: str, row: dict[str, Any]) -> list[str]:
     """Return the errors on measured data."""
-    return [name, row["unit"], f"{row['drawing']:.2f}", *(f"{row['ways'][way]['error']:.2f}" for way in WAYS)]
+    return [name, row["unit"], f"{row['nominal']:.2f}", *(f"{row['ways'][way]['error']:.2f}" for way in WAYS)]
 
 
 def blame(name: str, row: dict[str, Any]) -> list[str]:
-    """Return what is blamed on one data set."""
+    """Return the blamed effects of one data set."""
     hidden = row["hidden"] or []
     cells = []
     for way in WAYS:
-        told = row["ways"][way]
-        cells.append(", ".join(cause(n, hidden, told) for n in told["blamed"]) or "nothing")
+        found = row["ways"][way]
+        cells.append(", ".join(cause(n, hidden, found) for n in found["blamed"]) or "nothing")
     return [name, *cells]
 
 
-def cause(name: str, hidden: Sequence[str], told: dict[str, Any]) -> str:
-    """Return a cause that is blamed: in bold where it is hidden, with what is hidden where that is in its group."""
+def cause(name: str, hidden: Sequence[str], found: dict[str, Any]) -> str:
+    """Return a blamed effect: in bold if it is hidden, with the hidden effect if that is in its group."""
     if name in hidden:
         return f"**{name}**"
-    group = told.get("right", []) if name not in told.get("wrong", [name]) else []
+    group = found.get("right", []) if name not in found.get("wrong", [name]) else []
     return f"{name} or **{', '.join(group)}**" if group else name
 
 
@@ -152,8 +154,8 @@ def draw(rows: dict[str, Any]) -> None:
         return
     figure, axis = plt.subplots(figsize=(9, 0.42 * len(chosen) + 1.6))
     places = np.arange(len(chosen))[::-1]
-    axis.scatter([row["drawing"] / row["floor"] for _, row in chosen], places, marker="|", s=140, color="black",
-                 label="drawing, nothing fitted")  # fmt: skip
+    axis.scatter([row["nominal"] / row["floor"] for _, row in chosen], places, marker="|", s=140, color="black",
+                 label="nominal model, nothing fitted")  # fmt: skip
     for k, way in enumerate(WAYS):
         over = [row["ways"][way]["error"] / row["floor"] for _, row in chosen]
         axis.scatter(over, places + 0.18 * (1 - k), s=36, color=COLOURS[k], label=way)

@@ -26,7 +26,7 @@ class Blame:
 
     name: str
     group: tuple[str, ...]
-    """Names that the data cannot tell from it, itself among them."""
+    """Names that the data do not distinguish from it, including its own."""
 
 
 def fit_everything(model: Model, recording: Recording) -> tuple[Model, list[Blame]]:

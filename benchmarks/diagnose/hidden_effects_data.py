@@ -1,12 +1,12 @@
 """Data sets with a hidden effect: small experiments in Reality, by name and seed, made in seconds each.
 
-python -m benchmarks.diagnose.hidden_effects_data  # how far each is from its drawing, against the noise
+python -m benchmarks.diagnose.hidden_effects_data  # residual of the nominal model over the noise
 python -m benchmarks.diagnose.hidden_effects_data --kinds null pair  # some of them: single, null, outside, pair
 python -m benchmarks.diagnose.hidden_effects_data --rigs slide drop
 
-The table tells, for each data set, how long it took to make, and the root mean square of residual over noise in the
-channels where it is largest, with starts refitted (`hidden_effects_residual`): of the drawing, and of the drawing with
-the library's effects at the true values, where it has them.
+The table has, for each data set, the time to make it, and the root mean square of residual over noise in the channels
+where it is largest, with refitted initial states (`hidden_effects_residual`): for the nominal model, and for the nominal
+model with the library's effects at the true values, where the library has them.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Data:
-    """A recording, the drawing that a model is made from, and the truth."""
+    """A recording, the nominal scene, and the truth."""
 
     recording: Recording
     scene: Scene
@@ -210,9 +210,9 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Print how far each data set is from its drawing."""
+    """Print the residual of the nominal model on each data set."""
     chosen = [c for c in cases() if c.kind in args.kinds and c.rig in args.rigs]
-    print(f"{'data set':56s} {'demos':>5s} {'make':>6s} {'drawing':>8s} {'truth':>6s}  drawing, by channel")
+    print(f"{'data set':56s} {'demos':>5s} {'make':>6s} {'nominal':>8s} {'truth':>6s}  nominal, by channel")
     for case in chosen:
         if args.seeds is not None and case.seed not in args.seeds:
             continue
@@ -229,7 +229,7 @@ def main(args: Args) -> None:
 
 
 def true_model(data: Data) -> Model | None:
-    """Return the drawing with the library's effects at the true values; None where there is nothing to add."""
+    """Return the nominal model with the library's effects at the true values; None where there is nothing to add."""
     if not data.truth or not all(t.known and t.parameters for t in data.truth):
         return None
     model = Model(data.scene)

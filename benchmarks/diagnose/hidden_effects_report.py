@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.stats import norm
 
-from benchmarks.diagnose.hidden_effects_data import BEST
+from benchmarks.diagnose.hidden_effects_data import BEST, cases
 from benchmarks.pages import FOLDER, data_path, read_data, table
 from concent_warp.files import write_text
 
@@ -45,14 +46,14 @@ def write_kept(kept: dict[str, Any], total: int) -> None:
 
 
 def other_seeds(rows: Sequence[Row], total: int, host: str) -> str:
-    """Return what another run found."""
+    """Return the section of a run on other seeds."""
     wrong = [
         [f"`{r['name']}`", r.get("verdict", "error"), named(r)]
         for r in sorted(rows, key=lambda r: r["name"])
         if r["kind"] == "single" and not first_right(r)
     ]
     return f"""
-## Again, on other seeds
+## Other seeds
 
 {host} {len(rows)} of {total} data sets.
 
@@ -70,7 +71,7 @@ def slim(row: Row) -> Row:
 
 
 def detection_limits(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the smallest size of each effect that the search would have named, by rig, from data that lack nothing."""
+    """Return the smallest size of each effect that the search would name, by rig, from data in which nothing is hidden."""
     sizes: dict[tuple[str, str, str, str], list[float]] = {}
     for row in rows:
         for found in row.get("detectable", ()) if row["kind"] == "null" else ():
@@ -212,10 +213,11 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
     """Return the page."""
     single = [r for r in rows if r["kind"] == "single"]
     seconds = np.array([r["seconds"] for r in rows]) if rows else np.zeros(1)
+    planned = Counter(case.rig for case in cases())
     by_rig = []
     for rig in dict.fromkeys(r["rig"] for r in rows):
         mine = np.array([r["seconds"] for r in rows if r["rig"] == rig])
-        by_rig.append([rig, str(len(mine)), f"{np.median(mine):.0f}", f"{mine.max():.0f}"])
+        by_rig.append([rig, f"{len(mine)} of {planned[rig]}", f"{np.median(mine):.0f}", f"{mine.max():.0f}"])
     effects = []
     for name in dict.fromkeys(r["truth"][0]["name"] for r in single):
         mine = [r for r in single if r["truth"][0]["name"] == name]
@@ -244,22 +246,19 @@ def page(rows: Sequence[Row], total: int, host: str, limits: Sequence[dict[str, 
     ]
     return f"""# Hidden effects
 
-How often `concent diagnose` names the effect that is hidden in a recording. The recordings are made in
-Reality, whose implementation of each effect is not the library's;
-`benchmarks/diagnose/hidden_effects_data.py` lists them.
+`python -m benchmarks.diagnose.hidden_effects`: how often `concent diagnose` names the effect that is hidden in a
+recording. The recordings are made in Reality, which implements each effect by other means than the library;
+`benchmarks/diagnose/hidden_effects_data.py` lists all {total}.
 
-```
-python -m benchmarks.diagnose.hidden_effects            # {total} data sets, resumable, in random order
-python -m benchmarks.diagnose.hidden_effects --report   # this page
-```
+{host} {len(rows)} of {total} data sets are finished, {len(failed)} ended in an error; the
+{total - len(rows)} others count in no share below. {seconds.sum() / 3600:.1f} hours of one core in all.
 
-{host} {len(rows)} of {total} data sets done, {len(failed)} ended in an error; the
-{total - len(rows)} others were not finished in the time and are in no share below.
-{seconds.sum() / 3600:.1f} hours of one core in all.
+What the figures do not show: measured data ([diagnoses of them](diagnose_real.md)), and more than two effects at a time.
+Slow data sets are missing more often than others; the table of times has the counts by rig.
 
 {table(["", "bar", "share", "95 % interval", "data sets"], all_shares(rows))}
-Intervals are Wilson's. Data with two magnitudes: the middle one leaves a residual of about four standard deviations of
-the noise, the large one two to three times that.
+Intervals are Wilson's. The *bar* is the required share. Effects have two magnitudes: *middle* leaves a residual of about four
+standard deviations of the noise, *large* two to three times that.
 
 ## By effect
 
@@ -268,21 +267,19 @@ the noise, the large one two to three times that.
 
 ## Outside the library, two at once, false alarms
 
-The hidden effects are in the name of the data. Groups are effects that the data do not distinguish, in the order
-of the additions; the ratio is that of the residual to the noise, of the nominal model and after each addition.
+The name of the data has the hidden effects. Groups are effects that the data do not distinguish, in the order of the
+additions; the ratio is that of residual to noise, for the nominal model and after each addition.
 
 {table(["data", "verdict", "named", "ratio"], other)}
-## Smallest sizes that are found
+## Detection limits
 
-The smallest size of each effect that the search would have named in half of all cases, on the rig that it is tried on:
-the median over the data sets of that rig in which nothing is hidden. `detectable` in the output of `concent diagnose`
-has it for any recording.
+The smallest size of each effect that the search would name in half of all cases: the median over the data sets of its
+rig in which nothing is hidden. `detectable` in the output of `concent diagnose` gives it for any recording.
 
 {table(["effect", "rig", "smallest size"], smallest)}
 ## Time
 
-Seconds on one core for a whole diagnosis, all candidates and the calibration included, beside others on a shared
-machine.
+Seconds on one core of a shared machine for a whole diagnosis, all candidates and the calibration included.
 
 {table(["rig", "data sets", "median [s]", "longest [s]"], by_rig)}"""
 

@@ -23,19 +23,20 @@ def page(result: dict[str, Any], studies: list[dict[str, Any]]) -> str:
 
 Written by `benchmarks/diagnose/real.py`; do not edit.
 
-Tosses of a cube on a board (ContactNets) and logs of a servo that swings a payload (BAM, XL330) are diagnosed with the
-default settings (of tosses at most two additions, for time), starting from the models as published. No setting was
-chosen by these data, but two things came of a first look at them. Noise that a recording does not state is taken for
-larger where even the quietest stretches show more: the cube's tracker scatters by 0.02 mm in flight, far less than a
-rigid body with Coulomb contacts can follow through an impact. And the reader of servo logs states the resolution of the
-encoder as its noise: without, that rule took misfit for noise, and the diagnosis at kp 100 ended with lag, friction by
-load, gravity compensation and tilt, and nothing left to explain. Times are of a machine that several jobs shared.
+`python -m benchmarks.diagnose.real --data DATA`: diagnoses, with default settings (at most two additions for tosses), of
+tosses of a cube on a board (ContactNets) and of logs of a servo that swings a payload (BAM, XL330). The cube's model is
+the published one; the servo's has roughly known motor constants, no friction, and a drive strength that is fitted.
 
-What judges each step are recordings that the diagnosis did not see: other tosses, or the logs at the other gain of the
-controller. A window starts from the measured state, corrected within the noise by its first 0.1 s, for every model
-alike; the error is the root mean square over the rest of the window (0.2 s of tosses, 0.3 s of swings), and then over
-the units (tosses, or windows of swings). Intervals are bootstrapped over the units; p is Wilcoxon's signed-rank test,
-two-sided and not corrected. Windows of one log are not independent, so that their p-values flatter.
+Each step is scored on recordings that the diagnosis does not see: other tosses, or the logs at the other gain of the
+controller. A window starts from the measured state, corrected within the noise by its first 0.1 s; the error is the root
+mean square over the rest of the window (0.2 s of tosses, 0.3 s of swings), then over the units (tosses, or windows of
+swings). Intervals are bootstrapped over the units; p is Wilcoxon's signed-rank test, two-sided and not corrected. A
+*decoy* is an effect that is fitted on top of the final model although the diagnosis did not accept it.
+
+What the figures do not show: all three verdicts are "none of these", so that a part of the discrepancy has no
+explanation here; orientation of the tosses does not improve. No ground truth of the effects exists. Windows of one log
+are not independent, so their p-values are too small. Two rules for the noise level (a lower bound from the quietest
+stretches, the resolution of the encoder) were set after a look at these data. Other jobs ran on the machine.
 
 ![Error on held-out data after each addition](diagnose_real.png)
 """
@@ -50,14 +51,14 @@ two-sided and not corrected. Windows of one log are not independent, so that the
 
 
 def section(study: dict[str, Any]) -> str:
-    """Return what is said of one diagnosis."""
+    """Return the section of one diagnosis."""
     diagnosis = study["diagnosis"]
     ratios = ", ".join(f"{r:.1f}" for r in diagnosis["ratio"])
     text = f"""
 ## {study["title"][0].upper() + study["title"][1:]}
 
 Verdict: `{diagnosis["verdict"]}`, after {study["seconds"]:.0f} s. Residual over noise, before and after each addition:
-{ratios}. Of the discrepancy {100 * diagnosis["unexplained"]:.0f} % stays unexplained.
+{ratios}. {100 * diagnosis["unexplained"]:.0f} % of the discrepancy remain unexplained.
 
 Accepted, in this order:
 
@@ -67,7 +68,7 @@ Accepted, in this order:
     text += table(head, [[f["name"], parameters(f), gain(f), f"{f['p']:.2g}"] for f in accepted])
     for names in diagnosis["groups"]:
         if len(names) > 1:
-            text += f"\nThe data cannot tell {names[0]} from {', '.join(names[1:])}.\n"
+            text += f"\nThe data do not distinguish {names[0]} from {', '.join(names[1:])}.\n"
     for k, judge in enumerate(study["judges"]):
         text += f"\n{judge['name']} [{judge['unit']}], {judge['units']} units:\n\n"
         text += steps(study["steps"], k)
@@ -76,7 +77,7 @@ Accepted, in this order:
         ["decoy", *(j["name"] for j in study["judges"]), "fitted"], [decoy(d, study) for d in study["decoys"]]
     )
     if "ladder" in study:
-        text += "\nWithout any choice, in the order of the literature on servos:\n"
+        text += "\nServo effects in the order of the literature, without a selection:\n"
         for k, judge in enumerate(study["judges"]):
             text += f"\n{judge['name']} [{judge['unit']}]:\n\n" + steps(study["ladder"], k)
     rejected = [f for f in diagnosis["effects"] if not f["accepted"]]

@@ -1,4 +1,4 @@
-"""How long a diagnosis takes, all candidates and the calibration included, and how that grows.
+"""Time of a diagnosis, all candidates and the calibration included, and how it grows.
 
     python -m benchmarks.diagnose.speed                    # every case that there is, then the page
     python -m benchmarks.diagnose.speed --parts scenes     # some of them; the page keeps the other figures
@@ -34,7 +34,7 @@ SCENES = {
     "arm-joint_friction-middle-2": 480,
     "insertion-joint_friction-middle-2": 480,
 }
-"""Data sets, and what they may take on two cores [s]."""
+"""Data sets and their time limits on two cores [s]."""
 GROWING = "pendulum-joint_friction-middle-0"
 COUNTS = (2, 4, 8, 16, 0)
 """Candidates; 0 is all."""
@@ -54,11 +54,11 @@ class Args:
     jobs: int = len(os.sched_getaffinity(0))
     """Processes."""
     host: str = "2 cores"
-    """Under which heading the figures stand."""
+    """Heading of the figures."""
     remark: str = ""
-    """What is to be said of them; kept until another takes its place."""
+    """Remark on the figures; kept until it is replaced."""
     table: bool = False
-    """Write the page from the figures that there are."""
+    """Write the page from the stored figures."""
 
 
 def main(args: Args) -> None:
@@ -119,7 +119,7 @@ def data_of(name: str) -> tuple[Recording, Model]:
 
 
 def timed(key: str, model: Model, recording: Recording, cfg: DiagnoseCfg) -> dict[str, Any]:
-    """Return how long a diagnosis takes, and what it says."""
+    """Return how long a diagnosis takes, and its verdict."""
     begin = time.perf_counter()
     found = diagnose(model, recording, cfg)
     return {
@@ -155,12 +155,11 @@ def write_report(data: dict[str, Any]) -> None:
     lines = [
         "# Time of a diagnosis",
         "",
-        "How long `concent diagnose` takes, screening, fits, chance and intervals included; without the search for",
-        "missing forces (`explain`), which takes as long again at most, and a minute at most.",
-        "",
-        "```",
-        "python -m benchmarks.diagnose.speed",
-        "```",
+        "`python -m benchmarks.diagnose.speed`: wall time of `concent diagnose` with default settings on recordings of",
+        "Reality that hide one effect: screening, fits, null distribution and intervals. The search for missing forces",
+        "(`explain`) is left out; it takes at most as long again, and at most a minute. Other scenes scale with the",
+        "number of candidates, the length of the recording and the contacts in it. Hosts are not comparable: other jobs",
+        "ran on some of them.",
     ]
     for host, found in data.items():
         lines += ["", f"## {host}", "", machine_line(found["machine"]), ""]

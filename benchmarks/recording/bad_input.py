@@ -1,11 +1,10 @@
-"""What the user reads when an input is broken: runs every case of `bad_input_cases` and writes the table of messages.
+"""Error messages for broken inputs: runs every case of `bad_input_cases` and writes the table of messages.
 
     python -m benchmarks.recording.bad_input [--output FILE] [--library]
 
-Each case goes through ``concent compare <recording> --model <model>`` in a working folder of its own. It passes if the
-command fails, says exactly one sentence on stderr without a traceback, and leaves no file behind, neither in the
-working folder nor beside the inputs. Before, the sound recording and model that the cases
-start from must be accepted.
+Each case runs ``concent compare <recording> --model <model>`` in its own working folder. It passes if the command fails,
+prints exactly one sentence on stderr without a traceback, and leaves no file behind, neither in the working folder nor
+beside the inputs. The valid recording and model that the cases are made from must be accepted first.
 """
 
 from __future__ import annotations
@@ -32,13 +31,13 @@ OUTPUT = Path(__file__).parents[2] / "docs" / "benchmarks" / "bad_input.md"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one case."""
+    """Result of one case."""
 
     case: Case
     code: int
     """Exit status of the command."""
     message: str
-    """All that came on stderr, with the paths of the temporary folder shortened."""
+    """Everything printed on stderr, with the paths of the temporary folder shortened."""
     left: list[str]
     """Files that were not there before."""
     seconds: float
@@ -140,11 +139,11 @@ def table(outcomes: list[Outcome], command: bool) -> str:
     lines = [
         "# Broken inputs",
         "",
-        f"{len(outcomes)} inputs, each with one fault, given to {way}. The sound recording and model",
-        f"that they start from are accepted; {passed} of {len(outcomes)} are refused as they should be: exit status",
-        "other than 0, one sentence on stderr, no traceback, no file left behind.",
-        f"The longest took {max(outcome.seconds for outcome in outcomes):.1f} s. Made by",
-        "`python -m benchmarks.recording.bad_input`.",
+        f"`python -m benchmarks.recording.bad_input`: {len(outcomes)} inputs, each with one fault, are given to",
+        f"{way}. {passed} of {len(outcomes)} are refused as required: exit status other than 0,",
+        "one sentence on stderr, no traceback, no file left behind. The valid recording and model that they are made",
+        f"from are accepted. The longest case takes {max(outcome.seconds for outcome in outcomes):.1f} s. Faults that",
+        "are not in the table are not tested.",
         "",
         "| | input | fault | message |",
         "|---|---|---|---|",

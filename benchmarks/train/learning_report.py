@@ -23,18 +23,22 @@ KEPT = ("steps", "seconds", "success", "chain success", "return")
 POINTS = 150
 """Points of a curve that are kept."""
 BARS = (0.5, 0.9, 0.95, 0.99)
-"""Shares of success whose first time is told."""
+"""Success rates whose first time is reported."""
 ABOUT = """\
-Trainings of the shape sorter with the arm, a seed each being a demonstration, a model and a policy of its own. *while
-exploring* is the share of the episodes that ended in a round with object 1 in place, actions drawn at random by the
-policy; *without exploration* is a test after the training: the policy's means, from initial states that it has not
-seen, in the same simulation, with Wilson's interval. Seconds are those of collecting and updating; reading the model,
-drawing initial states, compiling and capturing come before and are told apart as *start*.
+`python -m benchmarks.train.learning --out D`: trainings of the shape sorter with the arm. Each seed has its own
+demonstration, model and policy. *while exploring* is the share of the episodes ended in an iteration that end with
+object 1 in place, with actions sampled from the policy; *without exploration* is a test after the training with the
+mean actions, from unseen reset states in the same simulation, with Wilson's 95 % interval. Seconds are those of
+rollouts and updates; reading the model, sampling reset states, compilation and capture are *start*.
+
+What the figures do not show: success in Reality ([Table 1](train_table1.md)), which varies strongly between seeds that all
+reach 100 % here. All tables have two to six seeds. A training stops when its time is over, so the seconds of two cases
+on different hosts are not comparable.
 """
 
 
 def taken(folder: Path, stage: str) -> dict[str, Any]:
-    """Return the trainings of a folder."""
+    """Return the trainings in a folder."""
     found = {}
     for path in sorted((folder / "runs").glob(f"*_{stage}_*/{RESULT}")):
         ordered = read_curve(path.parent)
@@ -49,7 +53,7 @@ def taken(folder: Path, stage: str) -> dict[str, Any]:
 
 
 def first(rows: list[dict[str, float]], bar: float) -> list[float] | None:
-    """Return steps and seconds after which three rounds on end succeed in this share while exploring."""
+    """Return steps and seconds from which three iterations in a row reach this success rate while exploring."""
     name = "chain success" if "chain success" in rows[0] else "success"
     fine = [row[name] >= bar for row in rows]
     for k in range(len(rows) - 2):
