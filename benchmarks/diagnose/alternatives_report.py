@@ -31,8 +31,8 @@ def page(data: dict[str, Any]) -> str:
 
 Written by `benchmarks/diagnose/alternatives.py`; do not edit. {machine_line(data["machine"])}
 
-`python -m benchmarks.diagnose.alternatives`: three methods correct a model that lacks an effect, on the same recordings,
-and are scored on the same other recordings:
+`python -m benchmarks.diagnose.alternatives`: three methods correct a model that lacks an effect, on the same
+recordings, and are scored on the same other recordings:
 
 - *diagnosis*: `concent diagnose` with default settings; the model with all accepted effects;
 - *everything at once*: the parameters of all candidate effects of the library and the initial states, fitted together
@@ -46,8 +46,8 @@ it is accepted (a group counts as right if the hidden effect is in it).
 
 ## Data with a known truth
 
-{len(known)} data sets of Reality, each with a second recording for scoring. Twelve data sets do not show which method is
-better on a single effect.
+{len(known)} data sets of Reality, each with a second recording for scoring. Twelve data sets do not show which method
+is better on a single effect.
 """
     head = ["", *WAYS]
     text += "\n" + table(head, summary(known)) if known else ""

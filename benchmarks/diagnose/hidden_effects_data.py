@@ -5,8 +5,8 @@ python -m benchmarks.diagnose.hidden_effects_data --kinds null pair  # some of t
 python -m benchmarks.diagnose.hidden_effects_data --rigs slide drop
 
 The table has, for each data set, the time to make it, and the root mean square of residual over noise in the channels
-where it is largest, with refitted initial states (`hidden_effects_residual`): for the nominal model, and for the nominal
-model with the library's effects at the true values, where the library has them.
+where it is largest, with refitted initial states (`hidden_effects_residual`): for the nominal model, and for the
+nominal model with the library's effects at the true values, where the library has them.
 """
 
 from __future__ import annotations

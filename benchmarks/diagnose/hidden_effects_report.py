@@ -71,7 +71,7 @@ def slim(row: Row) -> Row:
 
 
 def detection_limits(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the smallest size of each effect that the search would name, by rig, from data in which nothing is hidden."""
+    """Return the smallest size of each effect that the search would name, by rig, from data that hide nothing."""
     sizes: dict[tuple[str, str, str, str], list[float]] = {}
     for row in rows:
         for found in row.get("detectable", ()) if row["kind"] == "null" else ():
@@ -253,12 +253,12 @@ recording. The recordings are made in Reality, which implements each effect by o
 {host} {len(rows)} of {total} data sets are finished, {len(failed)} ended in an error; the
 {total - len(rows)} others count in no share below. {seconds.sum() / 3600:.1f} hours of one core in all.
 
-What the figures do not show: measured data ([diagnoses of them](diagnose_real.md)), and more than two effects at a time.
-Slow data sets are missing more often than others; the table of times has the counts by rig.
+What the figures do not show: measured data ([diagnoses of them](diagnose_real.md)), and more than two effects at a
+time. Slow data sets are missing more often than others; the table of times has the counts by rig.
 
 {table(["", "bar", "share", "95 % interval", "data sets"], all_shares(rows))}
-Intervals are Wilson's. The *bar* is the required share. Effects have two magnitudes: *middle* leaves a residual of about four
-standard deviations of the noise, *large* two to three times that.
+Intervals are Wilson's. The *bar* is the required share. Effects have two magnitudes: *middle* leaves a residual of
+about four standard deviations of the noise, *large* two to three times that.
 
 ## By effect
 

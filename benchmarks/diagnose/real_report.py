@@ -23,14 +23,14 @@ def page(result: dict[str, Any], studies: list[dict[str, Any]]) -> str:
 
 Written by `benchmarks/diagnose/real.py`; do not edit.
 
-`python -m benchmarks.diagnose.real --data DATA`: diagnoses, with default settings (at most two additions for tosses), of
-tosses of a cube on a board (ContactNets) and of logs of a servo that swings a payload (BAM, XL330). The cube's model is
-the published one; the servo's has roughly known motor constants, no friction, and a drive strength that is fitted.
+`python -m benchmarks.diagnose.real --data DATA`: diagnoses, with default settings (at most two additions for tosses),
+of tosses of a cube on a board (ContactNets) and of logs of a servo that swings a payload (BAM, XL330). The cube's model
+is the published one; the servo's has roughly known motor constants, no friction, and a drive strength that is fitted.
 
 Each step is scored on recordings that the diagnosis does not see: other tosses, or the logs at the other gain of the
-controller. A window starts from the measured state, corrected within the noise by its first 0.1 s; the error is the root
-mean square over the rest of the window (0.2 s of tosses, 0.3 s of swings), then over the units (tosses, or windows of
-swings). Intervals are bootstrapped over the units; p is Wilcoxon's signed-rank test, two-sided and not corrected. A
+controller. A window starts from the measured state, corrected within the noise by its first 0.1 s; the error is the
+root mean square over the rest of the window (0.2 s of tosses, 0.3 s of swings), then over the units (tosses, or windows
+of swings). Intervals are bootstrapped over the units; p is Wilcoxon's signed-rank test, two-sided and not corrected. A
 *decoy* is an effect that is fitted on top of the final model although the diagnosis did not accept it.
 
 What the figures do not show: all three verdicts are "none of these", so that a part of the discrepancy has no

@@ -158,8 +158,8 @@ def write_report(data: dict[str, Any]) -> None:
         "`python -m benchmarks.diagnose.speed`: wall time of `concent diagnose` with default settings on recordings of",
         "Reality that hide one effect: screening, fits, null distribution and intervals. The search for missing forces",
         "(`explain`) is left out; it takes at most as long again, and at most a minute. Other scenes scale with the",
-        "number of candidates, the length of the recording and the contacts in it. Hosts are not comparable: other jobs",
-        "ran on some of them.",
+        "number of candidates, the length of the recording and the contacts in it. Other jobs ran on some",
+        "of the hosts.",
     ]
     for host, found in data.items():
         lines += ["", f"## {host}", "", machine_line(found["machine"]), ""]

@@ -2,9 +2,9 @@
 
     python -m benchmarks.recording.bad_input [--output FILE] [--library]
 
-Each case runs ``concent compare <recording> --model <model>`` in its own working folder. It passes if the command fails,
-prints exactly one sentence on stderr without a traceback, and leaves no file behind, neither in the working folder nor
-beside the inputs. The valid recording and model that the cases are made from must be accepted first.
+Each case runs ``concent compare <recording> --model <model>`` in its own working folder. It passes if the command
+fails, prints exactly one sentence on stderr without a traceback, and leaves no file behind, neither in the working
+folder nor beside the inputs. The valid recording and model that the cases are made from must be accepted first.
 """
 
 from __future__ import annotations
