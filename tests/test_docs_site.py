@@ -100,5 +100,5 @@ def test_notebook_finds_the_effect_and_the_error_falls_to_the_noise(site):
     assert "Missing: joint_friction" in text
     (value,) = re.findall(r"torque\[hinge\] = ([\d.]+) \[", text)
     assert float(value) == pytest.approx(0.03, rel=0.02)
-    assert "hinge_position: 8.2 -&gt; 1.0 x noise, fallen" in text
+    assert "hinge_position: 7.2 -&gt; 1.0 x noise, fallen" in text
     assert (site / "notebooks" / "hidden_effect.html").read_text().count('src="data:image/png;base64') == 2

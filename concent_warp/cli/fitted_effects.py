@@ -52,8 +52,8 @@ def say_fitted(fitted: FittedEffects) -> None:
             table.add_row(*map(escape, cells), end_section=k + 1 == len(group))
     say(table)
     table = Table(header_style="bold")
-    for name in ("residual / noise", "before", "after"):
-        table.add_column(name, justify="left" if name == "residual / noise" else "right")
+    for name in ("x noise", "before", "after"):
+        table.add_column(name, justify="left" if name == "x noise" else "right")
     for channel in fitted.channels:
         table.add_row(escape(channel.channel), f"{channel.before:.2f}", f"{channel.after:.2f}")
     table.add_section()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import gamma
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
+from concent_warp.comparison.noise_ratio import rms_noise
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import Noise, Source, channel_noise, pooled_noise
 from concent_warp.estimation.rotations import rotation_between, rotations, same_sign, turns
@@ -46,8 +46,7 @@ class Residual:
     """How far off, shape (T,): Euclidean norm, rotation angle, mean distance of the visible points from where the model
     has them; NaN where nothing was measured, infinite where the model has diverged."""
     noise: float | None
-    """RMS error that the measurement noise alone would leave with a perfect model, in `unit`: the noise floor. Of
-    points the mean distance, which hardly varies over time. None where the noise is unknown."""
+    """Root mean square of `error` that noise alone leaves with a perfect model; None where the noise is not known."""
     std: float | None = None
     """Standard deviation of the noise of each component of `value`, where it can be told; of points that of one."""
     source: Source = "unknown"
@@ -59,7 +58,7 @@ class Residual:
 
     @property
     def ratio(self) -> np.ndarray | None:
-        """Error over the noise floor [-], shape (T,); RMS 1 where the model is right. None without a floor."""
+        """Error over `noise` [-], shape (T,); root mean square 1 where only noise is left. None without noise."""
         return self.error / self.noise if self.noise else None
 
 
@@ -146,7 +145,7 @@ def _sensor_residual(
         time=channel.time,
         value=value,
         error=_lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
-        noise=None if std is None else std * float(np.sqrt(value.shape[1])),
+        noise=None if std is None else rms_noise(std, value.shape[1]),
         std=std,
         source=noise.source,
         extent=_extent(channel.value, kind),
@@ -189,7 +188,8 @@ def _point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
     some = np.asarray(measured.any(axis=1))
     value[~some] = np.nan
     error = np.where(some, (share * distance).sum(axis=1), np.nan)
-    noise = _point_noise(local, anchor, sightings)
+    std = _point_noise(local, anchor, sightings)
+    noise = None if std is None else std * _rms_mean_distance(measured.sum(axis=1)[some])
     return Residual(
         channel=f"{body} points",
         kind="points",
@@ -199,23 +199,26 @@ def _point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
         value=value,
         error=_lost(error, position, some),
         noise=noise,
-        std=None if noise is None else noise / _mean_norm(3),
+        std=std,
         source="unknown" if noise is None else "points",
         extent=_extent(value + position, "points"),
     )
 
 
 def _point_noise(local: np.ndarray, anchor: np.ndarray, sightings: np.ndarray) -> float | None:
-    """Return the mean distance that the scatter of `local` (F, M, 3) about `anchor` (M, 3) [m] leaves, if it tells.
+    """Return the standard deviation of a component of a point's residual [m] that noise alone leaves; None if unknown.
 
-    The anchors are means of `sightings` (M,) observations, so they err too.
+    Args:
+        local: The first observations of each point, body frame [m], shape (F, M, 3).
+        anchor: Their means, shape (M, 3), whose error is part of the residual.
+        sightings: Number of these observations, shape (M,).
     """
     several = sightings > 1
     if not several.any():
         return None
     square = np.nansum((local[:, several] - anchor[several]) ** 2)
     std = np.sqrt(square / (3 * (sightings[several] - 1).sum()))
-    return float(std * np.sqrt(1 + np.mean(1 / sightings[several])) * _mean_norm(3))
+    return float(std * np.sqrt(1 + np.mean(1 / sightings[several])))
 
 
 def _lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -224,6 +227,13 @@ def _lost(error: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> np.
     return np.where(diverged, np.inf, np.where(measured, error, np.nan))
 
 
-def _mean_norm(dim: int) -> float:
-    """Return the mean length of a vector of `dim` independent standard normal numbers (chi distribution)."""
-    return float(np.sqrt(2) * gamma((dim + 1) / 2) / gamma(dim / 2))
+def _rms_mean_distance(count: np.ndarray) -> float:
+    """Return the root mean square of the mean length of noise vectors in three dimensions of unit standard deviation.
+
+    The length has the mean sqrt(8 / pi) and the second moment 3 (Maxwell distribution).
+
+    Args:
+        count: Numbers of vectors that are averaged, shape (T,).
+    """
+    square = 8 / np.pi
+    return float(np.sqrt(np.mean(square + (3 - square) / np.maximum(count, 1)))) if len(count) else np.sqrt(3)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.bootstrap import LEVEL, RULE, effective_count, mean_interval
+from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.worst_spans import WorstSpan
@@ -45,9 +46,9 @@ class Summary:
     """95th percentile."""
     max: float
     noise: float | None
-    """RMS error that the measurement noise alone would leave, in `unit`; None where the noise is unknown."""
+    """Root mean square error that the measurement noise alone leaves; None where it is not known."""
     ratio: float | None
-    """RMS error over that noise floor [-]: "x noise"."""
+    """Root mean square error over `noise` [-] ("x noise", see `concent_warp.comparison.noise_ratio`)."""
     source: Source
     """Where the noise is from."""
 
@@ -181,7 +182,7 @@ class Comparison:
         weight = sum(n for _, n in noises)
         sources: list[Source] = [r.source for r, _ in found if r.noise is not None]
         noise = float(np.sqrt(sum(noise**2 * n for noise, n in noises) / weight)) if weight else None
-        rms = _statistic(lambda e: np.sqrt(np.mean(e**2)), pooled)
+        mean = _statistic(np.mean, pooled)
         return Summary(
             model=model,
             channel=channel,
@@ -189,14 +190,14 @@ class Comparison:
             unit=found[0][0].unit,
             count=len(pooled),
             effective=effective_count([p for p in parts if np.isfinite(p).all()]),
-            mean=_statistic(np.mean, pooled),
+            mean=mean,
             low=low,
             high=high,
-            rms=rms,
+            rms=_statistic(lambda e: np.sqrt(np.mean(e**2)), pooled),
             p95=_statistic(lambda e: np.percentile(e, 95), pooled),
             max=_statistic(np.max, pooled),
             noise=noise,
-            ratio=rms / noise if noise else None,
+            ratio=noise_ratio(pooled, noise) if noise else None,
             source=sources[0] if sources else "unknown",
         )
 

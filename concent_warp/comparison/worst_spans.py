@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.comparison.contact_names import ContactPartners
+from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.units import shown, times, unit_shown, words
@@ -242,7 +243,7 @@ def _described(
         onset=onset,
         error=rms,
         unit=residual.unit,
-        ratio=rms / residual.noise if residual.noise else None,
+        ratio=noise_ratio(error, residual.noise) if residual.noise else None,
         against=touching.names if touching else (),
         point=touching.point if touching else None,
         direction=text if np.isfinite(rms) else "",

@@ -231,7 +231,7 @@ class Procedure:
             groups=tuple(self.groups),
             where=() if explained else self._failures(fitted[0]),
             unexplained=unexplained if unknown is None else max(unexplained, unknown.share),
-            ratio=tuple(one.ratio for one in fitted),
+            ratio=tuple(one.noise_ratio for one in fitted),
             detectable=detectable,
             next_experiment=None if explained else self._suggested_experiment(),
             issues=tuple(issues),

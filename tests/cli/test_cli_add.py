@@ -46,7 +46,7 @@ def test_a_fit_finds_the_value_and_says_how_far_the_error_falls(swing, tmp_path,
     said = capsys.readouterr().out
     assert "damping[hinge]" in said
     assert "N m s/rad" in said
-    assert "residual / noise" in said
+    assert "x noise" in said
 
 
 def test_effects_that_the_model_has_are_fitted_along(swing, tmp_path):

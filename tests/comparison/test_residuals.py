@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.residuals import _mean_norm, residuals
+from concent_warp.comparison.noise_ratio import noise_ratio, rms_noise
+from concent_warp.comparison.residuals import _rms_mean_distance, residuals
 from concent_warp.errors import RecordingError
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack
@@ -148,7 +149,7 @@ def test_points_never_seen_at_the_start_take_no_part_and_unseen_frames_have_no_e
     assert np.nanmax(r.error) < 2e-5
 
 
-def test_noise_floor_is_the_rms_error_that_noise_alone_leaves(engine, exact):
+def test_noise_floor_is_the_mean_error_that_noise_alone_leaves(engine, exact):
     rng = np.random.default_rng(1)
     position = exact.measured["cube_position"]
     noisy = change(exact, "cube_position", value=position.value + rng.normal(0, 1e-3, position.value.shape))
@@ -156,15 +157,27 @@ def test_noise_floor_is_the_rms_error_that_noise_alone_leaves(engine, exact):
     noisy = replace(noisy, points={"cube": replace(track, value=track.value + rng.normal(0, 1e-3, track.value.shape))})
     r = found(engine, noisy)
     assert r["cube_position"].noise == pytest.approx(1e-3 * np.sqrt(3))
-    assert np.sqrt(np.mean(r["cube_position"].error ** 2)) == pytest.approx(r["cube_position"].noise, rel=0.25)
-    assert r["cube points"].noise == pytest.approx(r["cube points"].error[5:].mean(), rel=0.15)
+    assert noise_ratio(r["cube_position"].error, r["cube_position"].noise) == pytest.approx(1, rel=0.25)
+    assert noise_ratio(r["cube points"].error[5:], r["cube points"].noise) == pytest.approx(1, rel=0.15)
     assert r["hinge"].noise is None
 
 
-def test_mean_norm_is_that_of_the_chi_distribution():
-    assert _mean_norm(1) == pytest.approx(np.sqrt(2 / np.pi))
-    draws = np.random.default_rng(0).normal(size=(200_000, 4))
-    assert _mean_norm(4) == pytest.approx(np.linalg.norm(draws, axis=1).mean(), rel=5e-3)
+@pytest.mark.parametrize("dim", [1, 3, 4])
+def test_noise_alone_is_one_times_the_noise_whether_by_components_or_by_lengths(dim):
+    noise = 0.2 * np.random.default_rng(0).normal(size=(200_000, dim))
+    assert noise_ratio(noise, 0.2) == pytest.approx(1, rel=5e-3)
+    lengths = np.linalg.norm(noise, axis=1)
+    assert noise_ratio(lengths, rms_noise(0.2, dim)) == pytest.approx(noise_ratio(noise, 0.2))
+    assert noise_ratio(np.append(3 * lengths, np.nan), rms_noise(0.2, dim)) == pytest.approx(3, rel=5e-3)
+    assert noise_ratio(np.append(lengths, np.inf), rms_noise(0.2, dim)) == np.inf
+    assert np.isnan(noise_ratio(np.array([np.nan])))
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_mean_distances_of_points_have_the_root_mean_square_of_the_maxwell_distribution(count):
+    noise = np.random.default_rng(0).normal(size=(100_000, count, 3))
+    mean = np.linalg.norm(noise, axis=2).mean(axis=1)
+    assert _rms_mean_distance(np.full(10, count)) == pytest.approx(noise_ratio(mean), rel=5e-3)
 
 
 def test_a_sensor_that_the_model_lacks_is_named(engine, exact):

@@ -23,7 +23,7 @@ def residual(shift, channel="block_position", kind: Kind = "position", unit="m",
     value = np.random.default_rng(len(channel)).normal(0, std, (len(TIME), 3)) + shift
     return Residual(
         channel=channel, kind=kind, unit=unit, body=body, time=TIME, value=value, error=np.linalg.norm(value, axis=1),
-        noise=std * 1.7321, std=std, source="stated", extent=0.3, local=kind == "orientation",
+        noise=std * np.sqrt(3), std=std, source="stated", extent=0.3, local=kind == "orientation",
     )  # fmt: skip
 
 
@@ -44,9 +44,9 @@ def test_two_bumps_are_two_places_the_worse_first():
     assert [p.peak for p in found] == pytest.approx([3.2, 1.0], abs=0.03)
     assert (found[0].start, found[0].end) == pytest.approx((3.2 - 0.15 * 1.18, 3.2 + 0.15 * 1.18), abs=0.03)
     assert [p.direction for p in found] == ["along -z", "along +x"]
-    assert found[0].ratio == pytest.approx(found[0].error / (1e-4 * 1.7321))
+    assert found[0].ratio == pytest.approx(found[0].error / (1e-4 * np.sqrt(3)))
     assert found[0].ratio == pytest.approx(20, rel=0.2)
-    assert found[0].onset == pytest.approx(3.2 - 0.15 * np.sqrt(2 * np.log(4e-3 / (LEAST * 1.6e-4))), abs=0.04)
+    assert found[0].onset == pytest.approx(3.2 - 0.15 * np.sqrt(2 * np.log(4e-3 / (LEAST * 1.73e-4))), abs=0.04)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.least_squares import Fit, Linear
 from concent_warp.fit.effects.observation import Window
-from concent_warp.fit.effects.robust import HUBER, huber
+from concent_warp.fit.effects.robust import robust_noise_ratio
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
@@ -35,7 +35,12 @@ class FittedModel:
     @property
     def ratio(self) -> float:
         """Robust RMS residual over the noise [-]: 1 where the model explains all but noise."""
-        return noise_ratio(self.pieces)
+        return robust_noise_ratio([piece.residual for piece in self.pieces])
+
+    @property
+    def noise_ratio(self) -> float:
+        """Root mean square residual over the noise [-], "x noise"."""
+        return noise_ratio(np.concatenate([piece.residual for piece in self.pieces]))
 
 
 @dataclass(frozen=True)
@@ -89,9 +94,3 @@ class FittedCandidate:
     def share(self, base: FittedModel) -> float:
         """Return the gain as a share of the baseline's held-out error [-]."""
         return float(self.gain(base).sum() / max(base.errors.sum(), 1e-12))
-
-
-def noise_ratio(pieces: Sequence[Linear]) -> float:
-    """Return the RMS of residuals in units of the noise [-], with Huber's loss beyond `HUBER`."""
-    pooled = np.concatenate([piece.residual for piece in pieces])
-    return float(np.sqrt(np.mean(2 * huber(pooled, HUBER))))

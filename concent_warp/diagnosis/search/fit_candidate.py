@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate, noise_ratio
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.least_squares import Fit, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.robust import robust_noise_ratio
 
 
 def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window] = ()) -> Solver:
@@ -24,7 +25,8 @@ def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit
     pieces = tuple(projected(fit))
     sums = block_sums(pieces, base.blocks, base.limit)
     errors = HeldOut(sums, base.blocks).own()
-    return FittedCandidate(effect, solver.p.model(fit.values), fit, sums, pieces, errors, noise_ratio(pieces))
+    ratio = robust_noise_ratio([piece.residual for piece in pieces])
+    return FittedCandidate(effect, solver.p.model(fit.values), fit, sums, pieces, errors, ratio)
 
 
 def fit_candidate(base: FittedModel, screened: ScreenedCandidate) -> FittedCandidate:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
@@ -16,7 +17,7 @@ from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, 
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.fit.effects.robust import HUBER, huber, huber_limit
+from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
@@ -33,7 +34,7 @@ NORMAL = 1.96
 
 @dataclass(frozen=True)
 class ChannelError:
-    """Residual over noise of one channel, root mean square, rows beyond four times the noise weighed down."""
+    """Root mean square residual over noise of one channel, "x noise"."""
 
     channel: str
     before: float
@@ -59,7 +60,7 @@ class FittedEffects:
     parameters: tuple[tuple[FittedParameter, ...], ...]
     """The same by effect, in the order of the model's effects."""
     before: float
-    """Residual over noise with the values that the model came with; initial states are fitted before and after."""
+    """Root mean square residual over noise with the values that the model came with [-], initial states fitted."""
     after: float
     """With the fitted ones."""
     channels: tuple[ChannelError, ...]
@@ -148,8 +149,8 @@ def fit_effects(
     said(1.0, "done")
     parameters, correlation = _fitted_parameters(solver, fit, pieces, windows)
     remarks = _doubts(solver, fit, parameters, correlation)
-    before, after = _noise_ratio(given), _noise_ratio(found)
-    if after > max(before, AT_NOISE):
+    before, after = noise_ratio(np.concatenate(given)), noise_ratio(np.concatenate(found))
+    if robust_noise_ratio(found) > max(robust_noise_ratio(given), AT_NOISE):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
@@ -277,11 +278,6 @@ def _doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], cor
     return found
 
 
-def _noise_ratio(residuals: Sequence[np.ndarray]) -> float:
-    """Return the root mean square of residuals in units of noise, rows beyond `HUBER` times it weighed down."""
-    return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), HUBER))))
-
-
 def _by_channel(
     windows: Sequence[Window], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
 ) -> tuple[ChannelError, ...]:
@@ -290,6 +286,6 @@ def _by_channel(
     found = []
     for name in names:
         rows = [(k, r.rows) for k, w in enumerate(windows) for r in w.readings if r.channel == name]
-        first, last = (_noise_ratio([residuals[k][s] for k, s in rows]) for residuals in (before, after))
+        first, last = (noise_ratio(np.concatenate([residuals[k][s] for k, s in rows])) for residuals in (before, after))
         found.append(ChannelError(name, first, last))
     return tuple(sorted(found, key=lambda c: -c.before))

@@ -40,6 +40,11 @@ def huber(residual: np.ndarray, limit: float) -> np.ndarray:
     return np.where(size <= limit, 0.5 * residual**2, limit * (size - 0.5 * limit))
 
 
+def robust_noise_ratio(residuals: Sequence[np.ndarray]) -> float:
+    """Return the root mean square of residuals in units of noise [-], those beyond `HUBER` with Huber's loss."""
+    return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), HUBER))))
+
+
 def huber_weight(residual: np.ndarray, limit: float) -> np.ndarray:
     """Return the weights of iteratively reweighted least squares."""
     return np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
