@@ -1,14 +1,19 @@
 """Reward terms against NumPy, and the action distribution against its definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from small_insertion import CHAIN, SETTINGS, make_task
 
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
 from concent_warp.train.environment.environment import TERMS
 from concent_warp.train.environment.quaternions import angle, inverse, multiply, rotate, rotation_columns
 from concent_warp.train.environment.reward import disturbance, effort, engineered
+from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distribution import SquashedGaussian
+from concent_warp.train.resets.sample import sample_reset_states
 
 
 def quaternions(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -124,3 +129,28 @@ def test_an_observation_out_of_the_ordinary_leaves_densities_and_divergence_fini
     assert ratio.isfinite().all()
     assert float(ratio.detach().max()) < 10
     assert float(distribution.kl_divergence(before, distribution.params).detach().max()) < 1
+
+
+def test_the_reward_is_the_scaled_sum_of_its_terms_divided_by_the_chained_stages(task, states):
+    chain = make_task(CHAIN)
+    drawn = sample_reset_states(chain, CHAIN.reset, 0, count=12)
+    assert len(chain.chained) == 3
+    cases = ((task, SETTINGS, states, 1), (chain, replace(CHAIN, worlds=12), drawn, 3))
+    for of, cfg, pool, stages in cases:
+        torch.manual_seed(0)
+        made = make_environment(of, cfg, pool, device="cpu")
+        for _ in range(3):
+            _, reward, _, _ = made.step(2 * torch.rand(made.num_envs, made.num_actions) - 1)
+            assert reward.abs().max() > 0
+            torch.testing.assert_close(reward, cfg.reward.scale / stages * made.terms.sum(dim=1))
+
+
+def test_a_later_stage_is_worth_more_than_an_earlier_one():
+    chain = make_task(CHAIN)
+    drawn = sample_reset_states(chain, CHAIN.reset, 1, count=12)
+    made = make_environment(chain, replace(CHAIN, worlds=12), drawn, device="cpu")
+    made.start_from(range(12))
+    stage = made.stage.clone()
+    assert stage.unique().tolist() == [0, 1, 2]
+    made.step(torch.zeros(made.num_envs, made.num_actions))
+    torch.testing.assert_close(made.terms[:, TERMS.index("stages")], CHAIN.reward.stage * stage.float())

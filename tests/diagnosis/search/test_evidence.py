@@ -1,0 +1,164 @@
+"""What makes a fitted effect accepted: significance, gain, folds, its parameters' intervals; and how likely it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.result import Finding
+from concent_warp.diagnosis.search.baseline import fit_baseline
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.evidence import (
+    assess,
+    detectable_size,
+    fitted_parameters,
+    indistinguishable,
+    removed_by_channel,
+)
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.intervals import covariance, law_errors
+from concent_warp.fit.effects.prediction import Prediction
+from tests.scenes.swinging import drawing, swung, windows_of
+
+CFG = DiagnoseCfg(jobs=1)
+
+
+@pytest.fixture(scope="module")
+def base() -> FittedModel:
+    recording = swung()
+    windows = windows_of(recording)
+    return fit_baseline(drawing(recording), windows, cut_blocks(windows), "mujoco")
+
+
+@pytest.fixture(scope="module")
+def damping(base) -> FittedCandidate:
+    """The effect that is missing, fitted."""
+    return fit_candidate(base, screen(base, effect_class("joint_damping")("hinge")))
+
+
+def assessed(base, c, null, cfg=CFG) -> Finding:
+    return assess(base, c, np.asarray(null, dtype=float), 0, [c.effect], cfg)
+
+
+def test_a_gain_that_chance_often_reaches_is_not_accepted(base, damping):
+    share = damping.share(base)
+    null = np.zeros(400)
+    assert assessed(base, damping, null).accepted
+    null[:40] = share + 1e-6
+    found = assessed(base, damping, null)
+    assert found.p == pytest.approx(41 / 401)
+    assert not found.accepted
+    assert found.reason == "no better than chance"
+    assert assessed(base, damping, null, replace(CFG, significance_level=0.2)).accepted
+    null[18:] = 0.0
+    assert assessed(base, damping, null).p == pytest.approx(19 / 401)
+    assert assessed(base, damping, null).accepted
+
+
+def with_gain(base, c, gain) -> FittedCandidate:
+    """Return a candidate that removes this share of each block's error, shape (B,) or one for all."""
+    return replace(c, errors=base.errors * (1 - np.broadcast_to(gain, base.errors.shape)))
+
+
+def test_a_small_gain_is_not_accepted(base, damping):
+    found = assessed(base, with_gain(base, damping, 0.04), np.zeros(400))
+    assert found.reason == "removes less than 5 % of the error"
+    assert assessed(base, with_gain(base, damping, 0.06), np.zeros(400)).accepted
+    assert found.gain == pytest.approx(0.04)
+
+
+def test_an_effect_that_harms_in_two_of_five_folds_is_not_accepted(base, damping):
+    fold = base.blocks.fold
+    one, two = (np.where(np.isin(fold, folds), -0.02, 0.6) for folds in ([3], [1, 3]))
+    assert assessed(base, with_gain(base, damping, one), np.zeros(400)).accepted
+    assert assessed(base, with_gain(base, damping, two), np.zeros(400)).reason == "folds disagree"
+
+
+def test_a_gain_owed_to_few_blocks_is_not_accepted(base, damping):
+    gain = np.full(len(base.errors), -0.3)
+    gain[int(np.argmax(base.errors))] = 0.99
+    found = assessed(base, with_gain(base, damping, gain), [-1.0] * 400, replace(CFG, min_gain=-1.0))
+    assert found.low < 0 < found.high
+    assert found.reason == "the interval of its gain includes zero"
+
+
+def test_an_effect_whose_parameter_may_be_null_or_is_at_its_bound_is_not_accepted(base, damping):
+    wide = replace(damping, std=np.full(len(damping.fit.values), 1e3))
+    assert assessed(base, wide, np.zeros(400)).reason == "its parameters may be at their null values"
+    p = Prediction(base.model, (damping.effect,), base.windows).parameters[-1]
+    values = damping.fit.values.copy()
+    values[-1] = p.high
+    ended = replace(damping, fit=replace(damping.fit, values=values))
+    assert assessed(base, ended, np.zeros(400)).reason == "a parameter is at its bound"
+
+
+def test_an_interval_is_two_standard_deviations_and_the_formulas_own_error(base, damping):
+    (found,) = fitted_parameters(base, damping)
+    p = Prediction(base.model, (damping.effect,), base.windows).parameters[-1]
+    own = law_errors([p], damping.fit.values[-1:])[0]
+    std = np.sqrt(covariance(damping.sums, base.blocks)[-1, -1]) * p.scale
+    assert std > 0
+    assert found.high - found.value == pytest.approx(1.96 * np.hypot(std, own), rel=1e-9)
+    assert found.value - found.low == pytest.approx(1.96 * np.hypot(std, own), rel=1e-9)
+    assert not found.at_bound
+    (given,) = fitted_parameters(base, replace(damping, std=np.full(len(damping.fit.values), 0.3)))
+    assert given.high - given.value == pytest.approx(1.96 * np.hypot(0.3 * p.scale, own), rel=1e-9)
+    (wide,) = fitted_parameters(base, replace(damping, std=np.full(len(damping.fit.values), 1e6)))
+    assert (wide.low, wide.high) == (p.low, p.high)
+
+
+def order(base, pairs) -> list[str]:
+    """Return the names of those that are indistinguishable, in their order."""
+    return [f.name for _, f in indistinguishable(base, pairs, SearchCfg())]
+
+
+def pair(base, c, name, value=None) -> tuple[FittedCandidate, Finding]:
+    """Return a candidate with a finding of a name, whose parameter has another value if one is given."""
+    found = replace(assessed(base, c, np.zeros(400)), name=name)
+    if value is not None:
+        found = replace(found, parameters=tuple(replace(p, value=value) for p in found.parameters))
+    return c, found
+
+
+def test_of_two_with_the_same_errors_the_rarer_comes_second(base, damping, monkeypatch):
+    friction = fit_candidate(base, screen(base, effect_class("joint_friction")("hinge")))
+    rare = replace(friction, errors=damping.errors)
+    null = [p.null for p in Prediction(base.model, (friction.effect,), base.windows).parameters][-1]
+    start = Prediction(base.model, (damping.effect,), base.windows).parameters[-1].null
+    pairs = [pair(base, rare, "friction", null), pair(base, damping, "damping", start)]
+    assert len(pairs[0][1].parameters) == len(pairs[1][1].parameters)
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 0.0)
+    monkeypatch.setattr(effect_class("joint_friction"), "rarity", 3.0)
+    assert order(base, pairs) == ["damping", "friction"]
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 6.0)
+    assert order(base, pairs) == ["friction", "damping"]
+
+
+def test_of_two_with_the_same_errors_the_larger_value_comes_second(base, damping):
+    scale = Prediction(base.model, (damping.effect,), base.windows).parameters[-1].scale
+    pairs = [pair(base, damping, "large", 9 * scale), pair(base, damping, "small", scale)]
+    assert order(base, pairs) == ["small", "large"]
+
+
+def test_errors_that_fall_are_shares_of_each_channel(base, damping):
+    ((name, share),) = removed_by_channel(base, damping)
+    assert name == "angle"
+    before = sum(float(piece.residual @ piece.residual) for piece in base.pieces)
+    after = sum(float(piece.residual @ piece.residual) for piece in damping.pieces)
+    assert share == pytest.approx(1 - after / before)
+    assert removed_by_channel(base, replace(damping, pieces=base.pieces)) == ()
+
+
+def test_the_detectable_size_adds_the_share_to_the_error(base):
+    screened = screen(base, effect_class("joint_damping")("hinge"))
+    found = detectable_size(base, screened, 0.1)
+    p = Prediction(base.model, (screened.effect,), base.windows).parameters[-1]
+    curvature = sum(float(piece.jacobian[:, -1] @ piece.jacobian[:, -1]) for piece in screened.pieces)
+    assert (found.name, found.parameter, found.unit) == ("joint_damping", p.name, p.unit)
+    assert curvature * (found.size / p.scale) ** 2 == pytest.approx(0.1 * base.errors.sum())
+    assert detectable_size(base, screened, 0.4).size == pytest.approx(2 * found.size)
+    assert detectable_size(base, screened, 1e9) is None
