@@ -1,4 +1,4 @@
-"""Contact events on demonstrations of the shape sorter: what is found, when, and whether it is the same each time.
+"""Contact events on demonstrations of the shape sorter: stages found, their times, and repeatability.
 
 python -m benchmarks.events.extraction                                       # the inset geometry, 12 seeds
 python -m benchmarks.events.extraction --model runs/demo/model.toml --name fitted
@@ -213,11 +213,11 @@ def differences(late: list[float]) -> list[str]:
 
 
 def section(name: str, result: dict[str, Any]) -> str:
-    """Return the part of the page about one model."""
+    """Return the section of one model."""
     rows = result["rows"]
     right = sum(tuple(row["stages"]) == STAGES for row in rows)
     text = f"## {name[0].upper()}{name[1:]} geometry\n\n{machine_line(result['machine'])}\n\n"
-    text += f"{', '.join(STAGES)} found, in this order and nothing else, on {right} of {len(rows)} seeds.\n\n"
+    text += f"Exactly {', '.join(STAGES)}, in this order, on {right} of {len(rows)} seeds.\n\n"
     cells = []
     for row in rows:
         pairs = [(row["start"].get(stage), row["truth"].get(stage)) for stage in STAGES]
@@ -272,18 +272,17 @@ def page(results: dict[str, Any]) -> str:
     """Return the page."""
     text = """# Contact events: shape sorter
 
-Demonstrations of Reality, one a seed, replayed through a model; see [contact events](../events.md). Beside
-each start of a stage is how much later it comes than in truth: for pick the first contact of a finger and the block,
-for align that of block and box, for insert that of the block with a wall of the hole. The model steps by 5 ms,
-Reality by 1 ms. *Contact overlap*: IoU of the frames in which block and box touch with those of the truth.
+`python -m benchmarks.events.extraction`: demonstrations of Reality, one a seed, replayed in a model; the [contact
+events](../events.md) of the replay are compared with Reality's contacts. In brackets: by how much a stage starts later
+than in Reality, where pick starts with the first contact of a finger and the block, align with that of block and box,
+insert with that of the block and a wall of the hole. The model steps by 5 ms, Reality by 1 ms. *Contact overlap*: IoU
+of the frames in which block and box touch with those of Reality.
 
-Insert comes when the replayed block slips off the rim, which depends on the geometry and not on how stages are found:
-*block 2 mm below the rim* says how much earlier or later that is in the motion itself.
-In truth as in the model the block then hangs in the mouth of the hole, 2 to 4 mm deep, until it is pushed home half a
-second later; whether it leans on a wall before that push is a close call. A model whose hole is too wide lets the block
-go straight in: then no align is there to be found.
-
-`python -m benchmarks.events.extraction`
+What the figures do not show: how exactly stages are found in insert. There the replayed motion itself differs: the
+block slips off the rim earlier or later, depending on the geometry (row *block 2 mm below the rim*), and in Reality as
+in the model it then rests in the mouth of the hole, 2 to 4 mm deep, where it may or may not touch a wall. With a hole
+that is too wide in the model, no align exists. The fitted geometry has larger errors than the inset one in pick and
+align, and about the same in insert.
 
 """
     return text + "\n".join(section(name, result) for name, result in results.items())

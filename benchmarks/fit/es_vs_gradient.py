@@ -1,14 +1,14 @@
 """Evolution strategy, gradients, and gradients that seed the strategy: error against simulations and time.
 
-Four scenes (settle, push, tumble, insertion), five seeds each. The error is the mean distance of 24 tracked points from
-where the model has them, in the MuJoCo engine, on the demonstration that was fitted and on another one; judging costs
-no simulations. A rollout in MuJoCo counts as one simulation, one in Newton with its gradient as two.
+Four scenes (settle, push, tumble, insertion), five seeds each. The error is the mean distance of 24 tracked points
+between measurement and model, in C MuJoCo, on the fitted demonstration and on an unseen one; evaluating it costs no
+simulations. A rollout in MuJoCo counts as one simulation, one in Newton with its gradient as two.
 
     python -m benchmarks.fit.es_vs_gradient --out runs/es_vs_gradient.jsonl  # resumable; --seconds 200 ends early
     python -m benchmarks.fit.es_vs_gradient --out runs/es_vs_gradient.jsonl --report   # page and figure, in docs
 
-Several processes may share the work by --seeds and --scenes, each with an --out of its own; --parts names the others to
-the report. The page keeps what other machines have measured, in docs/benchmarks/data.
+Several processes may share the work by --seeds and --scenes, each with its own --out; --parts names the others to
+the report. The page keeps the results of other machines, in docs/benchmarks/data.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FIT = FitCfg(
     generations=40,
     patience=40,
 )
-"""Nothing is gripped in these scenes: what pushes an object may not freeze the face that it touches."""
+"""Nothing is grasped in these scenes: a pushing body must not freeze the face that it touches."""
 SLACK = 1.05
 """An error within this factor of another counts as equal."""
 
@@ -210,9 +210,9 @@ def summary(rows: dict[str, dict[str, Any]], scene: str, device: str) -> list[st
 def report(args: Args) -> None:
     """Write the page."""
     fresh = {key: row for path in (args.out, *args.parts) for key, row in Measurements(path).rows.items()}
-    if not fresh:
-        raise SystemExit(f"{args.out}: no results; run without --report first")
     known = read_data(NAME)
+    if not fresh and not known:
+        raise SystemExit(f"{args.out}: no results; run without --report first")
     rows = known.get("rows", {}) | fresh
     devices = sorted({key.rsplit(" ", 1)[1] for key in rows})
     assert __doc__ is not None
@@ -220,12 +220,12 @@ def report(args: Args) -> None:
     text += [
         "`python -m benchmarks.fit.es_vs_gradient`. Medians over seeds (range); errors in mm.",
         "",
-        "- *gradient*: the iterate that gradients end with, as scored in MuJoCo. *helped*: seeds in which it beat the",
-        "  start by 5 %, so that the strategy began there, else at the start.",
-        "- *at equal budget*: gradient+es after as many simulations as es took in all; *ratio*: relative to es.",
-        "- *of es to the error of gradient*: simulations after which es is within 5 % of it.",
+        "- *gradient*: the last iterate of the descent, evaluated in MuJoCo. *helped*: seeds in which it is at",
+        "  least 5 % better than the start; the evolution strategy then begins there, else at the start.",
+        "- *at equal budget*: gradient+es after as many simulations as es takes in all; *ratio*: relative to es.",
+        "- *of es to the error of gradient*: simulations after which es is within 5 % of that error.",
         "- *share*: simulations until gradient+es is within 5 % of the final error of es, relative to those of es;",
-        "  *a third*: seeds in which that is at most a third.",
+        "  *a third*: seeds in which it is at most a third.",
         "",
     ]
     head = [
@@ -242,8 +242,8 @@ def report(args: Args) -> None:
     plain = {key: {k: v for k, v in row.items() if k != "machine"} for key, row in rows.items()}
     write_data(NAME, {"machines": machines, "rows": plain})
     page = FOLDER / f"{NAME}.md"
-    said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
-    text += [f"## What it says{part}" for part in said]
+    said = page.read_text().split("## Reading the figures", 1)[1:] if page.is_file() else []
+    text += [f"## Reading the figures{part}" for part in said]
     write_page(NAME, "\n".join(text))
 
 

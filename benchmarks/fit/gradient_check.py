@@ -1,8 +1,9 @@
-"""Gradients through Newton against central differences, by how much of a demonstration they go through.
+"""Gradients through Newton against central differences, by the length of the simulated horizon.
 
-Settling, pushing, tumbling and the insertion of a peg of spheres into a socket of spheres, as in `gradient_scenes.py`,
-three starting geometries each. The loss of a horizon is the Chamfer distance over the frames until then. Compared are
-slopes along eight smooth deformations of the spheres, and those with respect to friction, stiffness and mass.
+Settling, pushing, tumbling, and insertion of a peg of spheres into a socket of spheres
+(`benchmarks/fit/gradient_scenes.py`), three starting geometries each. The loss of a horizon is the Chamfer distance
+over the frames until then. Slopes along eight smooth deformations of the spheres, and with respect to friction,
+stiffness and mass, are compared with central differences.
 
     python -m benchmarks.fit.gradient_check                 # a few minutes on a CPU; writes into docs/benchmarks
 """
@@ -113,12 +114,12 @@ def main(args: Args) -> list[dict[str, Any]]:
     if not args.write:
         return rows
     assert __doc__ is not None
-    text = ["# Gradients through Newton, checked", "", "\n".join(__doc__.split("\n")[2:5]), ""]
+    text = ["# Gradients through Newton, checked", "", "\n".join(__doc__.split("\n")[2:6]), ""]
     facts = machine(args.device)
     text += [f"`python -m benchmarks.fit.gradient_check`. {machine_line(facts)}", ""]
     text += [
-        "Relative error of the slopes along the deformations: norm of the difference over that of the central",
-        "differences, median (worst) of the geometries. Then the same of single factors, and the size of the slopes.",
+        "Relative error of the slopes along the deformations: norm of the difference over the norm of the central",
+        "differences, median (worst) of the geometries; then the same for single factors, and the size of the slopes.",
         "",
     ]
     head = ["motion", "until [s]", "steps", "relative error", "friction", "stiffness", "mass", "slope [mm/mm]"]
@@ -139,8 +140,8 @@ def main(args: Args) -> list[dict[str, Any]]:
             lines.append([WORDS[scene], f"{horizon:g}", steps, worst, *factors, f"{size:.2g}"])
     text += [table(head, lines)]
     page = FOLDER / f"{NAME}.md"
-    said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
-    text += [f"## What it says{part}" for part in said]
+    said = page.read_text().split("## Reading the figures", 1)[1:] if page.is_file() else []
+    text += [f"## Reading the figures{part}" for part in said]
     write_data(NAME, {"machine": facts, "rows": [{k: as_number(v) for k, v in r.items()} for r in rows]})
     write_page(NAME, "\n".join(text))
     return rows

@@ -1,15 +1,15 @@
-"""Forward and backward runs through Newton: worlds x steps a second, and memory, as worlds grow from 1 to 1,024.
+"""Forward and backward runs through Newton: worlds x steps a second, and memory, for 1 to 1,024 worlds.
 
 A box of 64 spheres that settles on a plane, 0.2 s. One rollout with its gradient is timed, captured and warm; the
-backward run simulates each chunk of steps once more, which is in it. *bytes a step*: what one step of one world keeps
-until its gradient has been taken. *per chunk*: the same for all worlds and all steps of a chunk. *on the device*:
-memory that all worlds have taken of a graphics processor after the first call, the clouds included.
+backward pass includes a second simulation of each chunk of steps. *bytes a step*: memory of one step of one world until
+its gradient is computed; *per chunk*: that of all worlds and all steps of a chunk; *on the device*: GPU memory after
+the first call, point clouds included. Other scenes need more time with more pairs of spheres.
 
     python -m benchmarks.fit.gradient_throughput --out runs/gradient_throughput.jsonl                  # on a CPU
     python -m benchmarks.fit.gradient_throughput --out runs/gradient_throughput.jsonl --device cuda:0  # appended
     python -m benchmarks.fit.gradient_throughput --out runs/gradient_throughput.jsonl --report         # page, in docs
 
-The page keeps what other machines have measured, in docs/benchmarks/data.
+The page keeps the results of other machines, in docs/benchmarks/data.
 """
 
 from __future__ import annotations
@@ -147,8 +147,8 @@ def report(rows: dict[str, dict[str, Any]]) -> None:
         text += [machine_line(mine[0]["machine"]), "", table(head, lines)]
     write_data(NAME, rows)
     page = FOLDER / f"{NAME}.md"
-    said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
-    write_page(NAME, "\n".join([*text, *(f"## What it says{part}" for part in said)]))
+    said = page.read_text().split("## Reading the figures", 1)[1:] if page.is_file() else []
+    write_page(NAME, "\n".join([*text, *(f"## Reading the figures{part}" for part in said)]))
 
 
 if __name__ == "__main__":

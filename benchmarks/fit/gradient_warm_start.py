@@ -1,9 +1,9 @@
 """Fits of a missing effect with and without a start by gradients through Newton: simulated steps, time and result.
 
-Three scenes of boxes, each with another thing wrong in the model: a block that slides to rest (friction), one that runs
-into another (the other's mass), one that drops flat (softness of contacts). The truth is an exact box in C MuJoCo with
-half the time step; poses are measured at 100 Hz with 0.1 mm and 1 mrad of noise. Diagnosed with the candidates sliding
-friction, mass, inertia and softness of contacts, without and with `DiagnoseCfg.gradient`.
+Scenes of boxes with one wrong parameter in the model: a block that slides to rest (friction), one that hits another
+(the other's mass), one that drops flat (contact compliance). The truth is an exact box in C MuJoCo with half the time
+step; poses are measured at 100 Hz with 0.1 mm and 1 mrad of noise. Candidates of the diagnosis are sliding friction,
+mass, inertia and contact compliance, without and with `DiagnoseCfg.gradient`.
 
     python -m benchmarks.fit.gradient_warm_start --out runs/gradient_warm_start.jsonl            # resumable
     python -m benchmarks.fit.gradient_warm_start --out runs/gradient_warm_start.jsonl --report   # page, in docs
@@ -24,7 +24,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from benchmarks.measurements import Measurements
-from benchmarks.pages import FOLDER, machine, machine_line, table, write_data, write_page
+from benchmarks.pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis
@@ -39,7 +39,7 @@ from concent_warp.simulate.mujoco_engine import MujocoEngine
 NAME = "gradient_warm_start"
 SceneName = Literal["slide", "collide", "drop"]
 EFFECTS = {"slide": ("sliding_friction", "a"), "collide": ("mass", "b"), "drop": ("contact_compliance", "a")}
-"""What is wrong in each scene, and with which body."""
+"""The wrong effect of each scene, and its body."""
 CANDIDATES = ("sliding_friction", "mass", "inertia", "contact_compliance")
 HALF, RADIUS, MASS, FRICTION = 0.02, 0.002, 0.08, 0.4
 """Half the edge of a block and radius of its corner spheres [m], its mass [kg], and friction, in the model."""
@@ -177,13 +177,13 @@ def report(rows: list[dict[str, Any]]) -> None:
     """Write the page."""
     assert __doc__ is not None
     text = ["# Gradients as a start for the diagnosis", "", "\n".join(__doc__.split("\n")[2:6]), ""]
-    text += [f"`python benchmarks/{NAME}.py`. Medians over seeds (range).", ""]
+    text += [f"`python -m benchmarks.fit.{NAME}`. Medians over seeds (range).", ""]
     text += [
-        "- *gradients*: error of what is wrong in the model, relative, where gradients in Newton end.",
+        "- *gradients*: relative error of the wrong parameter at the end of the descent in Newton.",
         "- *steps*: of MuJoCo, in thousands, in the whole diagnosis; *with*: with `--gradient`.",
-        "- *error*: of the fitted value of what is missing, relative. *right*: diagnoses that name it, alone or in a",
-        "  group. *residual*: over noise, of the model with what was added.",
-        "- *s*: seconds of the diagnosis; *Newton*: of the descent by itself.",
+        "- *error*: relative error of the fitted value. *right*: diagnoses that name the effect, alone or in",
+        "  a group. *residual*: over noise, of the model with the added effects.",
+        "- *s*: seconds of the diagnosis; *Newton*: of the descent alone.",
         "",
         machine_line(rows[0]["machine"]),
         "",
@@ -216,12 +216,12 @@ def report(rows: list[dict[str, Any]]) -> None:
     text += [table(head, lines)]
     write_data(NAME, {r["key"]: r for r in rows})
     page = FOLDER / f"{NAME}.md"
-    said = page.read_text().split("## What it says", 1)[1:] if page.is_file() else []
-    write_page(NAME, "\n".join([*text, *(f"## What it says{part}" for part in said)]))
+    said = page.read_text().split("## Reading the figures", 1)[1:] if page.is_file() else []
+    write_page(NAME, "\n".join([*text, *(f"## Reading the figures{part}" for part in said)]))
 
 
 def led_error(row: dict[str, Any]) -> float:
-    """Return the relative error of what is wrong in the model where gradients end."""
+    """Return the relative error of the wrong parameter at the end of the gradient descent."""
     found = row["newton"]
     ends = {"slide": found["friction"], "collide": found["mass"].get("b"), "drop": found["stiffness"] ** -0.5}
     return abs(ends[row["scene"]] / row["factor"] - 1)
@@ -239,6 +239,8 @@ def main(args: Args) -> None:
     """Measure what is missing, or write the page."""
     kept = Measurements(args.out, seconds=args.seconds)
     if args.report:
+        if not kept.rows:
+            kept.rows.update(read_data(NAME))
         if not kept.rows:
             raise SystemExit(f"{args.out}: no results; run without --report first")
         report(list(kept.rows.values()))

@@ -20,28 +20,35 @@ from benchmarks.pages import FOLDER, machine_line, read_data, table, write_data,
 NAME = "train_throughput"
 PICTURE = "train_throughput_vcp.png"
 ABOUT = """\
-The task is the insertion stage of the shape sorter with the arm. A step of an environment is one action, so
-`decimation` steps of the simulator; actions are random, and episodes end and start anew in between.
+`python -m benchmarks.train.throughput --out F`: environment steps per second of the insertion stage of the shape sorter
+with the arm. A step is one action, `decimation` steps of the simulator; actions are random; episodes end and restart.
 
-*environment* is the whole of `Environment.step` without learning: commands, physics, contact pairs, virtual collisions,
-reward, resets, observation. *bare* is `mujoco_warp.step`, as many of them as an action has, captured in one graph with
-the same model and the same buffers, from the same states with the same commands: those with which the environment's
-physics began, step by step, put back before each launch and not counted. Left to itself with the commands held, the
-engine comes to rest and is quicker (*at rest*); a policy in training does not leave it to itself. Medians, compilation
-and capture in none of them. Rates are environment steps per second.
+*environment* is all of `Environment.step` without learning: commands, physics, contact pairs, virtual collisions,
+reward, resets, observation. *bare* is `mujoco_warp.step`, as often as an action has steps, captured in one graph with
+the same model and buffers, from the same states with the same commands, which are restored before each launch outside
+of the timing. *at rest*: the engine with constant commands, which comes to rest and is faster. Medians without
+compilation and capture.
 
-The profile is of events on the device between the parts, in the course of steps; *distances* are contact pairs and
-virtual collisions, *judge* reward, ends of episodes and new initial states, *poses and pairs* what follows from those.
+The profile has the times of events on the device: *distances* are contact pairs and virtual collisions, *judge* is
+reward, ends of episodes and resets, *poses and pairs* their consequences.
+
+What the figures do not show: other tasks (time grows with spheres and contacts), and, in the first two sections, the
+default settings: surface points in the penalty, on by default, are off there. Sections are of different machines with
+different loads.
 """
 VCP = """\
-The same environment with the spheres of the contact events in the physics and the others in the penalty (VCP), and with
-all spheres in the physics (FULL). Actions are random.
+`python -m benchmarks.train.throughput --out F --collisions vcp full`: the same environment with the spheres
+of the contact events in the physics and the others in the penalty (VCP), and with all spheres in the physics (FULL).
+Actions are random.
 
-A batched engine has room for so many contacts and no more. *fixed* is FULL with VCP's buffers: what finds no room is
-dropped, and the states are wrong though finite. *fitting* is FULL with buffers found by doubling those that were too
-small until no step of no world dropped anything in a run of its own; in the run that is timed a few may still. Dropped
-are the world's steps in which something was; diverged the worlds whose state was not finite or beyond all bounds, of
-the episodes that ended. Memory is what the environment took, its graphs included, beyond one of 16 worlds.
+A batched engine has buffers for a fixed number of contacts. *fixed* is FULL with VCP's buffers: contacts beyond them
+are dropped, and the states are wrong though finite. *fitting* is FULL with buffers doubled until no world drops a
+contact in a separate run; in the timed run a few may. *dropped* is the share of world steps with dropped contacts;
+*diverged* the worlds with infinite or implausible states, of the episodes that ended. Memory is that of the environment
+with its graphs, beyond one of 16 worlds.
+
+What the figures do not show: default settings. The first section is without surface points in the penalty, which are on
+by default; the second has them, with pyramidal cones and steps twice as long. With 256 worlds the gain is 1.2 to 1.3.
 """
 
 
@@ -50,11 +57,11 @@ class Args:
     """Command line."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Measurements to take in; all are of one machine."""
+    """Measurements to add; all are of one machine."""
     section: str = ""
-    """Heading under which they stand, besides the device; by default with those of that kind of device."""
+    """Their heading besides the device; by default they are added to those of that kind of device."""
     remark: str = ""
-    """What is to be said of them."""
+    """Remark on the measurements."""
 
 
 def memory(r: Row) -> str:
@@ -68,7 +75,7 @@ def at(row: Row, name: str) -> float:
 
 
 def share(row: Row) -> float:
-    """Return what is left of the bare engine's rate."""
+    """Return the share of the bare engine's rate."""
     return at(row, "environment_ms") / at(row, "bare_ms")
 
 
@@ -96,7 +103,7 @@ def throughput(rows: list[Row]) -> list[str]:
     names = list(of(rows, "rate vcp")[0]["profile_ms"])
     return [
         table([*head, "steps that dropped contacts", "GiB"], lines),
-        "Contacts, constraint rows and iterations of the solver are means of a world, and the most iterations of any.",
+        "Contacts, constraint rows and solver iterations are means over worlds; *most* is the largest number of them.",
         "Where a step's time goes [ms]:",
         table(["worlds", "step", *names], profiles),
     ]
@@ -111,9 +118,7 @@ def learning(rows: list[Row]) -> list[str]:
         rate = 1e3 * r["worlds"] * r["steps"] / (collecting + updating)
         name = f"{r['worlds']:,}, {r['spheres']} spheres" + (f", {title}" if title else "")
         lines.append([name, f"{rate:,.0f}", f"{collecting:.0f}", f"{updating:.0f}"])
-    text = (
-        "With PPO, a round being 24 steps of each environment and an update of 5 epochs x 4 batches if not said else:"
-    )
+    text = "With PPO; an iteration is 24 steps of each environment and an update of 5 epochs x 4 batches unless stated:"
     return [text, table(["worlds", "steps/s", "collecting, ms", "updating, ms"], lines)] if lines else []
 
 
@@ -136,8 +141,8 @@ def kernels(rows: list[Row]) -> list[str]:
     for r in of(rows, "kernels"):
         lines = [[f"`{name}`", f"{launches:.0f}", f"{ms:.3f}"] for name, launches, ms in r["kernels"][:21]]
         parts += [
-            f"Kernels of a step that take most time, {r['worlds']:,} worlds ({r['collision']}). Of the solver's loop, "
-            "which is one within the graph, the profiler sees the first pass alone; the others are in no line:",
+            f"Slowest kernels of a step, {r['worlds']:,} worlds ({r['collision']}). Of the solver's loop "
+            "within the graph the profiler records the first pass only:",
             table(["kernel", "launches", "ms"], lines),
         ]
     return parts
@@ -224,7 +229,7 @@ def main() -> None:
     """Take measurements in and write the pages."""
     data = taken(tyro.cli(Args, description=__doc__))
     write_data(NAME, data)
-    written = f"Written by `benchmarks/{NAME}_report.py`; do not edit."
+    written = "Written by `benchmarks/train/throughput_report.py`; do not edit."
     pages = {NAME: ["# Throughput of training", written, ABOUT], "train_vcp": ["# VCP against FULL", written, VCP]}
     for result in data.values():
         rows = list(result["rows"].values())
