@@ -113,7 +113,7 @@ def test_events_are_the_three_stages_of_the_task(run, tmp_path):
 
 def test_comparison_falls_to_the_noise_with_friction(run):
     said = run("steps/compare.py")
-    assert re.search(r"^hinge_position, nominal: .* 8\.2 x noise$", said, re.MULTILINE)
+    assert re.search(r"^hinge_position, nominal: .* 7\.2 x noise$", said, re.MULTILINE)
     assert re.search(r"^hinge_position, with friction: .* 1\.0 x noise$", said, re.MULTILINE)
     assert "hinge_position: the error has fallen" in said
 

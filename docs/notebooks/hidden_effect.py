@@ -37,18 +37,18 @@ for name, channel in {**demonstration.action, **demonstration.measured}.items():
 
 # %% [markdown]
 # ## Compare
-# The nominal model is the scene of the recording as it stands. `compare` replays the commands in it and sets the error
-# against the error that the measurement noise alone would leave: 1 x noise is as good as a model can be.
+# The nominal model is the scene of the recording as it stands. `compare` replays the commands in it and divides the error
+# by the error that the measurement noise alone would leave: 1 x noise is as good as a model can be.
 
 # %%
 nominal = cw.Model.from_recording(recording)
 comparison = cw.compare({"nominal": nominal}, recording)
 for channel in comparison.channels:
     summary = comparison.summarise("nominal", channel)
-    print(f"{channel}: {summary.mean:.2g} {summary.unit} = {summary.ratio:.1f} x noise")
+    print(f"{channel}: RMS error {summary.rms:.2g} {summary.unit} = {summary.ratio:.1f} x noise")
 
 # %% [markdown]
-# The encoder sees eight times its noise: the model is wrong, but the figures do not say how.
+# The error of the encoder is seven times its noise: the model is wrong, but the figures do not say how.
 #
 # ## Diagnose
 # `diagnose` fits every effect of the library that could act here, judges each on data that its fit has not seen, and
