@@ -37,8 +37,8 @@ for name, channel in {**demonstration.action, **demonstration.measured}.items():
 
 # %% [markdown]
 # ## Compare
-# The nominal model is the scene of the recording as it stands. `compare` replays the commands in it and divides the error
-# by the error that the measurement noise alone would leave: 1 x noise is as good as a model can be.
+# The nominal model is the scene of the recording as it stands. `compare` replays the commands in it and divides the
+# error by the one that the measurement noise alone would leave: 1 x noise is as good as a model can be.
 
 # %%
 nominal = cw.Model.from_recording(recording)
