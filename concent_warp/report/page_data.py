@@ -17,7 +17,7 @@ from concent_warp.report.headline import headline_channel
 from concent_warp.report.motion_data import motion_data
 from concent_warp.report.opening import first_demonstration, openings
 from concent_warp.report.scene_data import geometry_data, packed, scene_bodies
-from concent_warp.report.where import numbered
+from concent_warp.report.worst_spans import numbered_spans
 from concent_warp.simulate.replay import initial_state
 from concent_warp.simulate.select import make_engine
 
@@ -68,7 +68,7 @@ def page_data(
         "demonstrations": found,
         "history": [] if fit is None else fit.history,
         "view": _camera_views(last, demonstrations[0]),
-        "places": [_place_data(comparison, number, place) for number, place in numbered(comparison)],
+        "places": [_place_data(comparison, number, place) for number, place in numbered_spans(comparison)],
     }
 
 

@@ -16,11 +16,11 @@ from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_text
-from concent_warp.report.diagnosis import bullet_list, diagnosis_section
+from concent_warp.report.diagnosis_section import bullet_list, diagnosis_section
 from concent_warp.report.headline import cards, headline_channel, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
-from concent_warp.report.where import noise_words, place_list, shown_demonstrations
+from concent_warp.report.worst_spans import noise_words, shown_demonstrations, worst_span_list
 from concent_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def write_report(
         )
         + '<span class="key noise"></span>noise floor',
         "diagnosis": diagnosis_section(diagnosis),
-        "where": _where_section(comparison, [d.name for d in chosen]),
+        "where": _worst_spans_section(comparison, [d.name for d in chosen]),
         "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (
             "How far the simulation is from the measurement at each instant of the replay. The bands are "
@@ -125,7 +125,7 @@ def _follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
     return sorted(data["view"]["bodies"], key=lambda name: name not in about)
 
 
-def _where_section(comparison: Comparison, shown: Sequence[str]) -> str:
+def _worst_spans_section(comparison: Comparison, shown: Sequence[str]) -> str:
     """Return the section that says where the last model fails."""
     strips = ""
     if len(comparison.models) > 1:
@@ -134,7 +134,9 @@ def _where_section(comparison: Comparison, shown: Sequence[str]) -> str:
         f"Every channel over time, coloured by its error over the measurement noise.{strips} Bands are "
         f"{_bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
     )
-    return _filled(_page_file("where.html"), {"about": escape(about), "places": place_list(comparison, shown)})
+    return _filled(
+        _page_file("worst_spans.html"), {"about": escape(about), "places": worst_span_list(comparison, shown)}
+    )
 
 
 def _bands(comparison: Comparison) -> str:

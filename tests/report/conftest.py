@@ -45,6 +45,8 @@ DIAGNOSIS = {
             "family": "contact",
             "gain": {"value": gain, "interval": [gain - 0.1, gain + 0.1]},
             "p": p,
+            "p_smallest": 0.001,
+            "accepted": p < 0.05,
             "parameters": [{"name": "coefficient[block]", "value": 0.31, "interval": [0.28, 0.35], "unit": "-"}],
         }
         for name, gain, p in (("sliding_friction", 0.5, 0.001), ("grip_force", 0.48, 0.001), ("air_drag", -0.02, 1.0))

@@ -17,7 +17,7 @@ from concent_warp.report.headline import _overlap_note
 from concent_warp.report.opening import first_demonstration, openings
 from concent_warp.report.report import _filled, write_report
 from concent_warp.report.scene_data import scene_bodies
-from concent_warp.report.where import numbered, shown_demonstrations
+from concent_warp.report.worst_spans import numbered_spans, shown_demonstrations
 from concent_warp.scene.scene import Scene
 
 PENDULUM = """
@@ -153,7 +153,7 @@ def test_bodies_that_measured_joints_move_are_shown_where_the_joints_put_them(ca
 
 
 def test_the_worst_places_stand_in_the_page_and_can_be_clicked(case, text, data):
-    places = [place for _, place in numbered(case.comparison)]
+    places = [place for _, place in numbered_spans(case.comparison)]
     assert places
     for number, place in enumerate(places, 1):
         assert escape(place.sentence(demonstration=True)) in text

@@ -1,4 +1,4 @@
-"""The section of a report that says where the model fails: a timeline of all channels, the worst places in words."""
+"""The section of a report on where the model fails: a timeline of all channels, and the worst spans in words."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from concent_warp.comparison.units import words
 from concent_warp.comparison.worst_spans import LEAST, WorstSpan, alike
 from concent_warp.estimation.noise import WORDS
 
-MOST_PLACES = 6
-"""Places in the list."""
+MOST_SPANS = 6
+"""Spans in the list."""
 
 
-def numbered(comparison: Comparison) -> list[tuple[int, WorstSpan]]:
-    """Return the places that the page names, numbered from 1: the worst of each kind."""
+def numbered_spans(comparison: Comparison) -> list[tuple[int, WorstSpan]]:
+    """Return the spans that the page lists, numbered from 1: the worst of each kind."""
     found, seen = [], set()
     for place in comparison.places:
-        if alike(place) not in seen and len(found) < MOST_PLACES:
+        if alike(place) not in seen and len(found) < MOST_SPANS:
             seen.add(alike(place))
             found.append((len(found) + 1, place))
     return found
 
 
 def shown_demonstrations(comparison: Comparison, most: int) -> tuple[str, ...]:
-    """Return the demonstrations to show, in their order: those with the worst places, then the first ones."""
-    worst = [place.demonstration for _, place in numbered(comparison)]
+    """Return the demonstrations to show, in their order: those with the worst spans, then the first ones."""
+    worst = [place.demonstration for _, place in numbered_spans(comparison)]
     chosen = list(dict.fromkeys([*worst, *comparison.demonstrations]))[:most]
     return tuple(d for d in comparison.demonstrations if d in chosen)
 
 
-def place_list(comparison: Comparison, shown: Collection[str]) -> str:
-    """Return the worst places as a list; those in a demonstration that is `shown` can be clicked."""
-    places = numbered(comparison)
+def worst_span_list(comparison: Comparison, shown: Collection[str]) -> str:
+    """Return the worst spans as a list; those in a demonstration that is `shown` can be clicked."""
+    places = numbered_spans(comparison)
     if not places:
         return f"<p>The error is nowhere above {LEAST:g} x noise.</p>"
     several = len(comparison.demonstrations) > 1
@@ -51,7 +51,7 @@ def place_list(comparison: Comparison, shown: Collection[str]) -> str:
 
 
 def noise_words(comparison: Comparison) -> str:
-    """Return where the noise floors are from; the way of most channels comes first, without their names."""
+    """Return the sources of the noise floors; that of most channels comes first, without their names."""
     found: dict[str, list[str]] = {}
     for channel in comparison.channels:
         source = comparison.summarise(comparison.after, channel).source

@@ -1,0 +1,157 @@
+"""The section of a report that shows a diagnosis: what is missing with its evidence, and what to measure next.
+
+It reads the JSON object of a diagnosis (docs/diagnose.md); entries that are missing are left out of the section.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from concent_warp.comparison.units import p_value_text, words
+from concent_warp.report.tables import Row, table
+
+MOST_EFFECTS = 10
+"""Effects in the chart; further ones are folded away."""
+ANSWER_CLASSES = {"effect": "named", "group": "open", "none_needed": "fine", "none_of_these": "lost"}
+"""Style of the headline by verdict."""
+FAMILIES = {
+    "joints": "joints and drives",
+    "objects": "objects",
+    "contact": "contact",
+    "world": "world",
+    "measurement": "measurement",
+}
+
+
+def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
+    """Return the section as HTML, empty where there is no diagnosis."""
+    if not diagnosis:
+        return ""
+    effects, verdict = diagnosis.get("effects", ()), diagnosis["verdict"]
+    found = ['<section id="diagnosis">', "<h2>What is missing</h2>"]
+    found.append(f'<p class="answer {ANSWER_CLASSES[verdict]}">{escape(_headline(diagnosis))}</p>')
+    found += [f"<p>{escape(_group_sentence(group))}</p>" for group in diagnosis.get("groups", ()) if len(group) > 1]
+    if effects:
+        found += ["<h3>Held-out error that each effect removes</h3>", _bars(effects)]
+    if parameters := _parameter_rows(effects):
+        header = ["effect", "parameter", "value", "95 % interval", "unit"]
+        found += ["<h3>Parameters</h3>", table(header, parameters, 2)]
+    if where := diagnosis.get("where"):
+        found += ["<h3>Where it shows</h3>", bullet_list([entry["sentence"] for entry in where])]
+    if limits := diagnosis.get("detectable"):
+        rows: list[Row] = [("", [escape(words(d["name"])), _number(d["size"], 3), escape(d["unit"])]) for d in limits]
+        opened = " open" if verdict == "none_needed" else ""
+        about = "<summary>Smallest detectable effects</summary>"
+        found.append(f"<details{opened}>{about}{table(['effect', 'size', 'unit'], rows, 1)}</details>")
+    if experiment := diagnosis.get("next_experiment"):
+        found.append(f'<p class="next"><b>Next experiment</b> {escape(experiment["sentence"])}</p>')
+    return "\n".join([*found, "</section>"])
+
+
+def _headline(diagnosis: Mapping[str, Any]) -> str:
+    """Return the verdict in one or two sentences."""
+    accepted = [e for e in diagnosis.get("effects", ()) if e["accepted"]]
+    groups = diagnosis.get("groups", ())
+    left = f" {_share(diagnosis['unexplained'])} of the error stays unexplained." if "unexplained" in diagnosis else ""
+    if diagnosis["verdict"] == "none_needed":
+        return "No discrepancy was detected: the model explains the measurements down to their noise."
+    if diagnosis["verdict"] == "group":
+        group = next(g for g in groups if len(g) > 1)
+        names = _listed([words(name) for name in group])
+        return f"The model lacks something, and the data cannot distinguish between {names}.{left}"
+    if diagnosis["verdict"] == "effect":
+        names = _listed([f"{words(e['name'])} ({FAMILIES.get(e['family'], e['family'])})" for e in accepted])
+        return f"The model lacks {names}. {_gain_sentence(accepted)}{left}"
+    lacks = "The model lacks something that none of the effects in the library explains"
+    if not accepted:
+        return f"{lacks}.{left}"
+    alike = [next((g for g in groups if e["name"] in g), [e["name"]]) for e in accepted]
+    names = _listed([_listed([words(name) for name in group], "or") for group in alike])
+    return f"{lacks}, beside what {names} can account for. {_gain_sentence(accepted)}{left}"
+
+
+def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the held-out gains of effects."""
+    parts = [
+        f"{words(e['name']) if len(effects) > 1 else 'it'} removes {_gain_text(e)} of the error ({_p_text(e)})"
+        for e in effects
+    ]
+    return f"On data that the fit has not seen, {', '.join(parts)}."
+
+
+def _group_sentence(group: Sequence[str]) -> str:
+    """Return a sentence on effects that the data cannot distinguish."""
+    return f"These data cannot distinguish between {_listed([words(name) for name in group])}."
+
+
+def _bars(effects: Sequence[Mapping[str, Any]]) -> str:
+    """Return a bar for each effect with its interval; what lies beyond `MOST_EFFECTS` is folded away."""
+    ends = [end for e in effects for end in (e["gain"]["value"], *e["gain"]["interval"])]
+    low, high = min([0.0, *ends]), max([0.01, *ends])
+    span = high - low
+
+    def mark(kind: str, start: float, end: float) -> str:
+        return (
+            f'<i class="{kind}" style="left:{100 * (start - low) / span:.2f}%;'
+            f'width:{100 * (end - start) / span:.2f}%"></i>'
+        )
+
+    rows = []
+    for e in effects:
+        value, interval = e["gain"]["value"], e["gain"]["interval"]
+        marks = f'<i class="zero" style="left:{100 * -low / span:.2f}%"></i>'
+        marks += mark("gain", *sorted((0.0, value))) + mark("whisker", *interval)
+        rows.append(
+            f'<div class="effect {"accepted" if e["accepted"] else "rejected"}"><span class="name">'
+            f'{escape(words(e["name"]))}</span><span class="track">{marks}</span>'
+            f'<span class="figure">{_gain_text(e)} <span class="quiet">{escape(_p_text(e))}</span></span></div>'
+        )
+    shown = f'<div class="bars">{"".join(rows[:MOST_EFFECTS])}</div>'
+    if rest := rows[MOST_EFFECTS:]:
+        shown += f'<details><summary>{len(rest)} more</summary><div class="bars">{"".join(rest)}</div></details>'
+    return shown
+
+
+def _parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Return the rows of the table of parameters of accepted effects, of the best where none was accepted."""
+    rows: list[Row] = []
+    for e in [e for e in effects if e["accepted"]] or effects[:1]:
+        for k, p in enumerate(e["parameters"]):
+            name = escape(words(e["name"])) if k == 0 else ""
+            low, high = (_number(end, 4) for end in p["interval"])
+            value = f"<b>{_number(p['value'], 4)}</b>"
+            rows.append(("", [name, escape(p["name"]), value, f"{low} to {high}", escape(p["unit"])]))
+    return rows
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Return a number with so many significant digits, "∞" for one that JSON cannot hold."""
+    return "∞" if value is None else f"{value:.{digits}g}"
+
+
+def bullet_list(lines: Sequence[str]) -> str:
+    """Return lines as a list."""
+    return f'<ul class="plain">{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>'
+
+
+def _listed(names: Sequence[str], last: str = "and") -> str:
+    """Return names as "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"
+
+
+def _share(value: float) -> str:
+    """Return a share in whole percent."""
+    return f"{100 * value:.0f} %"
+
+
+def _gain_text(effect: Mapping[str, Any]) -> str:
+    """Return the gain of an effect with its interval in percent."""
+    low, high = effect["gain"]["interval"]
+    return f"{_share(effect['gain']['value'])} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _p_text(effect: Mapping[str, Any]) -> str:
+    """Return the p-value of an effect as text."""
+    return p_value_text(effect["p"], effect["p_smallest"])
