@@ -1,64 +1,64 @@
-"""Everything that can be set about a training: one tree of plain data, on the command line and beside every run."""
+"""Settings of a training: a tree of plain data, on the command line and in every run folder."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
 from concent_warp.files import write_text
+from concent_warp.run_folder import plain
 
 Range = tuple[float, float]
 ALL = "all"
 """Name of the chain of all stages."""
-SINGLE, CHAINED = 3.0, 12.0
-"""Lengths of episodes of one stage and of a chain of them, where none is given [s]."""
+SINGLE_STAGE_DURATION, CHAIN_DURATION = 3.0, 12.0
+"""Default durations of an episode of one stage and of a chain of stages [s]."""
 SETTINGS = "train.toml"
 """File of the resolved configuration in a run folder."""
 
 
 @dataclass(frozen=True)
 class ActionCfg:
-    """What an action does: steps of the commands, each number in -1..1 a share of the largest step."""
+    """Mapping from an action to commands: each number in -1..1 is a share of the largest step."""
 
-    gripper_actuators: tuple[str, ...] = ("gripper",)
-    """Actuators that open and close the gripper with one number; those that the scene lacks are passed over."""
-    tool_site: str = "tcp"
-    """Site between the fingertips: the end-effector."""
     turn: float = 0.02
     """Largest step of a hinge joint's command [rad]."""
     slide: float = 0.004
     """Largest step of a slide joint's command [m]."""
     gripper: float = 0.003
-    """Largest step of the gripper's command [m]: small enough that exploring does not drop what is held at once."""
+    """Largest step of the gripper's command [m]: so small that exploration does not drop a grasped object at once."""
     turn_lead: float = 0.03
-    """How far a hinge joint's command may run ahead of the joint [rad]: with the stiffness, the largest force."""
+    """Largest difference of command and position of a hinge joint [rad]; times the stiffness it bounds the torque."""
     slide_lead: float = 0.015
-    """The same for slide joints [m]."""
+    """Largest difference of command and position of a slide joint [m]; times the stiffness it bounds the force."""
+    gripper_actuators: tuple[str, ...] = ("gripper",)
+    """Actuators that open and close the gripper with one number; names that the scene lacks are ignored."""
+    tool_site: str = "tcp"
+    """Site between the fingertips: the end-effector."""
 
 
 @dataclass(frozen=True)
 class ObservationCfg:
-    """What the policy sees (paper, table of appendix C)."""
+    """Observation of the policy (paper, table of appendix C)."""
 
     slots: int = 8
-    """Contact slots; a stage with more demonstrated pairs keeps those spread most widely."""
+    """Contact slots; of a stage with more demonstrated pairs, those with the widest spread are kept."""
     noise: float = 0.0
-    """Standard deviation of the noise on object positions [m]."""
+    """Standard deviation of Gaussian noise on object positions [m]."""
 
 
 @dataclass(frozen=True)
 class EngineeredCfg:
-    """The engineered insertion reward (paper, appendix G): what has to be designed by hand for each task."""
+    """The engineered insertion reward, a baseline (paper, appendix G)."""
 
     hole: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the hole in the frame of object 2 [m]."""
     seat: float = 0.0235
-    """Height of object 1 above object 2's origin at which it counts as fully seated [m]."""
+    """Height of object 1 above object 2's origin at which it is fully seated [m]."""
     far: Range = (1.0, 0.1)
     """Amplitude and length scale [m] of the wide term, of alignment and depth alike."""
     near: Range = (1.0, 0.01)
@@ -78,7 +78,7 @@ class RewardCfg:
     """Weights and scales of the reward (paper, section 3.2.1 and appendix C)."""
 
     kind: Literal["contact", "engineered"] = "contact"
-    """The contact-event reward, or the engineered one as a baseline."""
+    """The contact-event reward, or the engineered reward as a baseline."""
     reach: float = 1.0
     """Weight of the reaching term."""
     regularisation: float = 1.0
@@ -90,29 +90,29 @@ class RewardCfg:
     near: Range = (2.0, 0.008)
     """Amplitude and length scale [m] of the near reaching term."""
     wide: Range = (1.0, 0.3)
-    """The same of a third term, for the way to an object; given where stages are chained."""
+    """Amplitude and length scale [m] of a third reaching term in chains of stages, for the approach to an object."""
     stage: float = 5.0
-    """Reward of a step for each stage that is done: more than reaching can give, so that moving on is always better."""
+    """Reward per step for each completed stage; larger than the reaching terms, so that the next stage pays off."""
     action: float = 0.01
     """Penalty of the squared action."""
     velocity: float = 0.001
     """Penalty of the squared arm joint velocity [s^2/rad^2]."""
     press: float = 0.0
-    """Penalty of the squared lead of a joint's command over the joint, relative to the largest allowed: of force and
-    haste."""
+    """Penalty of the squared difference of command and joint position relative to the largest allowed, which limits
+    force and speed."""
     disturb_position: float = 2.0
-    """Penalty of moving an object between steps [1/m]: in the hand where the stage holds it, else in the world."""
+    """Penalty of an object's displacement between steps [1/m]: in the hand where the stage grasps it, else in the
+    world."""
     disturb_rotation: float = 1.0
-    """The same for turning it [1/rad]."""
+    """Penalty of an object's rotation between steps [1/rad], likewise."""
     failure: float = 5.0
-    """Fixed penalty of an episode that ends in failure."""
+    """Penalty of an episode that ends in failure."""
     lenience: float = 0.0
-    """Share of the penalties of virtual collisions and failure that counts while no episode succeeds; it rises to 1
-    with the square of the share of those that do. Large penalties that count from the start keep a policy away from its
-    target."""
+    """Factor on the penalties of virtual collisions and failure while no episode succeeds; it rises to 1 with the
+    square of the success rate. Large penalties from the start keep a policy away from its target."""
     scale: float = 0.05
-    """Factor on all of it, so that values are of order 1, which the value function learns sooner; divided by the number
-    of stages that are chained."""
+    """Factor on the whole reward, divided by the number of chained stages; the value function learns faster when
+    returns are of order 1."""
     engineered: EngineeredCfg = field(default_factory=EngineeredCfg)
 
 
@@ -123,80 +123,121 @@ class CollisionCfg:
     margin: float = 0.002
     """Distance below which spheres outside the physics are penalised [m]."""
     severe: float = 0.004
-    """Penetration of one of them that ends the episode [m]."""
+    """Penetration of such a sphere that ends the episode [m]."""
     slack: float = 0.0005
-    """How deep contacts of the physics are, too: left-out spheres are taken to be smaller by so much [m]."""
+    """Reduction of the radii of these spheres [m]: the penetration that contacts of the physics have as well."""
     depth: float = 50.0
-    """Penalty of a penetration [1/m], summed over the spheres. Too little, and the policy learns to go through what the
-    physics leaves out."""
-    points: int = 512
-    """Points on the surface of each object that are to keep out of the other objects as well: spheres round off edges,
-    and what is learnt with these points holds up where edges are sharp."""
+    """Penalty of a penetration [1/m], summed over the spheres. If it is too small, the policy learns to pass through
+    what the physics leaves out."""
     band: float = 0.01
     """Penalty of a sphere in touch, falling to 0 at the margin."""
+    points: int = 512
+    """Surface points of each object that must stay outside the other objects too: spheres round off edges, and a policy
+    trained with these points also succeeds where edges are sharp."""
+    candidates: int = 20_000
+    """Random surface points of which farthest point sampling selects `points`."""
     threads: int = 128
-    """Threads of a GPU that share a world's spheres."""
+    """GPU threads per world."""
+
+
+@dataclass(frozen=True)
+class PostureSolverCfg:
+    """Inverse kinematics of one state by damped least squares from the demonstrated posture."""
+
+    iterations: int = 20
+    """Largest number of iterations."""
+    damping: float = 1e-4
+    """Damping added to the diagonal of J J^T, with lengths in m and angles in rad."""
+    position: float = 2e-4
+    """Accepted position error [m], well below `ResetCfg.slip`."""
+    angle: float = 2e-3
+    """Accepted orientation error [rad]."""
+
+
+@dataclass(frozen=True)
+class NewtonSolverCfg:
+    """Inverse kinematics of all states at once by Newton's Levenberg-Marquardt solver."""
+
+    iterations: int = 40
+    """Number of iterations."""
+    seeds: int = 4
+    """Initial postures per state, of which the best solution is kept."""
+    noise: float = 0.1
+    """Standard deviation of the further initial postures around the demonstrated one [rad or m]."""
+    limit_weight: float = 10.0
+    """Weight of the joint limits against position [1/m] and orientation [1/rad]."""
+    position: float = 3e-4
+    """Accepted position error [m]; larger than that of `PostureSolverCfg`, as the solver works in single precision."""
+    angle: float = 3e-3
+    """Accepted orientation error [rad]."""
 
 
 @dataclass(frozen=True)
 class ResetCfg:
-    """Initial states along the demonstration, the contact chain kept (paper, appendix D)."""
+    """Initial states along the demonstration that keep the contact chain (paper, appendix D)."""
 
     states: int = 2048
-    """States drawn before training, of which each episode takes one."""
+    """States sampled before training; each episode starts from one of them."""
     demonstrated: float = 0.2
     """Share of states as demonstrated, without displacement."""
-    before: float = 0.3
-    """How long before the preceding stage states are taken from [s]."""
     position: float = 0.012
     """Half width of the horizontal displacement [m]."""
     lift: float = 0.015
-    """Largest upward displacement of what is held [m]."""
+    """Largest upward displacement of a grasped object [m]."""
     turn: float = 0.15
     """Half width of the rotation about the vertical [rad]."""
-    held: float = 0.15
-    """Half width of the rotation of a held object in the hand, about the axis along which it is held [rad]: an edge
-    that catches turns it there, and a policy is to know what to do then."""
-    solver: Literal["auto", "newton", "posture"] = "auto"
-    """Inverse kinematics: all states at once by Newton, from several seeds, or one after the other from the
-    demonstrated posture; "auto" takes Newton on a GPU (on a CPU its kernels take a minute to compile)."""
+    grasp_turn: float = 0.15
+    """Half width of the rotation of a grasped object in the hand about the axis between the fingers [rad]: the rotation
+    that contact with an edge causes."""
     joints: float = 0.05
-    """Half width of the displacement of the arm's joints where nothing is held [rad or m]."""
-    settle: float = 0.1
-    """Time for which a state is simulated, the commands held, before it may be used [s]."""
-    slip: float = 0.003
-    """How far an object may move in the hand while settling [m]."""
-    overlap: float = 0.0015
-    """Penetration of spheres of different objects at which a displaced state is discarded [m]."""
+    """Half width of the displacement of the arm's joints where no object is grasped [rad or m]."""
     free: float = 0.3
-    """Share of states at the very beginning, where stages are chained: the robot as at the start of the demonstration,
+    """In chains of stages, share of initial states of the whole task: the robot as at the start of the demonstration,
     the objects anywhere. The others are shared equally among the stages."""
     place: tuple[float, float] = (0.05, 0.03)
-    """Half widths of the squares about the demonstrated places in which objects 1 and 2 are put in a chain [m]."""
+    """In chains, half widths of the squares around the demonstrated positions of objects 1 and 2 [m]."""
     heading: tuple[float, float] = (0.5, 0.3)
-    """Half widths of their rotations about the vertical in a chain [rad]."""
+    """In chains, half widths of the rotations of objects 1 and 2 about the vertical [rad]."""
+    approach: float = 3.0
+    """In chains, factor minus 1 by which the displacement of the hand is larger at the start of the approach to object
+    1 than at its end."""
+    before: float = 0.3
+    """Time before the preceding stage from which states are sampled [s]."""
+    settle: float = 0.1
+    """Time for which a state is simulated with constant commands before it is accepted [s]."""
+    slip: float = 0.003
+    """Largest accepted motion of a grasped object in the hand during that time [m]."""
+    overlap: float = 0.0015
+    """Penetration of spheres of different objects above which a displaced state is discarded [m]."""
+    passes: int = 20
+    """Largest number of passes, of `states` candidates each, after which sampling fails."""
+    solver: Literal["auto", "newton", "posture"] = "auto"
+    """Inverse kinematics: "newton" solves all states at once, "posture" one by one; "auto" takes "newton" on a GPU (its
+    kernels take a minute to compile on a CPU)."""
+    posture_solver: PostureSolverCfg = field(default_factory=PostureSolverCfg)
+    newton_solver: NewtonSolverCfg = field(default_factory=NewtonSolverCfg)
 
 
 @dataclass(frozen=True)
 class ChainCfg:
-    """When a world moves on to the next stage, and when its episode is over."""
+    """When a world moves to the next stage, and when its episode ends."""
 
     tolerance: float = 0.004
-    """Distance within which all contact pairs of a target event are to be [m]."""
+    """Largest distance of all contact pairs at which a target event is met [m]."""
     hold: int = 2
-    """Control steps for which they are to be there."""
+    """Consecutive control steps for which they must be within it."""
     rest: float = 0.5
-    """Time for which object 1 has been in place when an episode of a chain ends [s]."""
+    """Time for which object 1 must be in place before an episode of a chain ends [s]."""
 
 
 @dataclass(frozen=True)
 class RandomisationCfg:
-    """What differs between the worlds; it is drawn once for each world."""
+    """Domain randomisation; values are sampled once for each world."""
 
     friction: Range = (1.0, 1.0)
-    """Factor on the sliding friction of all geoms but the robot's."""
+    """Factor on the sliding friction of all geoms except the robot's."""
     grip: Range = (1.0, 1.0)
-    """Factor on the sliding friction of the robot's geoms. What is held has the larger friction of the two."""
+    """Factor on the sliding friction of the robot's geoms; a grasp has the larger friction of object and finger."""
     stiffness: Range = (1.0, 1.0)
     """Factor on the stiffness of the position control."""
     damping: Range = (1.0, 1.0)
@@ -204,17 +245,16 @@ class RandomisationCfg:
     mass: Range = (1.0, 1.0)
     """Factor on mass and inertia of the objects."""
     joint_friction: Range = (0.0, 0.0)
-    """Dry friction of the joint with the strongest drive [N m or N]; less in the others, as their drives are weaker."""
+    """Dry friction of the joint with the strongest drive [N m or N]; of others in proportion to their torque limits."""
     delay: Range = (0.0, 0.0)
     """Delay of the arm's commands [s]."""
     lag: Range = (0.0, 0.0)
-    """Time constant with which the arm's set points follow its commands [s]."""
-    push: tuple[float, float] = (0.0, 0.0)
-    """Standard deviations of a force [N] and of a torque [N m], each along any direction, that act on object 1 for the
-    length of an action now and then, where the stage holds it: it is turned in the hand, or knocked out of the way, and
-    the policy learns what to do then. Not in an evaluation."""
-    push_share: float = 0.2
-    """Share of the actions in which they act."""
+    """Time constant of a first-order lag of the arm's set points [s]."""
+    perturbation: tuple[float, float] = (0.0, 0.0)
+    """Random force perturbations: standard deviations of a force [N] and a torque [N m] per axis that act on object 1
+    for one action while the stage grasps it; none in evaluations. `TrainCfg.with_perturbations` has values."""
+    perturbation_share: float = 0.2
+    """Share of actions with random force perturbations."""
 
 
 @dataclass(frozen=True)
@@ -227,44 +267,55 @@ class EnvironmentCfg:
         4096
     """
 
-    worlds: int = 4096
-    """Environments side by side."""
-    engine: Literal["auto", "warp", "mujoco"] = "auto"
-    """MuJoCo-Warp or C MuJoCo; "auto" takes MuJoCo-Warp on a GPU and C MuJoCo on a CPU."""
     stage: str = "insert"
     """Stage of the contact event sequence whose target event is trained; "all" chains all stages."""
-    collision: Literal["vcp", "full"] = "vcp"
-    """Spheres in the physics: those of the contact event sequence alone, or all."""
-    decimation: int = 10
-    """Time steps of the model in one action."""
-    stride: int = 1
-    """How many of those a simulation step takes at once: coarser physics, in less time. Contacts want steps of half
-    their time constant at most."""
+    worlds: int = 4096
+    """Number of environments simulated in parallel, on each rank."""
     episode: float | None = None
-    """Length of an episode [s]; by default 3 s, where stages are chained 12 s."""
-    dropped: float = 0.02
-    """Distance of a contact pair with the robot at which a held object counts as lost [m]."""
-    lost: float = 1.0
-    """Distance between objects 1 and 2 at which an episode ends, for one of them has been knocked away [m]."""
+    """Duration of an episode [s]; by default 3 s for one stage and 12 s for a chain."""
     success: float = 0.003
-    """Largest deviation, per axis, of object 1 from its demonstrated place in object 2 that counts as success [m]."""
-    capture: Literal["none", "physics", "step"] = "step"
-    """What is captured in CUDA graphs: nothing, the physics, or all of a step."""
-    fuse: bool = False
-    """Compile what torch does in a captured step into few kernels: quicker steps for some time at the start."""
-    nconmax: int | None = None
-    """Contacts a world to make room for; by default measured on the demonstration."""
-    njmax: int | None = None
-    """Constraint rows a world to make room for; by default measured on the demonstration."""
-    solver_iterations: int | None = None
-    """Most iterations of the solver in a simulation step; by default the model's."""
-    ls_iterations: int | None = None
-    """Most iterations of its line search; by default the model's."""
+    """Largest deviation per axis of object 1 from its demonstrated position in object 2 that counts as success [m]."""
+    collision: Literal["vcp", "full"] = "vcp"
+    """Spheres in the physics: "vcp" those of the contact event sequence, with the virtual collision penalty on the
+    others; "full" all."""
+    engine: Literal["auto", "warp", "mujoco"] = "auto"
+    """MuJoCo-Warp or C MuJoCo; "auto" takes MuJoCo-Warp on a GPU and C MuJoCo on a CPU."""
+    decimation: int = 10
+    """Time steps of the model per action."""
+    stride: int = 1
+    """Time steps of the model per simulation step: coarser physics in less time. Contacts need steps of at most half
+    their time constant."""
     cone: Literal["auto", "elliptic", "pyramidal"] = "auto"
-    """Friction cones; "auto" as the model has them. Pyramids are quicker; friction is weaker between their axes than
-    along them, and what is held slips more."""
+    """Friction cones; "auto" keeps the model's. Pyramidal cones are faster; their friction is weaker between the axes
+    than along them, and grasped objects slip more."""
+    dropped: float = 0.02
+    """Distance of a contact pair with the robot at which a grasped object counts as dropped [m]."""
+    lost: float = 1.0
+    """Distance between objects 1 and 2 at which an episode fails [m]."""
+    max_position: float = 1e4
+    """Generalised position above which a world counts as diverged [rad or m]."""
+    max_velocity: float = 1e4
+    """Generalised velocity above which a world counts as diverged [rad/s or m/s]."""
+    randomise_effects: bool = True
+    """Sample the parameters of the model's effects for each world from their fitted 95 % intervals."""
+    nconmax: int | None = None
+    """Contact capacity per world; by default measured on the demonstration."""
+    njmax: int | None = None
+    """Constraint capacity per world; by default measured on the demonstration."""
+    buffer_factor: float = 2.0
+    """Default capacities relative to the largest number in the demonstration: exploration makes more contacts."""
+    buffer_spare: int = 16
+    """Contacts added to the default capacity; four times as many constraints."""
+    solver_iterations: int | None = None
+    """Largest number of solver iterations per simulation step; by default the model's."""
+    ls_iterations: int | None = None
+    """Largest number of line-search iterations; by default the model's."""
     jacobian: Literal["auto", "dense", "sparse"] = "auto"
-    """How the solver keeps the constraints' derivatives: the same results, at other speeds; "auto" as MuJoCo does."""
+    """Storage of the constraint Jacobian: same results, different speed; "auto" decides as MuJoCo does."""
+    capture: Literal["none", "physics", "step"] = "step"
+    """What is captured in CUDA graphs: nothing, the physics, or the whole step."""
+    fuse: bool = False
+    """Compile the torch operations of a captured step into few kernels: faster steps, longer start."""
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
@@ -272,20 +323,18 @@ class EnvironmentCfg:
     reset: ResetCfg = field(default_factory=ResetCfg)
     chain: ChainCfg = field(default_factory=ChainCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
-    randomise_effects: bool = True
-    """Draw the parameters of the model's effects for each world from their fitted 95 % intervals."""
 
     @property
     def simulation_steps(self) -> int:
-        """Simulation steps of one action."""
+        """Simulation steps per action."""
         return self.decimation // self.stride
 
     @property
     def seconds(self) -> float:
-        """Length of an episode [s]."""
+        """Duration of an episode [s]."""
         if self.episode is not None:
             return self.episode
-        return CHAINED if self.stage == ALL else SINGLE
+        return CHAIN_DURATION if self.stage == ALL else SINGLE_STAGE_DURATION
 
 
 @dataclass(frozen=True)
@@ -299,46 +348,51 @@ class PpoCfg:
     """
 
     iterations: int = 300
-    """Rounds of collecting and updating."""
+    """Iterations of collecting steps and updating the policy."""
+    learning_rate: float = 1e-3
+    """Initial learning rate."""
     steps: int = 24
-    """Steps of each environment in a round."""
+    """Steps of each environment per iteration."""
+    entropy: float = 0.002
+    """Weight of the entropy."""
+    discount: float = 0.98
+    """Discount factor of a step."""
     epochs: int = 5
-    """Passes over what was collected."""
+    """Passes over the collected steps per iteration."""
     batches: int = 4
-    """Batches of a pass."""
+    """Mini-batches per pass."""
     hidden: tuple[int, ...] = (256, 256, 256)
     """Sizes of the hidden layers of policy and value function."""
     activation: str = "swish"
-    """Activation of both."""
+    """Activation function of both networks."""
     std: float = 0.6
-    """Standard deviation of the Gaussian before squashing, at the start."""
+    """Initial standard deviation of the Gaussian before squashing."""
+    max_mean: float = 4.0
+    """Largest magnitude of the mean before squashing: tanh(4) is 0.9993. Outputs for observations far from those seen
+    before can be in the hundreds, where single precision does not represent the change of density by an update."""
     normalise: bool = True
-    """Normalise observations by their running mean and deviation."""
-    discount: float = 0.98
-    """Discount factor of a step."""
+    """Normalise observations by their running mean and standard deviation."""
+    max_observation: float = 10.0
+    """Largest magnitude of a normalised observation [standard deviations]; it bounds networks' outputs and losses."""
     lam: float = 0.95
-    """Weight of longer returns in the advantage."""
+    """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
     """Clipping of the probability ratio."""
-    entropy: float = 0.002
-    """Weight of the entropy."""
     value: float = 1.0
     """Weight of the value loss."""
-    learning_rate: float = 1e-3
-    """Learning rate at the start."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """Whether the learning rate follows the divergence between updates."""
+    """Whether the learning rate adapts to the Kullback-Leibler divergence of an update."""
     divergence: float = 0.01
-    """Divergence that the adaptive rate aims at."""
+    """Target Kullback-Leibler divergence of the adaptive learning rate."""
     gradient: float = 1.0
     """Largest norm of the gradient."""
     tf32: bool = True
-    """Multiply matrices with 10 bits of mantissa on a GPU, which is quicker."""
+    """Multiply matrices in TF32 (10 bits of mantissa) on a GPU, which is faster."""
 
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """A whole training.
+    """Settings of a training.
 
     Example:
         >>> import concent_warp as cw
@@ -348,11 +402,11 @@ class TrainCfg:
     """
 
     seed: int = 0
-    """Seed of everything drawn at random."""
-    checkpoint: int = 50
-    """Rounds between checkpoints; one is also written at the end and when interrupted."""
+    """Seed of all random numbers."""
     target: float | None = None
-    """Share of successful episodes in a round at which training stops early."""
+    """Success rate within an iteration at which training stops early."""
+    checkpoint: int = 50
+    """Iterations between checkpoints; one is also written at the end and on interruption."""
     environment: EnvironmentCfg = field(default_factory=EnvironmentCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
@@ -369,52 +423,67 @@ class TrainCfg:
             "checkpoint": self.checkpoint,
         }.items():
             if value < 1:
-                raise TrainError(f"{name} is not right", expected="at least 1", found=value)
+                raise TrainError(f"{name} is out of bounds", expected="at least 1", found=value)
         if e.decimation % e.stride:
             raise TrainError(
-                "an action is no whole number of simulation steps",
+                "an action is not a whole number of simulation steps",
                 expected=f"a divisor of the decimation, {e.decimation}",
                 found=f"stride {e.stride}",
             )
-        push = e.randomisation
-        if min(push.push) < 0 or not 0 <= push.push_share <= 1:
+        std, share = e.randomisation.perturbation, e.randomisation.perturbation_share
+        if min(std) < 0 or not 0 <= share <= 1:
             raise TrainError(
-                "pushes are not right",
-                expected="deviations of at least 0 and a share from 0 to 1",
-                found=f"push {push.push}, push_share {push.push_share}",
+                "the random force perturbations are out of bounds",
+                expected="standard deviations of at least 0 and a share from 0 to 1",
+                found=f"perturbation {std}, perturbation_share {share}",
             )
         if e.worlds * p.steps < p.batches:
             raise TrainError(
-                "a round holds fewer steps than batches", expected=f"at least {p.batches}", found=e.worlds * p.steps
+                "an iteration has fewer environment steps than mini-batches",
+                expected=f"at least {p.batches}",
+                found=e.worlds * p.steps,
             )
 
+    def with_perturbations(self) -> TrainCfg:
+        """Return the settings with random force perturbations on the grasped object in training.
+
+        The perturbations have standard deviations of 3 N and 0.08 N m. Joint steps are at most 6 mrad, friction factors
+        1 to 2.5, grasps rotated by up to 0.3 rad, and the penalty of virtual collisions is 1000 per metre. The values
+        are for insertions of a block of 80 g (docs/benchmarks/train_table1.md).
+
+        Example:
+            >>> import concent_warp as cw
+            >>> cw.TrainCfg().with_perturbations().environment.randomisation.perturbation
+            (3.0, 0.08)
+        """
+        e = self.environment
+        e = replace(
+            e,
+            action=replace(e.action, turn=0.006),
+            virtual=replace(e.virtual, depth=1000.0),
+            reset=replace(e.reset, grasp_turn=0.3),
+            randomisation=replace(e.randomisation, friction=(1.0, 2.5), perturbation=(3.0, 0.08)),
+        )
+        return replace(self, environment=e)
+
     def save(self, path: Path) -> None:
-        """Write a TOML file, in one piece or not at all; what is None is left out."""
+        """Write a TOML file atomically; None values are left out."""
         import tomli_w
 
         write_text(path, tomli_w.dumps(plain(self)))
 
     @staticmethod
     def load(path: Path) -> TrainCfg:
-        """Read what `save` wrote.
+        """Return the settings that `save` wrote.
 
         Raises:
-            TrainError: The file is missing or is no such configuration.
+            TrainError: The file is missing or not a configuration of a training.
         """
         if not path.is_file():
-            raise TrainError("no such configuration of a training", where=path)
+            raise TrainError("the configuration of a training is missing", where=path)
         try:
             return decode(TrainCfg, tomllib.loads(path.read_text()), str(path))
         except tomllib.TOMLDecodeError as error:
             raise TrainError("not a TOML file", where=path, found=error) from None
         except ConcentError as error:
             raise TrainError(str(error)) from None
-
-
-def plain(value: Any) -> Any:
-    """Return nested dataclasses as TOML holds them."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items() if item is not None}
-    return list(value) if isinstance(value, tuple) else value

@@ -12,8 +12,9 @@ from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
+from concent_warp.run_folder import plain
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import SETTINGS, TrainCfg, plain
+from concent_warp.train.cfg import SETTINGS, TrainCfg
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
@@ -81,7 +82,7 @@ class TrainingRun:
         All are displaced from the demonstration, with the object grasped as demonstrated; in a chain of stages, all are
         initial states of the whole task.
         """
-        cfg = replace(self.cfg.environment.reset, demonstrated=0.0, held=0.0, free=1.0)
+        cfg = replace(self.cfg.environment.reset, demonstrated=0.0, grasp_turn=0.0, free=1.0)
         return sample_reset_states(task, cfg, seed + 1_000_000, count=count)
 
 

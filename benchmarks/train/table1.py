@@ -46,7 +46,7 @@ for stability in the model of *ours*, which may favour it. An episode succeeds w
 place at the bottom of the hole. Shares are pooled over seeds, with Wilson's 95 % interval of these policies; the
 column *seeds* shows how much trainings differ.
 
-Used to choose settings: seeds 0 to 2; with random force perturbations (`push`) seeds 0 and 3 to 5; `held 0.6` seeds 5
+Used to choose settings: seeds 0 to 2; with random force perturbations seeds 0 and 3 to 5; `grasp-turn 0.6` seeds 5
 to 7; the lead scale seeds 0 and 3 to 8; `turn-lead` seeds 3 to 5. Seeds 9 to 11 were used for no choice, but smaller
 leads and more exploration, tried on them as well, did worse and were dropped. The hidden delay is the third effect
 tried, after weaker gravity compensation and joint compliance.

@@ -44,7 +44,7 @@ from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.warp_engine import preferred_device
 from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.environment.worlds import buffers, make_environment
+from concent_warp.train.environment.worlds import buffer_sizes, make_environment
 from concent_warp.train.learning.ppo import Trainer
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.run import TrainingRun
@@ -228,7 +228,7 @@ class Bench:
         """Return the rate with buffers that nothing overflows, found by doubling those that did."""
         tried = []
         while True:
-            contacts, rows = self.room or buffers(task, cfg)
+            contacts, rows = self.room or buffer_sizes(task, cfg)
             cfg = replace(cfg, nconmax=contacts, njmax=rows)
             dropping = self.dropping(cfg, task, states)
             tried.append([contacts, rows, dropping])
@@ -356,7 +356,7 @@ def measure_one(bench: Bench, kept: Measurements, what: What, cfg: EnvironmentCf
     if what == "rate" and cfg.collision == "vcp":
         one(name, 30, lambda: bench.rate(cfg, task, states))
     elif what == "rate":
-        contacts, rows = buffers(bench.task("vcp")[0], cfg)
+        contacts, rows = buffer_sizes(bench.task("vcp")[0], cfg)
         fixed = replace(cfg, nconmax=contacts, njmax=rows)
         one(f"{name} fixed", 30, lambda: bench.rate(fixed, task, states))
         one(f"{name} fitting", 60, lambda: bench.fitting(cfg, task, states))

@@ -1,1 +1,5 @@
-"""A policy tried out: in simulation, in Reality, and before the cameras that make a data set."""
+"""Deployment of a trained policy: evaluation, live view and rendered data sets.
+
+`evaluate` counts successes in simulation and in Reality; `play` shows a policy in the browser; `render_dataset` renders
+episodes to a data set; `reality_world` makes Reality an environment of `train`; `cfg` holds the settings of all.
+"""

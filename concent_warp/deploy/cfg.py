@@ -1,4 +1,4 @@
-"""Settings of evaluation, live view and rendering; imports nothing heavy."""
+"""Settings of evaluation, live view and rendering; this module imports no heavy packages."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Format = Literal["lerobot", "robomimic"]
 
 @dataclass(frozen=True)
 class RealityWorldCfg:
-    """Reality in which a policy is tried."""
+    """Reality, the world in which a policy is evaluated."""
 
     hide: tuple[str, ...] = ()
-    """Hidden effects, each as name=value in the unit of its main parameter, as in joint_friction=1.2; an unknown name
-    lists those that there are."""
+    """Hidden effects, each as name=value in the unit of its main parameter, such as joint_friction=1.2; an unknown name
+    lists the known ones."""
     shapes: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
     """Sizes of block and hole."""
     reality: WorldCfg = field(default_factory=WorldCfg)
@@ -41,13 +41,13 @@ class EvaluateCfg(RealityWorldCfg):
     """
 
     action_scale: float = 1.0
-    """Size of the steps of the robot's commands, as a share of those that the policy was trained with: below 1 it moves
-    more slowly, for as long an episode."""
+    """Size of command steps relative to training, above 0 and at most 1: below 1 the robot moves more slowly; episodes
+    last as long."""
     setpoint_lead_scale: float = 1.0
-    """How far commands may run ahead of the joints, as a share of that in training: with the stiffness of the drives,
-    this is the largest force that the robot exerts."""
+    """Largest difference of command and joint position relative to training, above 0 and at most 1: with the stiffness
+    of the drives it bounds the force that the robot exerts."""
     videos: int = 0
-    """How many of the first episodes in Reality to film, as MP4."""
+    """Number of first episodes in Reality to record as MP4."""
 
 
 @dataclass(frozen=True)
@@ -61,23 +61,25 @@ class PlayCfg(RealityWorldCfg):
     """
 
     action_scale: float = 1.0
-    """Size of the steps of the robot's commands, as for concent evaluate."""
+    """Size of command steps relative to training, above 0 and at most 1."""
     setpoint_lead_scale: float = 1.0
-    """How far commands may run ahead of the joints, as for concent evaluate."""
+    """Largest difference of command and joint position relative to training, above 0 and at most 1."""
     port: int = 8080
-    """Port of the page; the next free one where it is taken."""
+    """Port of the page; if it is in use, the next free one."""
     host: str = "127.0.0.1"
-    """Address to serve the page on; 0.0.0.0 lets others open it, whom nothing keeps from using the controls."""
+    """Address of the server; 0.0.0.0 lets anyone in the network open the page and use its controls."""
     speed: float = 1.0
-    """Speed to begin with, relative to the time in the world."""
+    """Initial speed relative to simulated time."""
     states: int = 32
-    """Initial states that episodes begin from in turn."""
+    """Number of initial states, from which episodes start in turn."""
     pause: float = 1.0
-    """How long the last moment of an episode stays, at normal speed [s]."""
+    """Time for which the last state of an episode is shown, at normal speed [s]."""
     poll: float = 0.2
-    """Time between looks at the controls while nothing moves [s]."""
+    """Period of polling the controls while the policy is paused [s]."""
     eye: tuple[float, float, float] = (0.3, -0.42, 0.36)
-    """Where the objects are seen from, relative to them [m]."""
+    """Position of the camera relative to the objects [m]."""
+    touch_gap: float = 5e-4
+    """Gap below which a sphere is shown as touching a body [m], the depth of typical contacts."""
 
 
 @dataclass(frozen=True)
@@ -91,54 +93,54 @@ class RenderCfg:
     """
 
     episodes: int = 20
-    """Initial states of the policy, of which each makes an episode."""
+    """Number of initial states of the policy; one episode starts from each."""
     keep: Literal["successes", "all"] = "successes"
     """Which episodes of a policy go into the data set."""
     task: str | None = None
-    """What is done, in words; by default what the demonstration says."""
+    """Description of the task in words; the demonstration's by default."""
     networks: Path | None = None
     """Run folder of concent render-train; its cameras are rendered."""
     splats: tuple[str, ...] = ()
-    """Looks of objects, each as body=file.ply, in metres and the body's frame."""
+    """Gaussian splats of objects, each as body=file.ply, in metres and the body's frame."""
     shadows: bool = True
     """Whether objects with splats cast shadows, under lights sampled for each episode."""
     cameras: tuple[str, ...] = ()
-    """Cameras to render; by default those of the networks, else base and wrist, which a scene without any is given."""
+    """Cameras to render; by default those of the networks, without networks "base" and "wrist", added if absent."""
     size: int = 256
     """Height and width of the images [px]."""
     show: Literal["visual", "spheres"] = "visual"
-    """What the raw image shows of the objects: their shapes, or the contact spheres."""
+    """Geometry of the objects in the raw image: visual shapes or contact spheres."""
     rate: int = 10
-    """Frames a second of a recording; those of a policy come at its own rate."""
+    """Frame rate of a rendered recording [Hz]; a policy's episodes have its control rate."""
     worlds: int = 8
-    """Episodes rendered at a time."""
+    """Number of episodes rendered in parallel."""
     flow_steps: int = 4
     """Steps of the flow from noise to image; fewer are faster."""
     half: bool = False
-    """Let the networks multiply in bfloat16, which is faster on a GPU."""
+    """Evaluate the networks in bfloat16, which is faster on a GPU."""
     codec: Literal["h264", "av1"] = "h264"
-    """How the videos of a LeRobotDataset are encoded."""
+    """Video codec of a LeRobotDataset."""
     films: int = 0
-    """How many of the first episodes to write as MP4 too, the cameras side by side."""
+    """Number of first episodes to also write as MP4, with the cameras side by side."""
     figure: Path | None = None
-    """File (.png or .pdf) for a figure of the layers that the first episode's images are made of."""
+    """File (.png or .pdf) of a figure with the layers of the first episode's images."""
     seed: int = 0
     """Seed of initial states, lights and noise."""
     lights: ShadowCfg = field(default_factory=ShadowCfg)
-    """Lights of the shadows."""
+    """Settings of the lights."""
 
 
 def check(cfg: EvaluateCfg, world: WorldName, episodes: int) -> None:
     """Check the settings of an evaluation.
 
     Raises:
-        TrainError: One of them is out of bounds, or is about Reality where the policy runs in simulation.
+        TrainError: One is out of bounds, or concerns Reality while the policy runs in simulation.
     """
     if episodes < 1:
         raise TrainError("the number of episodes is out of bounds", expected="at least 1", found=episodes)
     if not 0 <= cfg.videos <= episodes:
         raise TrainError("the number of videos is out of bounds", expected=f"0 to {episodes}", found=cfg.videos)
     if wanted(cfg.hide) and world == "simulation":
-        raise TrainError("effects are hidden in Reality alone", fix="add --world reality")
+        raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     if cfg.videos and world == "simulation":
         raise TrainError("videos are of Reality", fix="add --world reality")

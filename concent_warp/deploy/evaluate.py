@@ -1,4 +1,4 @@
-"""How often a trained policy succeeds, in simulation and in Reality, from initial states that training has not seen."""
+"""Success rate of a policy in simulation and in Reality, from initial states that training has not seen."""
 
 from __future__ import annotations
 
@@ -33,24 +33,25 @@ def evaluate(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
-    """Run a policy from many initial states and count successes.
+    """Return the outcomes of a policy's episodes from many initial states.
 
     Args:
         policy: The policy.
         cfg: Settings: Reality with its hidden effects, the scales of the robot's commands, videos.
         world: "simulation", the model that the policy was trained in, or "reality": exact convex shapes, elliptic
-            friction cones, fine time steps, and what `EvaluateCfg.hide` names.
-        episodes: Initial states, of which each is run once.
+            friction cones, shorter time steps, and the effects of `EvaluateCfg.hide`.
+        episodes: Number of initial states; one episode starts from each.
         seed: Seed of the initial states.
-        device: Warp's name of the device for the simulation; the first CUDA device by default where there is one.
-        out: Folder for the videos; by default the folder videos in the policy's run folder, of a pretrained policy in
-            the current one.
-        overwrite: Replace videos that are there.
+        device: Warp's name of the device for the simulation; the first CUDA device by default, the CPU
+            without one.
+        out: Folder of the videos; by default the folder `videos` in the policy's run folder, or in the working
+            directory for a pretrained policy.
+        overwrite: Replace existing videos.
         progress: Called with the share done, 0..1.
 
     Raises:
         TrainError: A setting is out of bounds, or Reality has other bodies than the model.
-        ConcentError: No such effect can be hidden, or a video is there already.
+        ConcentError: A hidden effect is unknown, or a video exists.
 
     Example:
         >>> import concent_warp as cw
@@ -80,7 +81,7 @@ def evaluate(
 
 
 def _video_files(cfg: EvaluateCfg, folder: Path, *, overwrite: bool) -> list[Path]:
-    """Return the files of the videos that are asked for.
+    """Return the files of the requested videos.
 
     Raises:
         ConcentError: One of them exists and is not to be replaced.
@@ -93,14 +94,14 @@ def _video_files(cfg: EvaluateCfg, folder: Path, *, overwrite: bool) -> list[Pat
 
 
 class EpisodeStates:
-    """States of the first episodes of an evaluation, for `run_episodes`."""
+    """Collects the positions along the first episodes of an evaluation; a `watch` of `run_episodes`."""
 
     def __init__(self, count: int) -> None:
         self.states: list[list[np.ndarray]] = [[] for _ in range(count)]
-        """Positions of each step of each episode, each of shape (nq,)."""
+        """Positions (nq,) before each step of each episode."""
 
     def __call__(self, episodes: np.ndarray, qpos: np.ndarray) -> None:
-        """Keep the states of the first episodes; ids (R,) and positions (R, nq)."""
+        """Store positions (R, nq) of the episodes (R,)."""
         for episode, state in zip(episodes, qpos, strict=True):
             if episode < len(self.states):
                 self.states[episode].append(state.copy())
@@ -109,7 +110,7 @@ class EpisodeStates:
 def _write_videos(
     files: list[Path], episodes: EpisodeStates, world: TaskWorld, task: Task, starts: ResetStates, period: float
 ) -> None:
-    """Film episodes that began with `starts` and whose states are a period apart [s]."""
+    """Write videos of episodes from the initial states `starts`; `period` is the time between states [s]."""
     bodies = tuple(task.compiled.body(i).name for i in task.objects)
     for k, (path, states) in enumerate(zip(files, episodes.states, strict=True)):
         make_folder(path.parent)
@@ -123,5 +124,5 @@ def _write_videos(
 
 
 def without_reality(cfg: EvaluateCfg) -> EvaluateCfg:
-    """Return the settings without what they say of Reality, for an evaluation in simulation."""
+    """Return the settings without hidden effects and videos, for an evaluation in simulation."""
     return replace(cfg, hide=(), videos=0)

@@ -1,4 +1,4 @@
-"""A policy at work in one world, shown live in the browser."""
+"""A policy in one world, shown live in the browser."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ def play(
     device: str = "cpu",
     serving: Callable[[str], None] | None = None,
 ) -> list[str]:
-    """Serve a page that shows a policy at work, until so many episodes have ended or the call is interrupted.
+    """Serve a page that shows a policy, until a number of episodes have ended or the call is interrupted.
 
     Args:
         policy: The policy.
         cfg: Settings.
         world: "simulation" or "reality".
-        episodes: Episodes after which to end; None goes on until interrupted.
+        episodes: Number of episodes; None continues until interrupted.
         seed: Seed of the initial states.
         device: Warp's name of the device; one world is fastest on the CPU.
-        serving: Called with the address of the page once it is served.
+        serving: Called with the address of the page when it is served.
 
     Returns:
         The outcomes of the episodes.
 
     Raises:
         TrainError: A setting is out of bounds.
-        ConcentError: The address cannot be served on.
+        ConcentError: The address is not available.
 
     Example:
         >>> import concent_warp as cw
@@ -56,12 +56,12 @@ def play(
         1
     """
     cfg = cfg or PlayCfg()
-    player, drawn = _make_player(policy, cfg, world=world, seed=seed, device=device)
+    player, shown = _make_player(policy, cfg, world=world, seed=seed, device=device)
     task = player.environment.task
     assert task.model.geometry is not None
-    view = LiveView(drawn, task.model.geometry, task.collidable, host=cfg.host, port=cfg.port, speed=cfg.speed)
+    view = LiveView(shown, task.model.geometry, task.collidable, host=cfg.host, port=cfg.port, speed=cfg.speed)
     try:
-        objects = player.moment().position[list(task.objects)]
+        objects = player.state().position[list(task.objects)]
         view.look_at(objects.mean(axis=0), cfg.eye)
         if serving is not None:
             serving(view.address)
@@ -76,7 +76,7 @@ def play(
 def _make_player(
     policy: Policy, cfg: PlayCfg, *, world: WorldName, seed: int = 0, device: str = "cpu"
 ) -> tuple[Player, mujoco.MjModel]:
-    """Return the policy in its world, and the model to draw.
+    """Return the policy in its world, and the model to show.
 
     Raises:
         TrainError: A setting is out of bounds.
@@ -84,7 +84,7 @@ def _make_player(
     if cfg.states < 1:
         raise TrainError("the number of states is out of bounds", expected="at least 1", found=cfg.states)
     if wanted(cfg.hide) and world == "simulation":
-        raise TrainError("effects are hidden in Reality alone", fix="add --world reality")
+        raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
     run = policy.run
     task = run.task()
@@ -93,23 +93,23 @@ def _make_player(
     settings = replace(run.cfg.environment, worlds=1)
     if world == "reality":
         environment = reality_environment(task, settings, states, cfg)
-        drawn = environment.physics.model
+        shown = environment.physics.model
     else:
         environment = make_environment(task, settings, states, device=device)
-        drawn = task.model.scene.model
-    return Player(environment, policy.act_in(environment), cfg.states), drawn
+        shown = task.model.scene.model
+    return Player(environment, policy.act_in(environment), cfg.states, cfg.touch_gap), shown
 
 
 def _watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -> None:
-    """Show the policy as the page's controls have it, until so many episodes have ended."""
+    """Run and show the policy under the page's controls, until a number of episodes have ended."""
     wishes, period = view.wishes, player.environment.control_step
     due = time.monotonic()
-    _show(player, view, player.moment())
+    _show(player, view, player.state())
     while episodes is None or len(player.ended) < episodes:
         if wishes.reset:
             wishes.reset = False
             player.begin()
-            _show(player, view, player.moment())
+            _show(player, view, player.state())
         if not (wishes.running or wishes.step):
             view.changed.wait(cfg.poll)
             view.changed.clear()
@@ -122,7 +122,7 @@ def _watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -
             due += cfg.pause / wishes.speed
         due = max(due + period / wishes.speed, time.monotonic())
         _wait_until(due, view)
-        _show(player, view, player.moment())
+        _show(player, view, player.state())
 
 
 def _wait_until(due: float, view: LiveView) -> None:
@@ -133,18 +133,18 @@ def _wait_until(due: float, view: LiveView) -> None:
             return
 
 
-def _show(player: Player, view: LiveView, moment: PlayedState) -> None:
-    """Draw a moment and say what it is."""
-    view.show(moment.position, moment.quaternion, moment.touching, moment.pairs)
-    touching = int(moment.touching.sum())
+def _show(player: Player, view: LiveView, state: PlayedState) -> None:
+    """Show a state with its stage, time and contacts."""
+    view.show(state.position, state.quaternion, state.touching, state.pairs)
+    touching = int(state.touching.sum())
     view.tell(
-        f"**Stage {moment.stage}**, {moment.time:.2f} s  \n"
-        f"{touching} of {len(moment.touching)} spheres touch  \n"
+        f"**Stage {state.stage}**, {state.time:.2f} s  \n"
+        f"{touching} of {len(state.touching)} spheres touch  \n"
         f"{counted(player.ended)}"
     )
 
 
 def counted(outcomes: list[str]) -> str:
-    """Return how many episodes ended and how, in words."""
+    """Return the number of ended episodes and of each outcome, in words."""
     each = ", ".join(f"{count} {name}" for name, count in Counter(outcomes).most_common())
     return f"{len(outcomes)} episode{'s' * (len(outcomes) != 1)}{': ' * bool(outcomes)}{each}"

@@ -1,4 +1,4 @@
-"""Reality as a training environment sees it: the policy's senses and commands on physics that it has never met."""
+"""Reality as an environment: the observation and action of a policy on the physics of Reality."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from concent_warp.train.task.task import Task
 
 
 def reality_world(task: Task, cfg: EnvironmentCfg, world: RealityWorldCfg) -> TaskWorld:
-    """Return Reality around a task's scene."""
+    """Return Reality with a task's scene."""
     return TaskWorld(
         task.model.scene,
         world.reality,
@@ -33,10 +33,10 @@ def reality_environment(
     """Return an environment whose physics is Reality's; success is the block at rest in the hole.
 
     Args:
-        task: What the policy was trained for.
-        cfg: Settings of the environment that the policy was trained in.
-        states: Initial states, of which each episode takes one.
-        world: Reality.
+        task: Task of the policy.
+        cfg: Settings of the training environment.
+        states: Initial states of the episodes.
+        world: Hidden effects, sizes and physics of Reality.
 
     Raises:
         TrainError: Reality has other bodies than the model.
@@ -47,8 +47,8 @@ def reality_environment(
     bodies = [task.compiled.body(i).name for i in range(task.compiled.nbody)]
     if [model.body(i).name for i in range(model.nbody)] != bodies or model.nq != task.compiled.nq:
         raise TrainError("Reality has other bodies than the model", where=task.model.scene.source)
-    if task.place is not None:
-        task = replace(task, place=np.array([0.0, 0.0, world.shapes.floor + world.shapes.block_size / 2]))
+    if task.target_position is not None:
+        task = replace(task, target_position=np.array([0.0, 0.0, world.shapes.floor + world.shapes.block_size / 2]))
     steps = round(cfg.decimation * task.replay.timestep / world.reality.timestep)
     actors = [[Actor(one.effect.force, one.effect.command) for one in real.hidden()] for _ in range(cfg.worlds)]
     physics = MujocoPhysics(model, cfg.worlds, steps, actors=actors)

@@ -139,7 +139,7 @@ def test_commands_are_scaled_as_in_an_evaluation():
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--hide", "mass=1.5"], "effects are hidden in Reality alone"),
+        (["--hide", "mass=1.5"], "hidden effects exist only in Reality"),
         (["--states", "0"], "number of states"),
         (["--setpoint-lead-scale", "0"], "setpoint lead scale is out of bounds; expected above 0, at most 1, found 0"),
         (["--states", "1", "--speed", "9"], "speed is not right; expected 0.1 to 4"),

@@ -84,7 +84,7 @@ SETTINGS = EnvironmentCfg(
     episode=1.5,
     action=ActionCfg(gripper_actuators=("grip",), gripper=0.0005),
     # A Cartesian gripper cannot turn what has turned in it.
-    reset=ResetCfg(states=200, turn=0.0, position=0.008, held=0.0),
+    reset=ResetCfg(states=200, turn=0.0, position=0.008, grasp_turn=0.0),
     # Few and large spheres follow the hole's edges loosely: most of what they penetrate by is no collision, and true
     # surfaces get farther into one another than a tight fit allows.
     virtual=CollisionCfg(depth=10.0, points=0),

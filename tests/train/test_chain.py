@@ -13,7 +13,7 @@ from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import _make_physics, make_environment
 from concent_warp.train.policy.evaluate import run_episodes
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
-from concent_warp.train.task.movable_fixtures import movable
+from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.stages import _worst_distance
 from concent_warp.train.task.task import Task
 
@@ -131,15 +131,15 @@ def test_block_falls_into_the_hole_wherever_a_world_has_it(chain, engine):
     second = chain.objects[1]
     np.testing.assert_allclose(physics.position[:, second, :2], box, atol=1e-6)
     seated = physics.position[:, chain.objects[0]] - physics.position[:, second]
-    assert chain.place is not None
-    np.testing.assert_allclose(seated[:, 2], chain.place[2], atol=1e-3)
+    assert chain.target_position is not None
+    np.testing.assert_allclose(seated[:, 2], chain.target_position[2], atol=1e-3)
     assert seated[:, :2].abs().max() < 2e-3
 
 
 def test_box_of_no_fixed_place_is_as_immovable(chain):
     plain = chain.model.scene.model
     assert plain.nmocap == 1
-    assert movable(chain.model.scene) == chain.model.scene
+    assert with_movable_fixtures(chain.model.scene) == chain.model.scene
     d = mujoco.MjData(chain.compiled)
     d.qpos[:] = chain.replay.qpos[-1]
     d.mocap_pos[0, 2] -= 0.001  # into the table: no contact of what cannot move with what does not

@@ -44,21 +44,21 @@ def offline(task: Task, values: tuple[np.ndarray, ...], world: int, ctrl: np.nda
 
 def test_commands_are_followed_as_the_effects_have_it(late):
     rng = np.random.default_rng(0)
-    values = sample_world_effects(late, WORLDS, 0, draw=True)
+    values = sample_world_effects(late, WORLDS, 0, sample=True)
     rows = (np.array([[0.0], [0.005], [0.0123], [0.062], [0.29]]), np.array([[0.0], [0.03], [0.001], [0.2], [0.05]]))
     parts = []
     for added, row in zip(late.model.effects, rows, strict=True):
         found = [added.effect.late(late.compiled, value) for value in row]
         parts.append(CommandDynamics(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
-    following = CommandDynamics.of(parts)
+    following = CommandDynamics.combined(parts)
     assert following is not None
-    assert len(values.late) == 2
+    assert len(values.command_dynamics) == 2
     follower = CommandFilter(following, late.compiled.opt.timestep, DECIMATION, "cpu")
     ctrl = rng.normal(size=(30, WORLDS, late.compiled.nu)).astype(np.float32)
-    follower.begin(torch.ones(WORLDS, dtype=torch.bool), torch.from_numpy(ctrl[0]))
+    follower.reset(torch.ones(WORLDS, dtype=torch.bool), torch.from_numpy(ctrl[0]))
     acted = []
     for command in ctrl:
-        follower.follow(torch.from_numpy(command))
+        follower.apply(torch.from_numpy(command))
         acted.append(follower.acting.clone())
     for world in range(WORLDS):
         expected = offline(late, rows, world, ctrl[:, world])
@@ -70,11 +70,11 @@ def test_worlds_that_begin_anew_forget_what_was_commanded(late):
     lag = np.full((2, late.compiled.nu), 0.1)
     follower = CommandFilter(CommandDynamics(lag, (lag,)), 0.005, DECIMATION, "cpu")
     old, new = torch.zeros(2, late.compiled.nu), torch.ones(2, late.compiled.nu)
-    follower.begin(torch.tensor([True, True]), old)
-    follower.follow(new)
+    follower.reset(torch.tensor([True, True]), old)
+    follower.apply(new)
     assert not follower.acting.any()
-    follower.begin(torch.tensor([False, True]), new)
-    follower.follow(new)
+    follower.reset(torch.tensor([False, True]), new)
+    follower.apply(new)
     assert (follower.acting[:, 1] == 1).all()
     assert not follower.acting[:, 0].any()
 
@@ -83,7 +83,7 @@ def test_worlds_that_begin_anew_forget_what_was_commanded(late):
 def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=DECIMATION)
     physics = _make_physics(late, settings, device="cpu")
-    values = sample_world_effects(late, WORLDS, 0, draw=True).values
+    values = sample_world_effects(late, WORLDS, 0, sample=True).values
     assert len(np.unique(values[0])) == WORLDS
     physics.qpos[:] = torch.as_tensor(late.replay.qpos[0]).to(physics.qpos.dtype)
     ctrl = np.tile(late.replay.ctrl[0], (8, 1))
@@ -92,7 +92,7 @@ def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
     for k, command in enumerate(ctrl):
         physics.ctrl[:] = torch.as_tensor(command, dtype=torch.float32)
         if k == 0:
-            physics.begin(torch.ones(WORLDS, dtype=torch.bool))
+            physics.reset_commands(torch.ones(WORLDS, dtype=torch.bool))
         physics.advance()
     expected = np.empty((WORLDS, late.compiled.nq))
     for world in range(WORLDS):
@@ -129,7 +129,7 @@ def test_drawn_delay_is_of_the_arm_alone(task):
     physics = _make_physics(task, cfg, device="cpu")
     physics.qpos[:] = torch.as_tensor(task.replay.qpos[0])
     physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)
-    physics.begin(torch.ones(4, dtype=torch.bool))
+    physics.reset_commands(torch.ones(4, dtype=torch.bool))
     before = physics.qpos.clone()
     physics.ctrl[:] -= 0.01
     physics.advance()

@@ -15,7 +15,7 @@ from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
 from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.randomisation import sample_model_fields
-from concent_warp.train.environment.world_effects import _drawn, sample_world_effects
+from concent_warp.train.environment.world_effects import _sample_parameters, sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics
 from concent_warp.train.task.task import Task
 
@@ -42,7 +42,7 @@ def varied() -> Task:
 def test_parameters_have_the_interval_of_the_fit(varied):
     rng = np.random.default_rng(0)
     added = (DAMPING, STRIBECK, MASS)
-    damping, stribeck, mass = (_drawn(a.effect.parameters(varied.compiled), a, 4000, rng) for a in added)
+    damping, stribeck, mass = (_sample_parameters(a.effect.parameters(varied.compiled), a, 4000, rng) for a in added)
     for values, (low, high) in ((damping[:, 0], (20, 40)), (stribeck[:, 0], (2, 10)), (mass[:, 0], (1.0, 1.4))):
         assert ((values > low) & (values < high)).mean() == pytest.approx(0.95, abs=0.012)
         assert values.mean() == pytest.approx((low + high) / 2, abs=0.02 * (low + high))
@@ -52,30 +52,30 @@ def test_parameters_have_the_interval_of_the_fit(varied):
 
 
 def test_values_follow_from_the_seed(varied):
-    first, again, other = (sample_world_effects(varied, 5, seed, draw=True).values[0] for seed in (0, 0, 1))
+    first, again, other = (sample_world_effects(varied, 5, seed, sample=True).values[0] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1
 
 
 def test_parameters_stay_within_their_bounds():
     wide = replace(DAMPING, intervals=((-40.0, 100.0), (0.0, 40.0)))
-    values = sample_world_effects(task_of(wide), 500, 0, draw=True).values[0]
+    values = sample_world_effects(task_of(wide), 500, 0, sample=True).values[0]
     assert values.min() >= 0
     assert values[:, 0].max() > 90
     assert len(np.unique(values[:, 0])) == 500
 
 
 def test_nothing_is_drawn_where_it_is_not_wanted_or_not_known(varied):
-    found = sample_world_effects(varied, 3, 0, draw=False)
+    found = sample_world_effects(varied, 3, 0, sample=False)
     assert not found.fields
     for values, added in zip(found.values, varied.model.effects, strict=True):
         np.testing.assert_array_equal(values, np.tile(added.array, (3, 1)))
-    unknown = sample_world_effects(task_of(replace(DAMPING, intervals=())), 3, 0, draw=True)
+    unknown = sample_world_effects(task_of(replace(DAMPING, intervals=())), 3, 0, sample=True)
     assert not unknown.fields
 
 
 def test_fields_are_those_of_models_with_the_drawn_values(varied):
-    found = sample_world_effects(varied, WORLDS, 0, draw=True)
+    found = sample_world_effects(varied, WORLDS, 0, sample=True)
     assert set(found.fields) >= {"dof_damping", "body_mass"}
     for world in range(WORLDS):
         effects = [replace(a, values=tuple(v[world])) for a, v in zip(varied.model.effects, found.values, strict=True)]
@@ -88,7 +88,7 @@ def test_fields_are_those_of_models_with_the_drawn_values(varied):
 def test_each_world_moves_as_a_model_with_its_values(varied, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=5)
     physics = _make_physics(varied, settings, device="cpu")
-    found = sample_world_effects(varied, WORLDS, 0, draw=True)
+    found = sample_world_effects(varied, WORLDS, 0, sample=True)
     start = torch.as_tensor(varied.replay.qpos[0])
     physics.qpos[:] = start.to(physics.qpos.dtype)
     ctrl = varied.replay.ctrl[0].copy()
@@ -127,14 +127,14 @@ def test_what_is_compiled_in_is_kept_and_said_so():
     late = AddedEffect(Latency(), (0.01,), ((0.005, 0.015),))
     task = task_of(size, DAMPING, late)
     with pytest.warns(UserWarning, match="cannot vary size between worlds") as said:
-        found = sample_world_effects(task, 3, 0, draw=True)
+        found = sample_world_effects(task, 3, 0, sample=True)
     assert len(said) == 1
-    assert found.kept == ("size",)
+    assert found.fixed == ("size",)
     assert (found.values[0] == 1.01).all()
     assert len(np.unique(found.values[1][:, 0])) == 3
     with pytest.warns(UserWarning, match="joint_damping"):
-        found = sample_world_effects(task, 3, 0, draw=True, variable=lambda name: name != "dof_damping")
-    assert found.kept == ("size", "joint_damping")
+        found = sample_world_effects(task, 3, 0, sample=True, variable=lambda name: name != "dof_damping")
+    assert found.fixed == ("size", "joint_damping")
     assert not found.fields
 
 
@@ -142,7 +142,7 @@ def test_factors_are_on_top_of_effects(varied):
     cfg = RandomisationCfg(damping=(2.0, 2.0000001))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fields = sample_world_effects(varied, WORLDS, 0, draw=True).fields
+        fields = sample_world_effects(varied, WORLDS, 0, sample=True).fields
     both = sample_model_fields(varied, WORLDS, cfg, 0, fields)
     np.testing.assert_allclose(both["dof_damping"], 2 * fields["dof_damping"], rtol=1e-6)
     np.testing.assert_array_equal(both["body_mass"], fields["body_mass"])

@@ -118,10 +118,10 @@ def test_success_is_block_in_its_demonstrated_place(environment, task):
     start(environment)
     block = environment.physics.qpos[:, :3]
     box = task.compiled.body("box").pos
-    block[:] = torch.as_tensor(box + task.place)
+    block[:] = torch.as_tensor(box + task.target_position)
     block[1::2, 2] += 0.006
-    environment.physics.place()
-    off = (environment.place() - torch.as_tensor(task.place)).abs().max(dim=1).values
+    environment.physics.update_poses()
+    off = (environment.relative_position() - torch.as_tensor(task.target_position)).abs().max(dim=1).values
     assert (off[::2] < 1e-6).all()
     assert (off[1::2] > 0.005).all()
     environment.physics.qvel.zero_()

@@ -112,7 +112,7 @@ def test_unknown_effects_are_refused_before_anything_runs(capsys):
     assert main(["evaluate", "--checkpoint", "nothing", "--hide", "magic=1"]) == 2
     assert "joint_friction" in capsys.readouterr().err
     assert main(["evaluate", "--checkpoint", "nothing", "--hide", "mass=2", "--world", "simulation"]) == 2
-    assert "effects are hidden in Reality alone" in capsys.readouterr().err
+    assert "hidden effects exist only in Reality" in capsys.readouterr().err
 
 
 def test_pads_are_the_geoms_of_all_fingers():

@@ -6,7 +6,7 @@ import pytest
 
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 from concent_warp.train.cfg import ActionCfg
-from concent_warp.train.resets.inverse_kinematics import reach
+from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
 from concent_warp.train.resets.inverse_kinematics_batch import _tool_chain, solve_inverse_kinematics_batch
 from concent_warp.train.task.robot import Robot
 
@@ -51,7 +51,7 @@ def test_small_displacements_are_reached_from_the_posture(asked):
     for i in range(6):
         d = mujoco.MjData(m)
         d.qpos[:] = qpos[i]
-        joints = reach(m, d, robot, position[i], rotation[i])
+        joints = solve_inverse_kinematics(m, d, robot, position[i], rotation[i])
         if i == 5:
             assert joints is None
         else:

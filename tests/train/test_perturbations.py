@@ -1,4 +1,4 @@
-"""Forces and torques that push what is held."""
+"""Random force perturbations of a grasped object."""
 
 from dataclasses import replace
 
@@ -14,7 +14,9 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import MujocoPhysics, WarpPhysics
 from concent_warp.train.environment.worlds import make_environment
 
-PUSHED = replace(SETTINGS, randomisation=replace(SETTINGS.randomisation, push=(2.0, 0.05), push_share=0.5))
+PERTURBED = replace(
+    SETTINGS, randomisation=replace(SETTINGS.randomisation, perturbation=(2.0, 0.05), perturbation_share=0.5)
+)
 
 
 def acted(environment: Environment) -> torch.Tensor:
@@ -49,15 +51,15 @@ def test_wrench_moves_the_body_that_it_acts_on_as_newton_says(task, engine, law)
     assert gained[5] == pytest.approx(1e-4 * time / m.body_inertia[body, 2], rel=1e-3)
 
 
-def test_pushes_come_in_training_and_not_in_an_evaluation(task, states):
+def test_perturbations_come_in_training_and_not_in_an_evaluation(task, states):
     torch.manual_seed(0)
-    environment = make_environment(task, PUSHED, states, device="cpu")
+    environment = make_environment(task, PERTURBED, states, device="cpu")
     body = task.objects[0]
-    pushes = torch.stack([acted(environment)[:, body] for _ in range(20)])
-    hit = pushes.abs().sum(dim=2) > 0
+    perturbations = torch.stack([acted(environment)[:, body] for _ in range(20)])
+    hit = perturbations.abs().sum(dim=2) > 0
     assert float(hit.float().mean()) == pytest.approx(0.5, abs=0.1)
-    assert float(pushes[hit][:, :3].std()) == pytest.approx(2.0, rel=0.15)
-    assert float(pushes[hit][:, 3:].std()) == pytest.approx(0.05, rel=0.15)
+    assert float(perturbations[hit][:, :3].std()) == pytest.approx(2.0, rel=0.15)
+    assert float(perturbations[hit][:, 3:].std()) == pytest.approx(0.05, rel=0.15)
     environment.start_from(list(range(environment.num_envs)))
     assert not acted(environment).any()
     environment.reset()
@@ -67,31 +69,39 @@ def test_pushes_come_in_training_and_not_in_an_evaluation(task, states):
     assert not others.any()
 
 
-@pytest.mark.parametrize("wrong", [{"push": (-1.0, 0.1)}, {"push_share": 1.5}])
-def test_pushes_that_cannot_be_are_refused(wrong):
-    with pytest.raises(TrainError, match="pushes are not right"):
-        TrainCfg(environment=replace(PUSHED, randomisation=replace(PUSHED.randomisation, **wrong)))
+@pytest.mark.parametrize("wrong", [{"perturbation": (-1.0, 0.1)}, {"perturbation_share": 1.5}])
+def test_negative_deviations_and_shares_above_one_are_refused(wrong):
+    with pytest.raises(TrainError, match="perturbations are out of bounds"):
+        TrainCfg(environment=replace(PERTURBED, randomisation=replace(PERTURBED.randomisation, **wrong)))
 
 
-def test_what_is_not_held_is_not_pushed(task, states):
-    environment = make_environment(task, PUSHED, states, device="cpu")
+def test_objects_that_are_not_grasped_are_not_perturbed(task, states):
+    environment = make_environment(task, PERTURBED, states, device="cpu")
     environment._frames.zero_()
     assert not acted(environment).any()
 
 
-def test_pushed_training_goes_on_as_if_it_had_not_stopped(task, states):
-    """Pushes are drawn from the generator that a checkpoint keeps."""
+def test_resumed_environment_samples_the_same_perturbations(task, states):
+    """Perturbations are sampled from the generator that a checkpoint keeps."""
     found = []
     for stop in (False, True):
         torch.manual_seed(3)
-        environment = make_environment(task, PUSHED, states, device="cpu")
+        environment = make_environment(task, PERTURBED, states, device="cpu")
         for _ in range(3):
             acted(environment)
         if stop:
             kept, generator = environment.state(), torch.get_rng_state()
-            environment = make_environment(task, PUSHED, states, device="cpu")
+            environment = make_environment(task, PERTURBED, states, device="cpu")
             environment.restore(kept)
             torch.set_rng_state(generator)
         found.append((acted(environment), environment.observation.clone()))
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_preset_perturbs_grasped_objects_and_keeps_other_settings():
+    cfg = TrainCfg(seed=4, environment=PERTURBED).with_perturbations()
+    assert (cfg.seed, cfg.environment.worlds) == (4, PERTURBED.worlds)
+    assert cfg.environment.randomisation.perturbation == (3.0, 0.08)
+    assert cfg.environment.randomisation.perturbation_share == 0.5
+    assert cfg.environment.action.turn == 0.006

@@ -28,9 +28,9 @@ def put(environment: Environment, time: float) -> None:
 
 def test_contact_points_are_at_their_targets_when_the_target_event_is_there(player):
     task = player.environment.task
-    apart = np.linalg.norm(np.diff(player.moment().pairs, axis=1), axis=-1).max()
+    apart = np.linalg.norm(np.diff(player.state().pairs, axis=1), axis=-1).max()
     put(player.environment, task.events.stages[task.stage].event.time)
-    moment = player.moment()
+    moment = player.state()
     assert moment.stage == "insert"
     assert len(moment.pairs) == task.table.used[task.stage].sum()
     together = np.linalg.norm(np.diff(moment.pairs, axis=1), axis=-1).max()
@@ -42,7 +42,7 @@ def test_targets_are_those_of_the_stage_that_the_world_is_in(player):
     for number, stage in enumerate(task.events.stages):
         put(environment, stage.event.time)
         environment.stage[0] = number
-        moment = player.moment()
+        moment = player.state()
         assert moment.stage == stage.name
         assert len(moment.pairs) == task.table.used[number].sum()
         assert np.linalg.norm(np.diff(moment.pairs, axis=1), axis=-1).max() < 0.002
@@ -51,7 +51,7 @@ def test_targets_are_those_of_the_stage_that_the_world_is_in(player):
 def test_spheres_that_touch_are_those_in_contact_and_none_in_the_air(player):
     environment, task = player.environment, player.environment.task
     put(environment, task.events.stages[task.stage].event.time)
-    held = player.moment().touching
+    held = player.state().touching
     names = np.array(task.model.geometry.names())
     d = mujoco.MjData(task.compiled)
     d.qpos[:] = environment.physics.qpos[0].numpy()
@@ -61,11 +61,11 @@ def test_spheres_that_touch_are_those_in_contact_and_none_in_the_air(player):
     assert met <= set(names[held])
     environment.physics.qpos[0, 2] += 1.0
     environment.refresh()
-    assert not player.moment().touching[task.model.geometry.of("block")].any()
+    assert not player.state().touching[task.model.geometry.of("block")].any()
 
 
 def test_bodies_are_where_the_world_has_them(player):
-    moment, task = player.moment(), player.environment.task
+    moment, task = player.state(), player.environment.task
     block = task.compiled.body("block").id
     np.testing.assert_allclose(moment.position[block], player.environment.physics.qpos[0, :3], atol=1e-6)
     assert moment.position.shape == (task.compiled.nbody, 3)
@@ -81,11 +81,11 @@ def test_episodes_end_with_an_outcome_and_begin_from_the_next_state(player, stat
     assert player.ended == [outcomes[-1]]
     assert player.ended[0] in ("missed", "success")
     assert at() == 1
-    assert player.moment().time == 0
+    assert player.state().time == 0
     player.step()
-    assert player.moment().time == pytest.approx(player.environment.control_step)
+    assert player.state().time == pytest.approx(player.environment.control_step)
     player.begin()
-    assert (at(), player.moment().time) == (2, 0)
+    assert (at(), player.state().time) == (2, 0)
     player.begin()
     assert at() == 0
 

@@ -9,8 +9,14 @@ from small_insertion import CHAIN, SETTINGS, make_task
 
 from concent_warp.train.cfg import EngineeredCfg, RewardCfg
 from concent_warp.train.environment.environment import TERMS
-from concent_warp.train.environment.quaternions import angle, inverse, multiply, rotate, rotation_columns
-from concent_warp.train.environment.reward import disturbance, effort, engineered
+from concent_warp.train.environment.quaternions import (
+    invert_quaternion,
+    multiply_quaternions,
+    rotate_vectors,
+    rotation_angle,
+    rotation_columns,
+)
+from concent_warp.train.environment.reward import disturbance_penalty, effort_penalties, engineered_reward
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.resets.sample import sample_reset_states
@@ -31,21 +37,25 @@ def test_rotations_agree_with_matrices():
     rng = np.random.default_rng(0)
     a, b, v = quaternions(rng, 5), quaternions(rng, 5), rng.normal(size=(5, 3))
     ta, tb, tv = (torch.as_tensor(x) for x in (a, b, v))
-    np.testing.assert_allclose(rotate(ta, tv), np.einsum("nij,nj->ni", matrix(a), v), atol=1e-12)
+    np.testing.assert_allclose(rotate_vectors(ta, tv), np.einsum("nij,nj->ni", matrix(a), v), atol=1e-12)
     np.testing.assert_allclose(
-        rotate(multiply(ta, tb), tv), np.einsum("nij,njk,nk->ni", matrix(a), matrix(b), v), atol=1e-12
+        rotate_vectors(multiply_quaternions(ta, tb), tv),
+        np.einsum("nij,njk,nk->ni", matrix(a), matrix(b), v),
+        atol=1e-12,
     )
-    np.testing.assert_allclose(rotate(inverse(ta), rotate(ta, tv)), v, atol=1e-12)
+    np.testing.assert_allclose(rotate_vectors(invert_quaternion(ta), rotate_vectors(ta, tv)), v, atol=1e-12)
     np.testing.assert_allclose(rotation_columns(ta), matrix(a)[:, :, :2].transpose(0, 2, 1).reshape(5, 6), atol=1e-12)
     turn = torch.tensor([np.cos(0.0001), np.sin(0.0001), 0, 0], dtype=torch.float32)
-    assert float(angle(turn)) == pytest.approx(0.0002, rel=1e-4)
-    assert float(angle(-turn)) == pytest.approx(0.0002, rel=1e-4)
+    assert float(rotation_angle(turn)) == pytest.approx(0.0002, rel=1e-4)
+    assert float(rotation_angle(-turn)) == pytest.approx(0.0002, rel=1e-4)
 
 
 def test_effort_is_the_papers():
     rng = np.random.default_rng(0)
     action, velocity, lead = rng.normal(size=(6, 8)), rng.normal(size=(6, 7)), rng.normal(size=(6, 7))
-    found = effort(RewardCfg(press=0.2), torch.as_tensor(action), torch.as_tensor(velocity), torch.as_tensor(lead))
+    found = effort_penalties(
+        RewardCfg(press=0.2), torch.as_tensor(action), torch.as_tensor(velocity), torch.as_tensor(lead)
+    )
     np.testing.assert_allclose(found[0], -0.01 * (action**2).sum(axis=1))
     np.testing.assert_allclose(found[1], -0.001 * (velocity**2).sum(axis=1))
     np.testing.assert_allclose(found[2], -0.2 * (lead**2).sum(axis=1))
@@ -59,7 +69,7 @@ def test_disturbance_counts_shifts_and_turns_of_every_object():
     moved[1, 0] = torch.tensor([0.0, 0.03, 0.04])
     turned = quaternion.clone()
     turned[1, 1] = torch.tensor([np.cos(0.1), 0, 0, np.sin(0.1)])
-    found = disturbance(cfg, (position, quaternion), (moved, turned))
+    found = disturbance_penalty(cfg, (position, quaternion), (moved, turned))
     np.testing.assert_allclose(found, [0.0, -(3.0 * 0.05 + 0.5 * 0.2)], atol=1e-6)
 
 
@@ -73,7 +83,7 @@ def test_engineered_reward_is_the_papers():
     expected = np.exp(-aside / 0.1) + np.exp(-aside / 0.01) + gate * (np.exp(-above / 0.1) + np.exp(-above / 0.01))
     seated = (aside < 0.01) & (above == 0)
     assert 0 < seated.sum() < len(seated)
-    np.testing.assert_allclose(engineered(cfg, torch.as_tensor(place)), expected + 50 * seated, rtol=1e-6)
+    np.testing.assert_allclose(engineered_reward(cfg, torch.as_tensor(place)), expected + 50 * seated, rtol=1e-6)
 
 
 def test_reaching_reward_of_an_environment_is_that_of_its_worst_pair(environment, task):

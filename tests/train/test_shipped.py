@@ -11,7 +11,7 @@ from data_parallel_training import make_run
 
 from concent_warp.cli import main
 from concent_warp.errors import TrainError
-from concent_warp.train.environment.observation import Layout
+from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, pretrained_checkpoint
@@ -72,7 +72,7 @@ def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_sma
         assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
         run = TrainingRun.load(FOLDER / name)
         weights = torch.load(pretrained_checkpoint(name), weights_only=False)["actor_state_dict"]
-        assert weights["obs_normalizer._mean"].shape[1] == Layout.of(run.task()).size
+        assert weights["obs_normalizer._mean"].shape[1] == ObservationLayout.of(run.task()).size
 
 
 def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_path):

@@ -13,10 +13,10 @@ from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.environment.observation import Layout
+from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.resets.sample import sample_reset_states
-from concent_warp.train.task.slots import _choose
+from concent_warp.train.task.slots import _select_pairs
 from concent_warp.train.task.task import Task
 
 
@@ -29,7 +29,7 @@ def sorter() -> Task:
 
 
 def test_observation_of_the_shape_sorter_is_the_papers_table(sorter):
-    layout = Layout.of(sorter)
+    layout = ObservationLayout.of(sorter)
     assert layout.parts == (
         ("joint angles", 14),
         ("joint velocities", 7),
@@ -66,7 +66,7 @@ def test_observation_of_the_shape_sorter_reads_the_state(sorter):
 
 def test_slots_keep_every_pair_of_bodies_and_favour_the_stages_own(sorter):
     stage = sorter.events.stages[sorter.stage]
-    chosen = _choose(sorter.events, stage, 8)
+    chosen = _select_pairs(sorter.events, stage, 8)
     bodies = [(sorter.events.entity[p.a].body, sorter.events.entity[p.b].body) for p in chosen]
     every = {(sorter.events.entity[p.a].body, sorter.events.entity[p.b].body) for p in stage.event.pairs}
     assert len(chosen) == 8
@@ -74,11 +74,11 @@ def test_slots_keep_every_pair_of_bodies_and_favour_the_stages_own(sorter):
     touching = sum(sorter.events.entity[p.b].body == "box" for p in stage.event.pairs)
     assert bodies.count(("block", "box")) == min(touching, 8 - (len(every) - 1))
     assert len(set(chosen)) == 8
-    assert _choose(sorter.events, stage, 1)[0] in stage.event.pairs
+    assert _select_pairs(sorter.events, stage, 1)[0] in stage.event.pairs
 
 
 def test_place_of_success_is_the_seat_in_the_hole(task):
-    np.testing.assert_allclose(task.place, [0.0, 0.0, 0.023], atol=0.0025)
+    np.testing.assert_allclose(task.target_position, [0.0, 0.0, 0.023], atol=0.0025)
 
 
 def test_unknown_stage_site_and_delays_are_refused():
@@ -112,7 +112,7 @@ def test_displaced_states_keep_the_block_in_the_hand(task, states):
 
 
 def test_what_is_held_is_turned_about_the_axis_along_which_it_is_held(task):
-    cfg = replace(SETTINGS.reset, demonstrated=0.0, turn=0.0, held=0.2)
+    cfg = replace(SETTINGS.reset, demonstrated=0.0, turn=0.0, grasp_turn=0.2)
     found = sample_reset_states(task, cfg, 0, count=24)
     # The fingers close along y: the block turns about y by up to 0.2 rad, and about nothing else.
     angles = 2 * np.arcsin(found.qpos[:, 4:7] * np.sign(found.qpos[:, 3:4]))

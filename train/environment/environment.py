@@ -1,8 +1,8 @@
-"""The vectorised environment, as rsl-rl wants one: everything on the device, and no wait for it in a step.
+"""Vectorised environment with rsl-rl's interface; all arrays stay on the device and a step does not wait for it.
 
-A step: commands from the action; the simulator; distances of pairs and virtual collisions; rewards, ends of episodes
-and new initial states where episodes ended; poses and distances of what is there now; observation. On CUDA each part
-is a captured graph.
+A step consists of: commands from the action; simulation; distances of contact pairs and virtual collisions; rewards,
+ends of episodes and their new initial states; poses and distances of the new states; observation. On CUDA each part is
+a captured graph.
 """
 
 from __future__ import annotations
@@ -21,42 +21,43 @@ from tensordict import TensorDict
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg
-from concent_warp.train.environment.observation import BaseObservation, Layout
+from concent_warp.train.environment.observation import BaseObservation, ObservationLayout
 from concent_warp.train.environment.physics import Graph, Physics, captured
-from concent_warp.train.environment.quaternions import inverse, rotate
-from concent_warp.train.environment.reward import disturbance, effort, engineered, relative_pose
+from concent_warp.train.environment.quaternions import invert_quaternion, rotate_vectors
+from concent_warp.train.environment.reward import (
+    disturbance_penalty,
+    effort_penalties,
+    engineered_reward,
+    relative_pose,
+)
 from concent_warp.train.environment.virtual_collision import virtual_collision
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
 TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
 """Terms of the reward, in the order of `Environment.terms`."""
-SPEED = 1e4
-"""Generalised velocity beyond which a world counts as diverged [rad/s or m/s]."""
-EXTENT = 1e4
-"""Generalised position beyond which it does [rad or m]."""
-EPISODES = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
-CHAINS = ("chains", "chain success")
-"""Sums over episodes that started with all stages to come; how many met each stage's target follows."""
+EPISODE_SUMS = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
+CHAIN_SUMS = ("chains", "chain success")
+"""Sums over episodes that started before the first stage; the number that met each stage's target follows."""
 
 
 class Environment(VecEnv):
     """N worlds of a task.
 
-    Where stages are chained, each world has a stage, whose target event observation and reward follow. It moves on when
-    the target's pairs have been together for some steps, and its episode ends when object 1 has come to rest in place.
+    In a chain of stages each world has a present stage, whose target event determines observation and reward. The next
+    stage follows when the target is met (`ChainCfg`); the episode ends when object 1 is at rest in place.
     """
 
     def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: ResetStates) -> None:
-        """Make the environment and start all worlds.
+        """Create the environment and start an episode in all worlds.
 
         Args:
-            task: What is trained.
-            cfg: Its settings.
-            physics: The worlds, with the bodies, joints, actuators and sites of the task's model.
+            task: The task.
+            cfg: Settings.
+            physics: The simulated worlds, with the bodies, joints, actuators and sites of the task's model.
             states: Initial states.
         """
-        self.task, self.physics, self.layout = task, physics, Layout.of(task)
+        self.task, self.physics, self.layout = task, physics, ObservationLayout.of(task)
         self.num_envs, self.num_actions, self.device = physics.worlds, task.robot.actions, physics.device
         self.control_step = cfg.decimation * task.replay.timestep
         """Time between actions [s]."""
@@ -98,7 +99,7 @@ class Environment(VecEnv):
         self.reset()
 
     def _make_tables(self) -> None:
-        """Put on the device what does not change."""
+        """Copy constant arrays to the device."""
         task, cfg, m = self.task, self._settings, self.task.compiled
         robot = task.robot
 
@@ -114,22 +115,22 @@ class Environment(VecEnv):
         ranges = np.where(m.actuator_ctrllimited[:, None], m.actuator_ctrlrange, [-np.inf, np.inf])
         self._range = real(ranges)
         self._objects = index(list(task.objects))
-        tool, stages = int(m.site_bodyid[robot.tool]), range(len(task.held))
-        self._frames = index([[tool if holds else 0 for holds in task.holds(s)] for s in stages])
-        keeps = np.array([task.keeps(s) for s in stages])
-        self._watched = torch.as_tensor(task.held & keeps[:, None], device=self.device)
-        self._place = None if task.place is None else real(task.place)
-        self._success, self._dropped, self._lost = cfg.success, cfg.dropped, cfg.lost
+        tool, stages = int(m.site_bodyid[robot.tool]), range(len(task.robot_slots))
+        self._frames = index([[tool if grasped else 0 for grasped in task.grasped_objects(s)] for s in stages])
+        grasped_at_start = np.array([task.starts_grasped(s) for s in stages])
+        self._watched = torch.as_tensor(task.robot_slots & grasped_at_start[:, None], device=self.device)
+        self._target = None if task.target_position is None else real(task.target_position)
+        self._max_deviation, self._max_grasp_gap, self._max_object_gap = cfg.success, cfg.dropped, cfg.lost
         self._rest = max(1, round(cfg.chain.rest / self.control_step))
         self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
-        force, torque = cfg.randomisation.push
+        force, torque = cfg.randomisation.perturbation
         self._perturbation_std = real([force] * 3 + [torque] * 3) if force or torque else None
         pool = self._states
         self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
         self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
 
     def _make_buffers(self) -> None:
-        """Allocate what lives as long as the environment; graphs refer to it."""
+        """Allocate the buffers that captured graphs refer to."""
         n, device, m = self.num_envs, self.device, self.task.compiled
         self.action = torch.zeros(n, self.num_actions, device=device)
         self.reward = torch.zeros(n, device=device)
@@ -140,19 +141,19 @@ class Environment(VecEnv):
         self.success = torch.zeros(n, dtype=torch.bool, device=device)
         """Whether object 1 was in place at the end of the last step."""
         self.reached = torch.zeros(n, dtype=torch.int32, device=device)
-        """How many stage targets had been met, in their order, by the end of the last step, earlier stages included."""
+        """Number of stage targets met in order by the end of the last step, stages before the initial one included."""
         self.stage = torch.full((n,), self.task.first, dtype=torch.int32, device=device)
-        """Stage of each world."""
-        self._begun = torch.zeros(n, dtype=torch.bool, device=device)
-        self._most = torch.zeros_like(self.stage)
-        self._near = torch.zeros_like(self.stage)
-        self._resting = torch.zeros_like(self.stage)
+        """Present stage of each world."""
+        self._from_start = torch.zeros(n, dtype=torch.bool, device=device)
+        self._stages_met = torch.zeros_like(self.stage)
+        self._steps_within = torch.zeros_like(self.stage)
+        self._steps_at_rest = torch.zeros_like(self.stage)
         self.terms = torch.zeros(n, len(TERMS), device=device)
         """Weighted terms of the last reward before it is scaled, shape (N, len(TERMS))."""
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self._return = torch.zeros(n, device=device)
         chained = [self.task.events.stages[s].name for s in self.task.chained]
-        self._names = (*TERMS, "steps", *EPISODES, *CHAINS, *(f"met {name}" for name in chained), "overflow")
+        self._names = (*TERMS, "steps", *EPISODE_SUMS, *CHAIN_SUMS, *(f"met {name}" for name in chained), "overflow")
         self._sums = torch.zeros(len(self._names), dtype=torch.float64, device=device)
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
@@ -164,7 +165,7 @@ class Environment(VecEnv):
         self._perturbing = torch.ones((), device=device)
 
     def reset(self) -> None:
-        """Start an episode in every world for training, at random places of it, so that they do not end all at once."""
+        """Start a training episode in every world, with random elapsed times, so that they do not all end at once."""
         self._perturbing.fill_(1)
         with torch.no_grad():
             self._start(torch.ones_like(self.done))
@@ -175,7 +176,7 @@ class Environment(VecEnv):
             self.refresh()
 
     def start_from(self, rows: Sequence[int]) -> None:
-        """Start an episode in every world from the states of these rows, one each; from here on nothing is pushed."""
+        """Start an episode in every world from the initial states of these rows, one each; without perturbations."""
         self._perturbing.zero_()
         index = torch.as_tensor(np.asarray(rows), device=self.device)
         with torch.no_grad():
@@ -183,18 +184,18 @@ class Environment(VecEnv):
         self.refresh()
 
     def refresh(self) -> None:
-        """Compute poses, distances and the observation that follow from the present state."""
+        """Compute poses, distances and observation of the present state."""
         with torch.no_grad():
-            self.physics.place()
+            self.physics.update_poses()
             self._paired.launch()
             self._observe()
 
     def get_observations(self) -> TensorDict:
-        """Return the observation of the present state; a copy, for rsl-rl keeps it through the next step."""
+        """Return a copy of the present observation; rsl-rl keeps it during the next step."""
         return TensorDict({"policy": self.observation.clone()}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Act for one step; see `rsl_rl.env.VecEnv.step`."""
+        """Act for one control step; see `rsl_rl.env.VecEnv.step`."""
         with torch.no_grad():
             self.action.copy_(actions)
             self._command()
@@ -208,15 +209,15 @@ class Environment(VecEnv):
         return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
 
     def read_log(self, total: Callable[[torch.Tensor], torch.Tensor] | None = None) -> dict[str, float]:
-        """Return means since the last call, and start anew; this waits for the device.
+        """Return means since the last call and reset the sums; this waits for the device.
 
         Terms are means over steps; `success`, `time outs`, `dropped`, `severe` and `diverged` are shares of the ended
         episodes, `return` and `length` [steps] their means; `overflow` is the share of steps in which a world's buffers
-        were too small. Where stages are chained, `success` and `met <stage>` are shares of the ended episodes that
-        started with all stages to come, and `success of all` is that of all.
+        were too small. In a chain of stages, `success` and `met <stage>` are shares of the ended episodes that started
+        before the first stage, and `success of all` is the share of all ended episodes.
 
         Args:
-            total: Adds the sums of other processes to those of this one; the worlds of this one alone by default.
+            total: Sums a tensor over ranks; by default only this process's worlds count.
         """
         values = self._sums.clone() if total is None else total(self._sums.clone())
         sums = dict(zip(self._names, values.tolist(), strict=True))
@@ -231,10 +232,10 @@ class Environment(VecEnv):
         return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
 
     def diverged_state(self) -> dict[str, np.ndarray] | None:
-        """Return the state at the start of the step in which a world first diverged, None if none has.
+        """Return the state before the step in which a world first diverged, None if none has.
 
-        It consists of "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, where objects stand that do not move,
-        "mocap_pos" (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the number of the "world", shape ().
+        It has "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, the poses of fixed objects, "mocap_pos"
+        (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the index of the "world", shape ().
         """
         if not bool(self._has_diverged):
             return None
@@ -245,14 +246,14 @@ class Environment(VecEnv):
         return {name: part.reshape(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Return everything that the future depends on besides the random number generators."""
+        """Return the state of all worlds by name, without random number generators."""
         return {name: value.clone() for name, value in self._state().items()}
 
     def restore(self, state: dict[str, torch.Tensor]) -> None:
-        """Bring back what `state` returned.
+        """Set the state that `state` returned.
 
         Raises:
-            TrainError: It is of an environment that had less of a state.
+            TrainError: It lacks a part of this environment's state.
         """
         parts = self._state()
         if missing := sorted(set(parts) - set(state)):
@@ -262,35 +263,45 @@ class Environment(VecEnv):
         self.refresh()
 
     def _state(self) -> dict[str, torch.Tensor]:
-        """Return the tensors themselves that `state` returns copies of."""
+        """Return the tensors of which `state` returns copies."""
         p = self.physics
         parts = {"qpos": p.qpos, "qvel": p.qvel, "ctrl": p.ctrl, "warmstart": p.warmstart}
         parts |= {"mocap position": p.mocap[0], "mocap quaternion": p.mocap[1]}
-        parts |= {"length": self.episode_length_buf, "return": self._return, "stage": self.stage, "begun": self._begun}
-        parts |= {"most": self._most, "near": self._near, "resting": self._resting, "skill": self._success_average}
+        parts |= {
+            "length": self.episode_length_buf,
+            "return": self._return,
+            "stage": self.stage,
+            "from start": self._from_start,
+        }
+        parts |= {
+            "stages met": self._stages_met,
+            "steps within": self._steps_within,
+            "steps at rest": self._steps_at_rest,
+            "success average": self._success_average,
+        }
         return parts | p.memory
 
     def parts(self) -> tuple[Callable[[], None], ...]:
-        """Return what a step consists of, in its order, for a profile: commands, physics, distances, judging, poses and
-        pairs of what is there now, observation.
+        """Return the parts of a step in order, for profiling: commands, physics, distances, rewards and resets, poses
+        and distances of the new states, observation.
         """
 
         def poses_and_pairs() -> None:
-            self.physics.place()
+            self.physics.update_poses()
             self._paired.launch()
 
         return (
             self._command, self.physics.advance, self._measured.launch, self._evaluate, poses_and_pairs, self._observe,
         )  # fmt: skip
 
-    def place(self) -> torch.Tensor:
-        """Return where object 1 is in the frame of object 2 [m], shape (N, 3)."""
+    def relative_position(self) -> torch.Tensor:
+        """Return the position of object 1 in the frame of object 2 [m], shape (N, 3)."""
         position, quaternion = self.physics.position, self.physics.quaternion
         first, second = self.task.objects[:2]
-        return rotate(inverse(quaternion[:, second]), position[:, first] - position[:, second])
+        return rotate_vectors(invert_quaternion(quaternion[:, second]), position[:, first] - position[:, second])
 
     def _apply_action(self) -> None:
-        """Turn the action into commands, and note what is compared with afterwards."""
+        """Compute commands from the action, and store the state before the step."""
         p = self.physics
         action = self.action.clamp_(-1, 1)
         for copy, value in zip(self._before, (p.qpos, p.qvel, p.ctrl), strict=True):
@@ -309,14 +320,16 @@ class Environment(VecEnv):
             self._perturb_object(self._perturbation_std)
 
     def _perturb_object(self, deviation: torch.Tensor) -> None:
-        """Have forces and torques of these standard deviations (6,) act on object 1 in some worlds that hold it."""
-        held = self._frames[self.stage.long(), 0] > 0
-        hit = held & (torch.rand(self.num_envs, device=self.device) < self._settings.randomisation.push_share)
+        """Apply random forces and torques of standard deviations (6,) to object 1 in some worlds that grasp it."""
+        grasped = self._frames[self.stage.long(), 0] > 0
+        hit = grasped & (
+            torch.rand(self.num_envs, device=self.device) < self._settings.randomisation.perturbation_share
+        )
         wrench = torch.randn(self.num_envs, 6, device=self.device) * deviation * self._perturbing
         self.physics.wrench[:, self.task.objects[0]] = wrench * hit[:, None]
 
     def _object_poses(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the objects' poses, in the hand for those that the stage holds: (N, O, 3) [m] and (N, O, 4)."""
+        """Return the objects' poses, relative to the hand if the stage grasps them: (N, O, 3) [m] and (N, O, 4)."""
         position, quaternion = self.physics.position, self.physics.quaternion
         frame = self._frames[self.stage.long()]
         return relative_pose(
@@ -327,33 +340,37 @@ class Environment(VecEnv):
         )
 
     def _measure(self) -> None:
-        """Launch what tells distances."""
+        """Launch the kernels of contact pairs and virtual collisions."""
         self._pairs.launch()
         if self._virtual is not None:
             self._virtual.launch()
 
     def _evaluate_step(self) -> None:
-        """Reward the step, let worlds move on, end episodes, and start new ones in their worlds."""
+        """Compute rewards, advance stages, end episodes and start new ones."""
         p, cfg, stage = self.physics, self._settings.reward, self.stage.long()
-        sane = (self._finite > 0) & (p.qpos.abs() < EXTENT).all(dim=1) & (p.qvel.abs() < SPEED).all(dim=1)
-        # The simulators put a command of their own in the place of one that is not finite.
-        sane &= p.ctrl.isfinite().all(dim=1)
-        diverged = ~sane
-        dropped = ((self._distance > self._dropped) & self._watched[stage]).any(dim=1) & sane
+        valid = (
+            (self._finite > 0)
+            & (p.qpos.abs() < self._settings.max_position).all(dim=1)
+            & (p.qvel.abs() < self._settings.max_velocity).all(dim=1)
+        )
+        # The simulators replace commands that are not finite.
+        valid &= p.ctrl.isfinite().all(dim=1)
+        diverged = ~valid
+        dropped = ((self._distance > self._max_grasp_gap) & self._watched[stage]).any(dim=1) & valid
         if len(self._objects) > 1:
-            dropped |= (torch.linalg.vector_norm(self.place(), dim=1) > self._lost) & sane
-        severe = torch.zeros_like(sane) if self._severe is None else (self._severe > 0) & sane
+            dropped |= (torch.linalg.vector_norm(self.relative_position(), dim=1) > self._max_object_gap) & valid
+        severe = torch.zeros_like(valid) if self._severe is None else (self._severe > 0) & valid
         failed = diverged | dropped | severe
         self.failure.copy_(torch.stack([dropped, severe & ~dropped, diverged], dim=1))
-        if self._place is None:
-            self.success.copy_((self._worst < self._success) & sane)
+        if self._target is None:
+            self.success.copy_((self._worst < self._max_deviation) & valid)
         else:
-            self.success.copy_(((self.place() - self._place).abs() < self._success).all(dim=1))
+            self.success.copy_(((self.relative_position() - self._target).abs() < self._max_deviation).all(dim=1))
         lead = (p.ctrl[:, self._arm] - p.qpos[:, self._arm_qpos].float()) / self._lead
-        arm = effort(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
-        disturb = disturbance(cfg, self._pose_before, self._object_poses())
+        effort = effort_penalties(cfg, self.action, p.qvel[:, self._arm_dof].float(), lead)
+        disturb = disturbance_penalty(cfg, self._pose_before, self._object_poses())
         weighted = [cfg.reach * self._reaching(), cfg.stage * (self.stage - self.task.first).float()]
-        weighted += [cfg.regularisation * t for t in (*arm, disturb)]
+        weighted += [cfg.regularisation * t for t in (*effort, disturb)]
         strictness = cfg.lenience + (1 - cfg.lenience) * self._success_average.square()
         weighted += [cfg.vcp * strictness * self._penalty, self._none]
         terms = torch.where(diverged[:, None], 0.0, torch.stack(weighted, dim=1))
@@ -361,10 +378,10 @@ class Environment(VecEnv):
         self.terms.copy_(terms)
         self.reward.copy_(cfg.scale / len(self.task.chained) * terms.sum(dim=1))
 
-        self._move_on(sane & ~failed)
+        self._advance_stages(valid & ~failed)
         self.episode_length_buf += 1
         self._return += self.reward
-        finished = (self.episode_length_buf >= self.max_episode_length) | (self._resting >= self._rest)
+        finished = (self.episode_length_buf >= self.max_episode_length) | (self._steps_at_rest >= self._rest)
         self.time_out.copy_(finished & ~failed)
         self.done.copy_(failed | self.time_out)
         self._record_divergence(diverged)
@@ -372,39 +389,39 @@ class Environment(VecEnv):
         self._start(self.done)
 
     def _reaching(self) -> torch.Tensor:
-        """Return the reaching reward of the worlds' stages, shape (N,)."""
+        """Return the reaching reward of each world's stage, shape (N,)."""
         cfg, chained = self._settings.reward, self.task.demonstrated is not None
         reach = self._reach.sum(dim=1)
         if chained:
             reach = reach + (self._worst_pair >= 0) * cfg.wide[0] * torch.exp(-self._worst / cfg.wide[1])
         if cfg.kind != "engineered":
             return reach
-        designed = engineered(cfg.engineered, self.place())
-        return torch.where(self.stage == self.task.stage, designed, reach) if chained else designed
+        engineered = engineered_reward(cfg.engineered, self.relative_position())
+        return torch.where(self.stage == self.task.stage, engineered, reach) if chained else engineered
 
-    def _move_on(self, fine: torch.Tensor) -> None:
-        """Bring worlds whose target is met to their next stage, and count for how long object 1 has been in place.
+    def _advance_stages(self, valid: torch.Tensor) -> None:
+        """Advance worlds that met their target to the next stage, and count the steps of object 1 in place.
 
         Args:
-            fine: Where nothing has failed, shape (N,) bool.
+            valid: Worlds without failure, shape (N,) bool.
         """
         chain = self._settings.chain
-        near = (self._worst_pair >= 0) & (self._worst < chain.tolerance) & fine
-        self._near.copy_(torch.where(near, self._near + 1, 0))
-        met = self._near >= chain.hold
-        self._most.copy_(torch.maximum(self._most, self.stage - self.task.first + met))
-        self.reached.copy_(self._most)
+        near = (self._worst_pair >= 0) & (self._worst < chain.tolerance) & valid
+        self._steps_within.copy_(torch.where(near, self._steps_within + 1, 0))
+        met = self._steps_within >= chain.hold
+        self._stages_met.copy_(torch.maximum(self._stages_met, self.stage - self.task.first + met))
+        self.reached.copy_(self._stages_met)
         onward = met & (self.stage < self.task.stage)
         self.stage += onward
-        self._near.masked_fill_(onward, 0)
+        self._steps_within.masked_fill_(onward, 0)
         if self.task.demonstrated is not None:
-            self._resting.copy_(torch.where(self.success & fine, self._resting + 1, 0))
+            self._steps_at_rest.copy_(torch.where(self.success & valid, self._steps_at_rest + 1, 0))
 
     def _count(self, terms: torch.Tensor) -> None:
-        """Add a step to the sums of the log."""
+        """Add a step to the sums of the log, and update the running success rate."""
         p, ended = self.physics, self.done.double()
-        succeeded, chains = self.success & self.time_out, self.done & self._begun
-        # Of as many episodes as there are worlds, those before count by 1 / e.
+        succeeded, chains = self.success & self.time_out, self.done & self._from_start
+        # Exponential average: earlier episodes weigh 1 / e once as many episodes as worlds have ended.
         keep = torch.exp(-ended.sum() / self.num_envs)
         share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
         self._success_average.copy_(torch.lerp(share, self._success_average.double(), keep))
@@ -419,7 +436,7 @@ class Environment(VecEnv):
         p.overflow.zero_()
 
     def _record_divergence(self, diverged: torch.Tensor) -> None:
-        """Keep the state before the step of the first world that diverged."""
+        """Store the state before the step in which a world first diverged."""
         world = diverged.to(torch.uint8).argmax()
         parts = [*self._before, *self.physics.mocap, self._worlds]
         state = torch.cat([values.index_select(0, world[None]).flatten().double() for values in parts])
@@ -427,21 +444,21 @@ class Environment(VecEnv):
         self._diverged_state.copy_(torch.where(first, state, self._diverged_state))
         self._has_diverged.logical_or_(first)
 
-    def _start(self, where: torch.Tensor, rows: torch.Tensor | None = None) -> None:
-        """Start episodes in the worlds of a mask (N,) bool, from initial states drawn anew or of these rows (N,)."""
+    def _start(self, mask: torch.Tensor, rows: torch.Tensor | None = None) -> None:
+        """Start episodes in the worlds of a mask (N,) bool, from initial states of rows (N,), by default random."""
         p = self.physics
         if rows is None:
             rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
-        states = (p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage, self._begun)
+        states = (p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage, self._from_start)
         for state, pool in zip(states, self._pool, strict=True):
-            mask = where.view(-1, *[1] * (state.ndim - 1))
-            state.copy_(torch.where(mask, pool[rows].to(state.dtype), state))
-        p.warmstart.copy_(torch.where(where[:, None], 0.0, p.warmstart))
-        self._most.copy_(torch.where(where, self.stage - self.task.first, self._most))
-        for counter in (self._near, self._resting, self.episode_length_buf, self._return):
-            counter.masked_fill_(where, 0)
-        p.begin(where)
+            shaped = mask.view(-1, *[1] * (state.ndim - 1))
+            state.copy_(torch.where(shaped, pool[rows].to(state.dtype), state))
+        p.warmstart.copy_(torch.where(mask[:, None], 0.0, p.warmstart))
+        self._stages_met.copy_(torch.where(mask, self.stage - self.task.first, self._stages_met))
+        for counter in (self._steps_within, self._steps_at_rest, self.episode_length_buf, self._return):
+            counter.masked_fill_(mask, 0)
+        p.reset_commands(mask)
 
     def _read_base(self) -> None:
-        """Write robot and objects to the observation; the slots are there already."""
+        """Write the parts before the slots to the observation; a kernel has written the slots."""
         self.observation[:, : self.layout.base] = self._base.read()

@@ -1,4 +1,4 @@
-"""The observation (paper, table of appendix C): robot and objects first, then the contact slots."""
+"""Observation of the policy (paper, table of appendix C): robot and objects, then contact slots."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from concent_warp.train.task.task import Task
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Names and widths of the parts of the observation, in their order."""
+class ObservationLayout:
+    """Names and widths of the parts of the observation, in order."""
 
     parts: tuple[tuple[str, int], ...]
 
     @staticmethod
-    def of(task: Task) -> Layout:
-        """Return the layout of a task: of the shape sorter with the embedded arm the paper's, 148 numbers."""
+    def of(task: Task) -> ObservationLayout:
+        """Return the layout of a task; 148 numbers, as in the paper, for the shape sorter with the embedded arm."""
         robot = task.robot
         hinges = int(robot.turning.sum())
         parts = [("joint angles", 2 * hinges)] if hinges else []
@@ -32,7 +32,7 @@ class Layout:
         parts.append(("end effector", 3))
         parts += [(f"object {i + 1}", 9) for i in range(len(task.objects))]
         parts += [(f"slot {i}", SLOT) for i in range(task.table.used.shape[1])]
-        return Layout(tuple(parts))
+        return ObservationLayout(tuple(parts))
 
     @property
     def size(self) -> int:
@@ -41,11 +41,15 @@ class Layout:
 
     @property
     def base(self) -> int:
-        """Length of what comes before the slots."""
+        """Length of the parts before the slots."""
         return sum(width for name, width in self.parts if not name.startswith("slot "))
 
     def columns(self, part: str) -> slice:
-        """Return where a part is."""
+        """Return the columns of a part.
+
+        Raises:
+            KeyError: The observation has no such part.
+        """
         start = 0
         for name, width in self.parts:
             if name == part:
@@ -55,10 +59,10 @@ class Layout:
 
 
 class BaseObservation:
-    """Reads robot and objects off the worlds."""
+    """Computes the parts of the observation that describe robot and objects."""
 
     def __init__(self, task: Task, physics: Physics, noise: float) -> None:
-        """Note where everything is; `noise` is the standard deviation of object positions [m]."""
+        """Store indices into the state; `noise` is the standard deviation of noise on object positions [m]."""
         robot = task.robot
 
         def index(values: object) -> torch.Tensor:
@@ -73,7 +77,7 @@ class BaseObservation:
         self._objects = index(list(task.objects))
 
     def read(self) -> torch.Tensor:
-        """Return everything before the slots, shape (N, base)."""
+        """Return the parts before the slots, shape (N, base)."""
         p = self._physics
         qpos = p.qpos.float()
         turned = qpos[:, self._hinges]

@@ -1,4 +1,4 @@
-"""The worlds that an environment acts on: states as torch tensors, either simulator behind one interface."""
+"""Simulated worlds of an environment: states as torch tensors, one interface for C MuJoCo and MuJoCo-Warp."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, 
 
 
 class Physics(Protocol):
-    """N worlds of one model. The tensors are the simulator's own memory: what is written to them is the state."""
+    """N worlds of one model; the tensors are views of the simulator's memory, so writing to them sets the state."""
 
     model: mujoco.MjModel
     worlds: int
@@ -41,9 +41,9 @@ class Physics(Protocol):
     wrench: torch.Tensor
     """Force [N] and torque [N m] on each body about its centre of mass, world frame, shape (N, nbody, 6)."""
     mocap: tuple[torch.Tensor, torch.Tensor]
-    """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of what is fixed where a world has it."""
+    """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of fixed objects, which differ between worlds."""
     warmstart: torch.Tensor
-    """Accelerations that the solver starts from, shape (N, nv)."""
+    """Initial accelerations of the solver, shape (N, nv)."""
     position: torch.Tensor
     """Body origins [m], world frame, shape (N, nbody, 3)."""
     quaternion: torch.Tensor
@@ -51,14 +51,14 @@ class Physics(Protocol):
     site: torch.Tensor
     """Site positions [m], world frame, shape (N, nsite, 3)."""
     overflow: torch.Tensor
-    """Bits of what went wrong in the simulator, shape (N,) int."""
+    """Overflow flags of the simulator, shape (N,) int."""
     dropping: int
-    """Those of the bits that say that contacts were dropped because a buffer was too small."""
+    """Mask of the flags of contacts dropped for lack of buffer capacity."""
     memory: dict[str, torch.Tensor]
-    """What the future depends on besides positions, velocities, commands and warm start."""
+    """Further state by name, for checkpoints."""
 
-    def begin(self, where: torch.Tensor) -> None:
-        """Take the present commands as having been held for long in the worlds of a mask, shape (N,) bool."""
+    def reset_commands(self, mask: torch.Tensor) -> None:
+        """Set delays and lags to the steady state of the present commands in the worlds of a mask, shape (N,) bool."""
         ...
 
     def poses(self) -> tuple[wp.array, wp.array]:
@@ -66,62 +66,62 @@ class Physics(Protocol):
         ...
 
     def advance(self) -> None:
-        """Simulate the steps of one action, the commands held, and compute the poses that follow."""
+        """Simulate the steps of one action with constant commands, and update the poses."""
         ...
 
-    def place(self) -> None:
-        """Compute the poses that follow from the positions."""
+    def update_poses(self) -> None:
+        """Compute the poses from the generalised positions."""
         ...
 
 
 @dataclass(frozen=True)
 class Actor:
-    """What acts on a world of C MuJoCo besides its commands: a hidden effect, say."""
+    """Forces and commands that act on a world of C MuJoCo beyond its model, as of a hidden effect."""
 
     force: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
-    """Called before every step; adds to `qfrc_applied` and `xfrc_applied`, of which nothing is left from before."""
+    """Called before every step; adds to `qfrc_applied` and `xfrc_applied`, which are zero before."""
     command: Callable[[float, np.ndarray], np.ndarray] | None = None
     """Maps time [s] and the command (nu,) to the one that acts."""
 
 
 class MujocoPhysics:
-    """Worlds of C MuJoCo, one after the other: for CPUs, and for worlds that are no model of ours."""
+    """Worlds of C MuJoCo, simulated one after the other: on CPUs, and for Reality."""
 
     def __init__(
         self,
         model: mujoco.MjModel,
         worlds: int,
         decimation: int,
-        laws: Sequence[tuple[ForceModel, np.ndarray]] = (),
+        force_models: Sequence[tuple[ForceModel, np.ndarray]] = (),
         actors: Sequence[Sequence[Actor]] = (),
         fields: Mapping[str, np.ndarray] | None = None,
-        following: CommandDynamics | None = None,
+        command_dynamics: CommandDynamics | None = None,
     ) -> None:
-        """Make the worlds.
+        """Create the worlds.
 
         Args:
             model: Compiled model.
             worlds: N.
-            decimation: Steps of one action.
-            laws: Force laws with their parameters, shape (N, P) each.
-            actors: What else acts, for each world its own, for they may have a state; none where empty.
+            decimation: Simulation steps per action.
+            force_models: Force models with their parameters, shape (N, P) each.
+            actors: Actors of each world, since they may have a state; none if empty.
             fields: Values of model fields that differ between worlds, shape (N, ...) each.
-            following: How what acts follows the commands; at once by default.
+            command_dynamics: Delays and lags of the commands; none by default.
         """
         self.model, self.worlds, self.device = model, worlds, "cpu"
-        self._follower = following and CommandFilter(following, model.opt.timestep, decimation, self.device)
-        self.memory = {} if self._follower is None else self._follower.memory
+        self._filter = command_dynamics and CommandFilter(command_dynamics, model.opt.timestep, decimation, self.device)
+        self.memory = {} if self._filter is None else self._filter.memory
         self._decimation, self._actors = decimation, tuple(actors) or ((),) * worlds
         self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
         self._data = [mujoco.MjData(m) for m in self._models]
         rows = list(enumerate(zip(self._models, self._data, strict=True)))
-        self._laws = [[law.bound(m, d, values[i]) for law, values in laws] for i, (m, d) in rows]
-        edited = sorted({name for law, _ in laws for name in law.edits})
+        self._force_models = [[law.bound(m, d, values[i]) for law, values in force_models] for i, (m, d) in rows]
+        edited = sorted({name for law, _ in force_models for name in law.edits})
         self._unedited = [[(getattr(m, name), getattr(m, name).copy()) for name in edited] for m in self._models]
         self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
         self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
         self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
-        # Double precision, so that nothing of a state is lost on the way to the simulator and back.
+        # Double precision, so that states are exact between tensors and simulator.
         self.qpos = torch.from_numpy(np.tile(model.qpos0, (worlds, 1)))
         self.qvel = torch.zeros(worlds, model.nv, dtype=torch.float64)
         self.warmstart = torch.zeros_like(self.qvel)
@@ -137,7 +137,7 @@ class MujocoPhysics:
         self._arrays = [tensor.numpy() for tensor in arrays]
 
     def _model_of(self, world: int, fields: Mapping[str, np.ndarray]) -> mujoco.MjModel:
-        """Return the model of a world, one for all where none differs."""
+        """Return the model of a world; the same object for all worlds without varied fields."""
         if not fields:
             return self.model
         m = copy.copy(self.model)
@@ -148,18 +148,18 @@ class MujocoPhysics:
         """Return positions and orientations as Warp arrays."""
         return self._xpos, self._xquat
 
-    def begin(self, where: torch.Tensor) -> None:
-        """See `Physics.begin`."""
-        if self._follower is not None:
-            self._follower.begin(where, self.ctrl)
+    def reset_commands(self, mask: torch.Tensor) -> None:
+        """See `Physics.reset_commands`."""
+        if self._filter is not None:
+            self._filter.reset(mask, self.ctrl)
 
     def advance(self) -> None:
-        """Simulate the steps of one action. A world that MuJoCo resets as unstable is left not finite instead."""
-        if self._follower is None:
+        """Simulate the steps of one action; the positions of a world that MuJoCo resets as unstable become NaN."""
+        if self._filter is None:
             acting = np.broadcast_to(self.ctrl.numpy(), (self._decimation, *self.ctrl.shape))
         else:
-            self._follower.follow(self.ctrl)
-            acting = self._follower.acting.numpy()
+            self._filter.apply(self.ctrl)
+            acting = self._filter.acting.numpy()
         with quiet_warnings():
             self._advance(acting.astype(float))
 
@@ -173,12 +173,12 @@ class MujocoPhysics:
                 for actor in self._actors[i]:
                     command = command if actor.command is None else actor.command(d.time, command)
                 d.ctrl[:] = command
-                if self._laws[i] or self._actors[i]:
+                if self._force_models[i] or self._actors[i]:
                     d.qfrc_applied[:] = 0
                     d.xfrc_applied[:] = wrench[i]
                     for target, values in self._unedited[i]:
                         target[:] = values
-                    for law in self._laws[i]:
+                    for law in self._force_models[i]:
                         law()
                     for actor in self._actors[i]:
                         if actor.force is not None:
@@ -189,59 +189,59 @@ class MujocoPhysics:
             if any(d.warning[kind].number for kind in UNSTABLE):
                 self._arrays[0][i] = np.nan
 
-    def place(self) -> None:
-        """Compute the poses that follow from the positions."""
+    def update_poses(self) -> None:
+        """Compute the poses from the generalised positions."""
         for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
             self._write(i, m, d)
             mujoco.mj_kinematics(m, d)
             self._read(i, d)
 
     def _write(self, i: int, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """Put the tensors of a world into its data, if they have been changed since they were read off it."""
+        """Copy the tensors of a world to its data, if they changed since they were read from it."""
         given = [array[i] for array in (*self._arrays[:2], *self._places)]
-        held = d.qpos, d.qvel, d.mocap_pos, d.mocap_quat
-        if not all(map(np.array_equal, given, held)):
+        present = d.qpos, d.qvel, d.mocap_pos, d.mocap_quat
+        if not all(map(np.array_equal, given, present)):
             mujoco.mj_resetData(m, d)
-            for target, value in zip(held, given, strict=True):
+            for target, value in zip(present, given, strict=True):
                 target[:] = value
             d.qacc_warmstart[:] = self._arrays[2][i]
 
     def _read(self, i: int, d: mujoco.MjData) -> None:
-        """Put the data of a world into its tensors."""
+        """Copy the data of a world to its tensors."""
         values = (d.qpos, d.qvel, d.qacc_warmstart, d.xpos, d.xquat, d.site_xpos)
         for array, value in zip(self._arrays, values, strict=True):
             array[i] = value
 
 
 class WarpPhysics:
-    """Worlds of MuJoCo-Warp, stepped by a captured graph."""
+    """Worlds of MuJoCo-Warp; a captured CUDA graph steps them."""
 
     def __init__(
         self,
         model: mujoco.MjModel,
         worlds: int,
         decimation: int,
-        laws: Sequence[tuple[ForceModel, np.ndarray]] = (),
+        force_models: Sequence[tuple[ForceModel, np.ndarray]] = (),
         *,
         device: str,
         nconmax: int,
         njmax: int,
         fields: Mapping[str, np.ndarray] | None = None,
-        following: CommandDynamics | None = None,
+        command_dynamics: CommandDynamics | None = None,
         capture: bool = True,
     ) -> None:
-        """Make the worlds and capture their step.
+        """Create the worlds and capture their step.
 
         Args:
             model: Compiled model.
             worlds: N.
-            decimation: Steps of one action.
-            laws: Force laws with their parameters, shape (N, P) each.
+            decimation: Simulation steps per action.
+            force_models: Force models with their parameters, shape (N, P) each.
             device: Warp's name of the device.
-            nconmax: Contacts a world, of a pool for all.
-            njmax: Constraint rows of each world.
+            nconmax: Contact capacity per world, of a pool shared by all.
+            njmax: Constraint capacity of each world.
             fields: Values of model fields that differ between worlds, shape (N, ...) each.
-            following: How what acts follows the commands; at once by default.
+            command_dynamics: Delays and lags of the commands; none by default.
             capture: Whether steps are captured in a graph.
         """
         import mujoco_warp as mjw
@@ -252,13 +252,13 @@ class WarpPhysics:
         self.model, self.worlds, self.nconmax, self.njmax = model, worlds, nconmax, njmax
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
-        edited = sorted({name for law, _ in laws for name in law.edits})
+        edited = sorted({name for law, _ in force_models for name in law.edits})
         varied = dict(fields or {})
         for name in set(edited) - set(varied):
             value = getattr(model, name)
             varied[name] = np.tile(value, (worlds, *[1] * value.ndim))
         check_drag(model, varied)
-        # What a law edits is zero now and then, and must not be taken for switched off.
+        # A field that a force model edits can be zero at times, which must not disable it.
         typical = {name: largest(values) + (name in edited) for name, values in varied.items()}
         with wp.ScopedDevice(self._warp_device):
             made = WorldModel(model, np.zeros(0, dtype=int), worlds, (), typical)
@@ -266,11 +266,13 @@ class WarpPhysics:
             self._model = made.mjw
             wp.synchronize_device(self._warp_device)
             self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
-            self._laws: list[tuple[ForceModel, Any]] = [(law, wp.array(values, dtype=float)) for law, values in laws]
+            self._force_models: list[tuple[ForceModel, Any]] = [
+                (law, wp.array(values, dtype=float)) for law, values in force_models
+            ]
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
-            self._follow(following, capture)
-            self._wrench = wp.zeros_like(d.xfrc_applied) if laws else d.xfrc_applied
+            self._make_filter(command_dynamics, capture)
+            self._wrench = wp.zeros_like(d.xfrc_applied) if force_models else d.xfrc_applied
             self.wrench = wp.to_torch(self._wrench)
             self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
             self.site, self.warmstart = wp.to_torch(d.site_xpos), wp.to_torch(d.qacc_warmstart)
@@ -283,71 +285,71 @@ class WarpPhysics:
             self.dropping = int(bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD)
             made.place(d)
             start = wp.clone(d.qpos)
-            self._steps()  # loads the modules, which cannot be done while a graph is captured
+            self._steps()  # loads the modules, which is impossible while a graph is captured
             self._advance = Graph(self._steps, self._warp_device, capture)
-            self._place = Graph(lambda: mjw.kinematics(self._model, self._data), self._warp_device, capture)
+            self._update_poses = Graph(lambda: mjw.kinematics(self._model, self._data), self._warp_device, capture)
             wp.copy(d.qpos, start)
             d.qvel.zero_()
             d.qacc_warmstart.zero_()
             d.overflow.zero_()
         wp.synchronize_device(self._warp_device)
 
-    def _follow(self, following: CommandDynamics | None, capture: bool) -> None:
-        """Keep the commands apart from what acts, where the one follows the other."""
-        self._follower, self.memory, self._acting = None, {}, None
-        if following is None:
+    def _make_filter(self, dynamics: CommandDynamics | None, capture: bool) -> None:
+        """Separate commands from what acts, if there are delays or lags."""
+        self._filter, self.memory, self._acting = None, {}, None
+        if dynamics is None:
             return
         self.ctrl = torch.zeros_like(self.ctrl)
-        follower = CommandFilter(following, float(self.model.opt.timestep), self._decimation, self.device)
-        self._follower, self.memory = follower, follower.memory
-        self._acting = [wp.from_torch(acts) for acts in follower.acting]
-        self._filter = captured(lambda: follower.follow(self.ctrl), capture and self._warp_device.is_cuda)
+        command_filter = CommandFilter(dynamics, float(self.model.opt.timestep), self._decimation, self.device)
+        self._filter, self.memory = command_filter, command_filter.memory
+        self._acting = [wp.from_torch(acts) for acts in command_filter.acting]
+        self._apply_filter = captured(lambda: command_filter.apply(self.ctrl), capture and self._warp_device.is_cuda)
 
     @property
     def simulator(self) -> tuple[Any, Any]:
-        """MuJoCo-Warp's model and data, for measurements of its own."""
+        """MuJoCo-Warp's model and data, for benchmarks."""
         return self._model, self._data
 
     def poses(self) -> tuple[wp.array, wp.array]:
         """Return positions and orientations as Warp arrays."""
         return self._data.xpos, self._data.xquat
 
-    def begin(self, where: torch.Tensor) -> None:
-        """See `Physics.begin`."""
-        if self._follower is not None:
-            self._follower.begin(where, self.ctrl)
+    def reset_commands(self, mask: torch.Tensor) -> None:
+        """See `Physics.reset_commands`."""
+        if self._filter is not None:
+            self._filter.reset(mask, self.ctrl)
 
     def advance(self) -> None:
         """Simulate the steps of one action."""
-        if self._follower is not None:
-            self._filter()
+        if self._filter is not None:
+            self._apply_filter()
         self._advance.launch()
 
-    def place(self) -> None:
-        """Compute the poses that follow from the positions."""
-        self._place.launch()
+    def update_poses(self) -> None:
+        """Compute the poses from the generalised positions."""
+        self._update_poses.launch()
 
     def _steps(self) -> None:
         """Launch the steps of one action."""
         for k in range(self._decimation):
             if self._acting is not None:
                 wp.copy(self._data.ctrl, self._acting[k])
-            if self._laws:
+            if self._force_models:
                 for target, values in self._unedited:
                     wp.copy(target, values)
                 self._data.qfrc_applied.zero_()
                 wp.copy(self._data.xfrc_applied, self._wrench)
-                for law, values in self._laws:
+                for law, values in self._force_models:
                     law.launch(self._model, self._data, values)
             self._mjw.step(self._model, self._data)
         self._mjw.kinematics(self._model, self._data)
 
 
 class Graph:
-    """Warp launches, recorded once and replayed on the stream that torch works on."""
+    """Warp launches, captured once and replayed on torch's current stream."""
 
     def __init__(self, launches: Callable[[], None], device: Any, capture: bool) -> None:
-        """Record `launches`, which must have run before, or keep them to be called as they are."""
+        """Capture `launches`, which must have run before; without `capture` they are called each time."""
         self._launches, self._device, self._graph = launches, device, None
         self._streams: dict[int, wp.Stream] = {}
         if capture:
@@ -356,7 +358,7 @@ class Graph:
             self._graph = captured.graph
 
     def launch(self) -> None:
-        """Launch."""
+        """Launch the graph on torch's current stream."""
         stream = None
         if self._device.is_cuda:
             current = torch.cuda.current_stream(wp.device_to_torch(self._device))
@@ -371,7 +373,7 @@ class Graph:
 
 
 def _compiled_or_plain(part: Callable[[], None]) -> Callable[[], None]:
-    """Do torch operations on fixed buffers; return them compiled into few kernels, or as they are where that fails."""
+    """Run torch operations on fixed buffers; return them compiled into few kernels, or uncompiled if that fails."""
     from torch._dynamo.exc import TorchDynamoException
 
     compiled = torch.compile(part, fullgraph=True, dynamic=False)
@@ -379,14 +381,14 @@ def _compiled_or_plain(part: Callable[[], None]) -> Callable[[], None]:
         with torch.no_grad():
             compiled()
     except TorchDynamoException as error:
-        said = str(error).strip().splitlines()
-        warnings.warn(f"operations are not fused: {said[0] if said else type(error).__name__}", stacklevel=2)
+        lines = str(error).strip().splitlines()
+        warnings.warn(f"operations are not fused: {lines[0] if lines else type(error).__name__}", stacklevel=2)
         return part
     return compiled
 
 
 def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
-    """Return torch operations on fixed buffers as a CUDA graph, of few fused kernels if wanted, or as they are."""
+    """Return torch operations on fixed buffers as a CUDA graph, fused if asked; unchanged without `capture`."""
     if not capture:
         return part
     if fuse:
@@ -401,5 +403,5 @@ def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> 
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             part()
-    recorded = part, graph  # what was compiled has to live as long as its kernels are launched
+    recorded = part, graph  # compiled kernels must outlive their launches
     return lambda: recorded[1].replay()

@@ -1,37 +1,37 @@
-"""Rotations of many worlds at once; quaternions are wxyz, in the last axis."""
+"""Rotations of many worlds at once; unit quaternions are wxyz, in the last axis."""
 
 from __future__ import annotations
 
 import torch
 
 
-def rotate(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+def rotate_vectors(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Return vectors (..., 3) rotated by unit quaternions (..., 4)."""
     u = q[..., 1:].expand_as(v)
     t = 2 * torch.linalg.cross(u, v)
     return v + q[..., :1] * t + torch.linalg.cross(u, t)
 
 
-def inverse(q: torch.Tensor) -> torch.Tensor:
+def invert_quaternion(q: torch.Tensor) -> torch.Tensor:
     """Return the inverse of unit quaternions (..., 4)."""
     return torch.cat([q[..., :1], -q[..., 1:]], dim=-1)
 
 
-def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+def multiply_quaternions(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the quaternions of b's rotation followed by a's, shape (..., 4)."""
     real = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdim=True)
     imaginary = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + torch.linalg.cross(a[..., 1:], b[..., 1:])
     return torch.cat([real, imaginary], dim=-1)
 
 
-def angle(q: torch.Tensor) -> torch.Tensor:
+def rotation_angle(q: torch.Tensor) -> torch.Tensor:
     """Return the angle of unit quaternions (..., 4) [rad], 0..pi, shape (...)."""
-    # Of the half angle the sine is accurate for small turns, where the cosine is not.
+    # The sine of the half angle is accurate for small rotations, the cosine is not.
     return 2 * torch.atan2(torch.linalg.norm(q[..., 1:], dim=-1), q[..., 0].abs())
 
 
 def rotation_columns(q: torch.Tensor) -> torch.Tensor:
-    """Return the first two columns of the rotation matrices, one after the other, shape (..., 6).
+    """Return the first two columns of the rotation matrices of quaternions (..., 4), concatenated, shape (..., 6).
 
     The continuous representation of Zhou et al., CVPR 2019, that the paper's observation uses.
     """

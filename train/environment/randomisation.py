@@ -1,7 +1,7 @@
-"""What differs between the worlds of a training beyond a model's effects: factors on physics, and late commands.
+"""Domain randomisation: factors on the physics of each world, and delays and lags of its commands.
 
-A policy that has met a range of frictions, masses, stiffnesses and delays depends on none of them being exactly right.
-Everything is drawn once for each world.
+A policy trained over ranges of friction, mass, stiffness and delay does not depend on their exact values. All values
+are sampled once for each world.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.task.task import Task
 
-ONE, NONE = (1.0, 1.0), (0.0, 0.0)
-"""Ranges in which a factor, or a time, changes nothing."""
+UNCHANGED, ZERO = (1.0, 1.0), (0.0, 0.0)
+"""Ranges of a factor, and of a friction or a time, that change nothing."""
 
 
 def sample_model_fields(
@@ -26,14 +26,14 @@ def sample_model_fields(
     seed: int,
     fields: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return the values of the model fields that differ between worlds, shape (N, ...) each.
+    """Return sampled values of the model fields that differ between worlds, by name, shape (N, ...) each.
 
     Args:
         task: The task.
         worlds: N.
         cfg: Ranges of the factors.
-        seed: Seed of what is drawn.
-        fields: Values that differ already; the factors are on top of them.
+        seed: Seed.
+        fields: Values that differ already, to which the factors are applied.
     """
     m = task.compiled
     rng = np.random.default_rng([seed, 2])
@@ -48,22 +48,22 @@ def sample_model_fields(
 
     robot = np.isin(m.geom_bodyid, _moved_by_robot(task))
     for extent, rows in ((cfg.friction, np.flatnonzero(~robot)), (cfg.grip, np.flatnonzero(robot))):
-        if extent != ONE:
+        if extent != UNCHANGED:
             scaled("geom_friction", rng.uniform(*extent, worlds), rows=rows, column=0)
-    if cfg.stiffness != ONE:
+    if cfg.stiffness != UNCHANGED:
         factor = rng.uniform(*cfg.stiffness, worlds)
         scaled("actuator_gainprm", factor, column=0)
         scaled("actuator_biasprm", factor, column=1)
-    if cfg.damping != ONE:
+    if cfg.damping != UNCHANGED:
         scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
-    if cfg.joint_friction != NONE:
+    if cfg.joint_friction != ZERO:
         actuator, dof = task.robot.actuator, task.robot.dof
         strongest = np.where(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator, 1], np.inf)
         share = np.ones(len(dof)) if np.isinf(strongest).any() else strongest / strongest.max()
         loss = found.get("dof_frictionloss", np.tile(m.dof_frictionloss, (worlds, 1))).copy()
         loss[:, dof] += rng.uniform(*cfg.joint_friction, (worlds, 1)) * share
         found["dof_frictionloss"] = loss
-    if cfg.mass != ONE:
+    if cfg.mass != UNCHANGED:
         factor, bodies = rng.uniform(*cfg.mass, worlds), np.array(task.objects)
         scaled("body_mass", factor, rows=bodies)
         scaled("body_inertia", factor, rows=bodies)
@@ -71,12 +71,12 @@ def sample_model_fields(
 
 
 def sample_command_dynamics(task: Task, worlds: int, cfg: RandomisationCfg, seed: int) -> CommandDynamics:
-    """Return the delay and the lag of the arm's commands in N worlds."""
+    """Return the sampled delay and lag of the arm's commands in N worlds."""
     rng = np.random.default_rng([seed, 4])
     times = []
     for extent in (cfg.delay, cfg.lag):
         values = np.zeros((worlds, task.compiled.nu))
-        if extent != NONE:
+        if extent != ZERO:
             values[:, task.robot.actuator] = rng.uniform(*extent, (worlds, 1))
         times.append(values)
     return CommandDynamics(times[0], (times[1],))

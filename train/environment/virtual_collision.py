@@ -1,4 +1,4 @@
-"""Which spheres left out of the physics must keep clear of which surfaces (paper, section 3.2.2)."""
+"""Virtual collision penalty of spheres outside the physics near other bodies (paper, section 3.2.2)."""
 
 from __future__ import annotations
 
@@ -18,17 +18,14 @@ from concent_warp.train.task.task import Task
 if TYPE_CHECKING:
     import trimesh
 
-CANDIDATES = 20_000
-"""Surface points to choose from."""
-
 
 def virtual_collision(task: Task, physics: Physics, stage: object, cfg: CollisionCfg) -> VirtualCollision | None:
-    """Return the penalty of a task's left-out spheres, None where there are none.
+    """Return the virtual collision penalty of a task, None without spheres or points to penalise.
 
-    Each object's left-out spheres keep clear of the surfaces of all other objects and of the robot's links. Points of
-    its own surface keep out of the other objects: spheres round off edges, and what slides over such an edge in the
-    simulation would catch on a sharp one. The margin band does not count between an object and what the stage's target
-    event has it touch.
+    Spheres of an object outside the physics are penalised near the surfaces of the other objects and of the robot's
+    links, and points of its surface inside the other objects: spheres round off edges, so that an object that slides
+    over such an edge in the simulation would catch on a sharp one. The margin band does not apply to bodies that touch
+    in the stage's target event.
 
     Args:
         task: The task.
@@ -81,10 +78,10 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
 
 
 def _within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return spheres that stay `slack` [m] below an object's surface: centres [m], shape (n, 3), radii [m], shape (n,).
+    """Return spheres moved `slack` [m] below an object's surface: centres [m], shape (n, 3), radii [m], shape (n,).
 
-    Spheres centred on the surface stand out of it by their radius, which a fit has corrected for those alone that took
-    part in contacts. The others would call collision what the demonstration did, where there is little room.
+    A fit moves only spheres that were in contact below the surface. Others protrude by up to their radius and would
+    penalise the demonstrated motion in narrow gaps.
     """
     distance, outward = surface.distance(centre)
     deep = np.clip(-distance, 0.0, radius)
@@ -93,22 +90,22 @@ def _within(surface: Surface, centre: np.ndarray, radius: np.ndarray, slack: flo
 
 
 def _surface_points(surface: Surface, cfg: CollisionCfg) -> np.ndarray:
-    """Return points spread over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
-    found, _ = surface.sample(max(CANDIDATES, cfg.points), np.random.default_rng(0))
+    """Return points distributed over an object's surface, the slack below it [m], shape (cfg.points, 3)."""
+    found, _ = surface.sample(max(cfg.candidates, cfg.points), np.random.default_rng(0))
     return inset(surface, found[farthest_point_sampling(found, cfg.points)], cfg.slack)[0]
 
 
 def _gate(task: Task, stage: int, a: int, b: int) -> float:
-    """Return 0 where a stage's target event has two bodies touch, else 1."""
+    """Return 0 if two bodies touch in a stage's target event, else 1."""
     used = task.table.used[stage]
     touching = set(zip(task.table.body_a[stage][used], task.table.body_b[stage][used], strict=True))
     return 0.0 if touching & {(a, b), (b, a)} else 1.0
 
 
 def _body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return vertices [m] (v, 3) and faces (f, 3) of a body's shapes, body frame; None where it has none.
+    """Return vertices [m] (v, 3) and faces (f, 3) of a body's shapes, body frame; None without shapes.
 
-    `visual` takes all shapes, else only those that collide.
+    `visual` takes all shapes, otherwise only those that collide.
     """
     parts = []
     for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
@@ -127,7 +124,7 @@ def _body_mesh(m: mujoco.MjModel, body: int, *, visual: bool) -> tuple[np.ndarra
 
 
 def _geom_mesh(m: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """Return a geom as a `trimesh.Trimesh` in its own frame, None where it is not a closed shape."""
+    """Return a geom's mesh in its own frame, None for planes and height fields."""
     import trimesh
 
     kinds, size = mujoco.mjtGeom, m.geom_size[geom]

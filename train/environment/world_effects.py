@@ -1,7 +1,7 @@
-"""Effects of a model in training: each world has parameters of its own, drawn from what the fit left open.
+"""Effects of a model in training: each world samples their parameters from the uncertainty of the fit.
 
-A fit gives each parameter a 95 % interval. The worlds draw from the normal distribution that has it, cut at the
-parameter's bounds, so that the policy meets what the effect may be and not only its most likely value.
+A fit gives each parameter a 95 % interval. Worlds sample from the normal distribution with this interval, truncated at
+the parameter's bounds, so that the policy is trained for all plausible values and not only for the most likely one.
 """
 
 from __future__ import annotations
@@ -22,95 +22,101 @@ from concent_warp.train.task.task import Task
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
-QUANTILE = 1.959964
-"""Half width of the 95 % interval of a normal distribution in standard deviations."""
-Laws = list[tuple["ForceModel", np.ndarray]]
+QUANTILE_95 = 1.959964
+"""Half width of the 95 % interval of a normal distribution [standard deviations]."""
+ForceModels = list[tuple["ForceModel", np.ndarray]]
 
 
 @dataclass(frozen=True)
 class WorldEffects:
-    """What effects are in each of N worlds."""
+    """Effects of a model with their parameters in N worlds."""
 
     fields: dict[str, np.ndarray]
     """Values of the model fields that differ between worlds, shape (N, ...) each."""
-    laws: Laws
-    """Force laws with their parameters in each world, shape (N, P) each."""
-    late: tuple[CommandDynamics, ...]
-    """Delays and lags of the commands, of each effect on them."""
+    force_models: ForceModels
+    """Force models with their parameters in each world, shape (N, P) each."""
+    command_dynamics: tuple[CommandDynamics, ...]
+    """Delays and lags of each effect on the commands."""
     values: tuple[np.ndarray, ...]
     """Parameters of each effect, shape (N, P) each."""
-    kept: tuple[str, ...]
-    """Names of effects that have intervals and cannot be varied."""
+    fixed: tuple[str, ...]
+    """Names of effects with intervals whose parameters cannot differ between worlds."""
 
 
 def sample_world_effects(
-    task: Task, worlds: int, seed: int, *, draw: bool, variable: Callable[[str], bool] | None = None
+    task: Task, worlds: int, seed: int, *, sample: bool, variable: Callable[[str], bool] | None = None
 ) -> WorldEffects:
     """Return the effects of a task's model in N worlds.
 
     Args:
         task: The task.
         worlds: N.
-        seed: Seed of what is drawn.
-        draw: Whether parameters are drawn, or as they are in the model everywhere.
-        variable: Whether the simulator can vary a model field between worlds; by default it can vary all.
+        seed: Seed.
+        sample: Whether parameters are sampled; otherwise all worlds have the model's values.
+        variable: Returns whether the simulator can vary a model field between worlds; by default all.
     """
     m, effects = task.compiled, task.model.effects
     bare = task.model.spec(task.collidable).compile() if effects else m
     rng = np.random.default_rng([seed, 3])
-    values, varied, kept = [], [], []
+    values, varied, fixed = [], [], []
     for added in effects:
         rows = np.tile(added.array, (worlds, 1))
-        if draw and _any_open(added):
+        if sample and _is_uncertain(added):
             if _can_vary(added.effect, added.effect.fields(m), variable):
                 parameters = added.effect.parameters(bare)
-                rows = _drawn(parameters, added, worlds, rng)
+                rows = _sample_parameters(parameters, added, worlds, rng)
                 varied.append(added.effect)
-            elif _acts(added.effect):
-                kept.append(added.effect.name)
+            elif _changes_motion(added.effect):
+                fixed.append(added.effect.name)
         values.append(rows)
-    if kept:
+    if fixed:
         warnings.warn(
-            f"the simulator cannot vary {', '.join(kept)} between worlds: all have the fitted value", stacklevel=2
+            f"the simulator cannot vary {', '.join(fixed)} between worlds: all have the fitted value", stacklevel=2
         )
-    laws = [(law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None]
-    late = tuple(_following(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands)
+    force_models = [
+        (law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None
+    ]
+    dynamics = tuple(
+        _command_dynamics(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands
+    )
     fields = _written_fields(bare, [added.effect for added in effects], varied, values)
-    return WorldEffects(fields, laws, late, tuple(values), tuple(kept))
+    return WorldEffects(fields, force_models, dynamics, tuple(values), tuple(fixed))
 
 
-def _following(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> CommandDynamics:
-    """Return how commands are followed under an effect on them; its parameters in the worlds are of shape (N, P)."""
+def _command_dynamics(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> CommandDynamics:
+    """Return delays and lags of an effect on the commands with parameters (N, P) in N worlds."""
     found = [effect.late(m, row) for row in values]
     delay, lag = (np.array([late[k] for late in found if late is not None]) for k in range(2))
     return CommandDynamics(delay, (lag,))
 
 
-def _any_open(added: AddedEffect) -> bool:
-    """Return whether an interval leaves anything open."""
+def _is_uncertain(added: AddedEffect) -> bool:
+    """Return whether any parameter has an interval of positive width."""
     return any(np.isfinite([low, high]).all() and high > low for low, high in added.intervals)
 
 
-def _acts(effect: Effect) -> bool:
-    """Return whether an effect changes the motion, and not only what instruments read."""
+def _changes_motion(effect: Effect) -> bool:
+    """Return whether an effect changes the motion, not only sensor readings."""
     law, write = type(effect).law is not Effect.law, type(effect).write is not Effect.write
     return law or write or effect.edits or effect.commands
 
 
 def _can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:
-    """Return whether the parameters of an effect can differ between worlds that share what is compiled."""
-    return _acts(effect) and not effect.edits and all(map(variable or bool, fields))
+    """Return whether the parameters of an effect can differ between worlds of one compiled model."""
+    return _changes_motion(effect) and not effect.edits and all(map(variable or bool, fields))
 
 
-def _drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rng: np.random.Generator) -> np.ndarray:
-    """Return parameters of an effect for N worlds, shape (N, P)."""
+def _sample_parameters(
+    parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return sampled parameters of an effect for N worlds, shape (N, P)."""
     from scipy.stats import truncnorm
 
     rows = np.tile(added.array, (worlds, 1))
     for k, (parameter, (low, high)) in enumerate(zip(parameters, added.intervals, strict=True)):
         if not (np.isfinite([low, high]).all() and high > low):
             continue
-        centre, std = 0.5 * (low + high), 0.5 * (high - low) / QUANTILE
+        centre, std = 0.5 * (low + high), 0.5 * (high - low) / QUANTILE_95
         ends = (np.array([parameter.low, parameter.high]) - centre) / std
         rows[:, k] = truncnorm.rvs(*ends, loc=centre, scale=std, size=worlds, random_state=rng)
     return rows
@@ -119,12 +125,12 @@ def _drawn(parameters: tuple[Parameter, ...], added: AddedEffect, worlds: int, r
 def _written_fields(
     bare: mujoco.MjModel, effects: list[Effect], varied: list[Effect], values: list[np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Return the model fields that varied effects set, shape (N, ...) each.
+    """Return the values of the model fields that varied effects set, by name, shape (N, ...) each.
 
     Args:
-        bare: The model, prepared for all effects, before any has set its fields.
-        effects: All effects; they are written in this order.
-        varied: Those whose values differ between worlds.
+        bare: Compiled model, prepared for all effects, with none of their fields set.
+        effects: All effects, in the order in which they are written.
+        varied: Effects whose parameters differ between worlds.
         values: Values of each effect, shape (N, P).
     """
     names = {name for effect in varied for name in effect.fields(bare)}

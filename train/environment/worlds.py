@@ -1,4 +1,4 @@
-"""From settings to worlds: which simulator, with which buffers, and what differs between the worlds."""
+"""Environment from settings: simulator, buffers, and the values that differ between worlds."""
 
 from __future__ import annotations
 
@@ -15,10 +15,6 @@ from concent_warp.train.environment.world_effects import sample_world_effects
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
-ROOM = 2.0
-"""Contacts and constraint rows to make room for, relative to the most of the demonstration."""
-SPARE = 16
-"""Contacts beyond that."""
 JACOBIANS = {
     "dense": mujoco.mjtJacobian.mjJAC_DENSE,
     "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
@@ -32,44 +28,56 @@ CONES = {
 def make_environment(
     task: Task, cfg: EnvironmentCfg, states: ResetStates, *, device: str | None = None, seed: int = 0
 ) -> Environment:
-    """Return the environment of a task on a device, the first CUDA device by default where there is one."""
+    """Return the environment of a task.
+
+    Args:
+        task: The task.
+        cfg: Settings.
+        states: Initial states of the episodes.
+        device: Warp's name of the device; the first CUDA device by default, the CPU without one.
+        seed: Seed of the values that are sampled for each world.
+    """
     return Environment(task, cfg, _make_physics(task, cfg, device=device, seed=seed), states)
 
 
 def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0) -> Physics:
-    """Return the worlds of a task."""
+    """Return the simulated worlds of a task."""
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = preferred_device() if device is None else device
-    m = _solver_chosen(task.compiled, cfg)
+    m = _with_solver_settings(task.compiled, cfg)
     on_cpu = not device.startswith("cuda")
-    plain = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
-    if plain:
+    in_c = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
+    if in_c:
         variable = None
     else:
         from concent_warp.simulate.warp_model import batchable as variable
-    effects = sample_world_effects(task, cfg.worlds, seed, draw=cfg.randomise_effects, variable=variable)
+    effects = sample_world_effects(task, cfg.worlds, seed, sample=cfg.randomise_effects, variable=variable)
     fields = sample_model_fields(task, cfg.worlds, cfg.randomisation, seed, effects.fields)
-    following = CommandDynamics.of([*effects.late, sample_command_dynamics(task, cfg.worlds, cfg.randomisation, seed)])
-    if plain:
-        return MujocoPhysics(m, cfg.worlds, cfg.simulation_steps, effects.laws, fields=fields, following=following)
-    contacts, constraints = buffers(task, cfg)
+    command_dynamics = CommandDynamics.combined(
+        [*effects.command_dynamics, sample_command_dynamics(task, cfg.worlds, cfg.randomisation, seed)]
+    )
+    if in_c:
+        return MujocoPhysics(
+            m, cfg.worlds, cfg.simulation_steps, effects.force_models, fields=fields, command_dynamics=command_dynamics
+        )
+    contacts, constraints = buffer_sizes(task, cfg)
     return WarpPhysics(
         m,
         cfg.worlds,
         cfg.simulation_steps,
-        effects.laws,
+        effects.force_models,
         device=device,
         nconmax=contacts,
         njmax=constraints,
         fields=fields,
-        following=following,
+        command_dynamics=command_dynamics,
         capture=cfg.capture != "none",
     )
 
 
-def _solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
-    """Return a model with the solver, friction cones and time step that the settings ask for."""
+def _with_solver_settings(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
+    """Return a copy of a model with the settings' solver, friction cones and time step."""
     limited = copy.copy(m)
     limited.opt.timestep *= cfg.stride
     if cfg.cone != "auto":
@@ -82,8 +90,10 @@ def _solver_chosen(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
     return limited
 
 
-def buffers(task: Task, cfg: EnvironmentCfg) -> tuple[int, int]:
-    """Return for how many contacts and constraint rows a world is to have room."""
-    contacts = int(ROOM * task.replay.contacts) + SPARE if cfg.nconmax is None else cfg.nconmax
-    constraints = int(ROOM * task.replay.constraints) + 4 * SPARE if cfg.njmax is None else cfg.njmax
+def buffer_sizes(task: Task, cfg: EnvironmentCfg) -> tuple[int, int]:
+    """Return the capacities of a world: contacts and constraint rows."""
+    contacts = int(cfg.buffer_factor * task.replay.contacts) + cfg.buffer_spare if cfg.nconmax is None else cfg.nconmax
+    constraints = (
+        int(cfg.buffer_factor * task.replay.constraints) + 4 * cfg.buffer_spare if cfg.njmax is None else cfg.njmax
+    )
     return contacts, constraints

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from rsl_rl.modules.distribution import GaussianDistribution
@@ -10,10 +11,6 @@ from torch import nn
 
 MAX_ACTION = 1.0 - 1e-6
 """Largest magnitude of an action: nearer to 1, tanh cannot be inverted in single precision."""
-MAX_MEAN = 4.0
-"""Largest magnitude of the mean of u in training: tanh(4) is 0.9993. For an observation far from those seen before, the
-network's output can be in the hundreds, where a small update changes the density by more than single precision
-represents, and the losses become non-finite."""
 
 
 class SquashedGaussian(GaussianDistribution):
@@ -23,9 +20,20 @@ class SquashedGaussian(GaussianDistribution):
     Gaussians, as tanh is one to one.
     """
 
+    def __init__(self, *args: Any, max_mean: float = 4.0, **options: Any) -> None:
+        """Create the distribution.
+
+        Args:
+            args: Those of `GaussianDistribution`.
+            max_mean: Largest magnitude of the mean of u, see `PpoCfg.max_mean`.
+            options: Those of `GaussianDistribution`.
+        """
+        super().__init__(*args, **options)
+        self.max_mean = max_mean
+
     def update(self, mlp_output: torch.Tensor) -> None:
-        """Set the distribution from means (..., A) of u, clamped to -4..4."""
-        super().update(mlp_output.clamp(-MAX_MEAN, MAX_MEAN))
+        """Set the distribution from means (..., A) of u, clamped to +-`max_mean`."""
+        super().update(mlp_output.clamp(-self.max_mean, self.max_mean))
 
     def sample(self) -> torch.Tensor:
         """Return actions, shape (..., A), strictly between -1 and 1."""

@@ -6,17 +6,18 @@ import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 
-MAX_NORMALISED = 10.0
-"""Largest magnitude of a normalised observation [standard deviations]: an object that flew away would otherwise make
-the networks' outputs and the losses arbitrarily large."""
-
 
 class BoundedNormalization(EmpiricalNormalization):
     """rsl-rl's running normalisation with clamped results and non-negative variances."""
 
+    def __init__(self, shape: int, max_observation: float) -> None:
+        """Create the normalisation of observations of a length, clamped to +-`max_observation` standard deviations."""
+        super().__init__(shape)
+        self.max_observation = max_observation
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Return observations normalised, shape (..., D), each clamped to +-`MAX_NORMALISED`."""
-        return super().forward(x).clamp(-MAX_NORMALISED, MAX_NORMALISED)
+        """Return observations normalised, shape (..., D), each within +-`max_observation`."""
+        return super().forward(x).clamp(-self.max_observation, self.max_observation)
 
     @torch.jit.unused
     def update(self, x: torch.Tensor) -> None:
@@ -26,8 +27,8 @@ class BoundedNormalization(EmpiricalNormalization):
         self._std = torch.sqrt(self.get_buffer("_var").clamp_(min=0.0))
 
 
-def bound_observations(model: MLPModel) -> None:
+def bound_observations(model: MLPModel, max_observation: float) -> None:
     """Replace a network's observation normalisation by `BoundedNormalization`, if it has one."""
     if model.obs_normalization:
         where = next(model.parameters()).device
-        model.obs_normalizer = BoundedNormalization(model.obs_dim).to(where)
+        model.obs_normalizer = BoundedNormalization(model.obs_dim, max_observation).to(where)

@@ -332,7 +332,7 @@ def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, process: Distribute
             str(environment.device),
         )
     for model in (algorithm.actor, algorithm.critic):
-        bound_observations(model)
+        bound_observations(model, cfg.max_observation)
     return algorithm
 
 
@@ -342,6 +342,7 @@ def network(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
     settings["obs_normalization"] = cfg.normalise
     if actor:
         settings["distribution_cfg"] = {"class_name": SquashedGaussian, "init_std": cfg.std, "std_type": "log"}
+        settings["distribution_cfg"]["max_mean"] = cfg.max_mean
     return settings
 
 

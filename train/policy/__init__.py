@@ -1,1 +1,6 @@
-"""A trained policy: evaluation, episodes, export, the pretrained ones."""
+"""A trained policy.
+
+`load` reads it with the inputs of its training; `episodes` runs it; `evaluate` counts successes, `play` steps through a
+single world; `export` writes ONNX and TorchScript; `pretrained` names the policies of the package and
+`write_pretrained` makes one.
+"""

@@ -36,7 +36,7 @@ class Episodes:
     which does not count.
     """
 
-    def __init__(self, environment: Environment, policy: PolicyFunction, rows: Sequence[int]) -> None:
+    def __init__(self, environment: Environment, policy: PolicyFunction, rows: Sequence[int] | np.ndarray) -> None:
         """Start an episode in every world.
 
         Args:

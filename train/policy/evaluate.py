@@ -1,4 +1,4 @@
-"""How often a policy succeeds: one episode from each initial state, judged by geometry at its end."""
+"""Success rate of a policy: one episode from each initial state, judged by the position of object 1 at its end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from concent_warp.train.policy.episodes import MISSED, SUCCESS, Episodes, Policy
 from concent_warp.train.resets.sample import ResetStates
 
 Watch = Callable[[np.ndarray, np.ndarray], None]
-"""Takes the episodes that are running, ids (R,) int, and their positions (R, nq)."""
+"""Called with the indices (R,) of the running episodes and their positions (R, nq)."""
 
 
 @dataclass(frozen=True)
@@ -30,39 +30,39 @@ class Evaluation:
     """
 
     success: np.ndarray
-    """Whether each ended with object 1 in place, shape (E,) bool."""
+    """Whether an episode ended with object 1 in place, shape (E,) bool."""
     outcome: tuple[str, ...]
-    """"success", "missed" where time was up, or what made it fail."""
+    """"success", "missed" after the time limit, or the failure "dropped", "severe" or "diverged", of each episode."""
     length: np.ndarray
-    """Steps of each, shape (E,) int."""
+    """Control steps of each episode, shape (E,) int."""
     stages: tuple[str, ...] = ()
-    """Stages whose targets were to be met, in their order; none where a single one was trained."""
+    """Names of the stages of a chain, in order; empty if one stage was trained."""
     reached: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
-    """How many of the targets each episode met, in their order, shape (E,) int."""
+    """Number of stage targets that each episode met in order, shape (E,) int."""
     videos: tuple[Path, ...] = ()
-    """Videos that were written."""
+    """Files of the videos."""
 
     @property
     def rate(self) -> float:
-        """Share of successes."""
+        """Success rate, 0..1."""
         return float(self.success.mean())
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the share."""
+        """Wilson's 95 % interval of the success rate."""
         return wilson(int(self.success.sum()), len(self.success))
 
     def counts(self) -> dict[str, int]:
-        """Return how many episodes came to each outcome."""
+        """Return the number of episodes by outcome."""
         return {name: self.outcome.count(name) for name in sorted(set(self.outcome))}
 
     @property
     def met(self) -> dict[str, int]:
-        """How many episodes met each stage's target, and those of all stages before it."""
+        """Number of episodes that met a stage's target after those of all stages before it, by stage."""
         return {name: int((self.reached > k).sum()) for k, name in enumerate(self.stages)}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return the evaluation as plain data."""
         return {
             "episodes": len(self.success),
             "successes": int(self.success.sum()),
@@ -74,7 +74,7 @@ class Evaluation:
         }
 
     def sentence(self) -> str:
-        """Return the result in words."""
+        """Return the result as a sentence."""
         low, high = self.interval
         others = ", ".join(f"{count} {name}" for name, count in self.counts().items() if name != "success")
         text = f"{int(self.success.sum())} of {len(self.success)} succeed: {self.rate:.1%} ({low:.1%} to {high:.1%})"
@@ -91,14 +91,14 @@ def run_episodes(
     progress: Callable[[float], None] | None = None,
     watch: Watch | None = None,
 ) -> Evaluation:
-    """Run one episode from each of the states that an environment was made with.
+    """Run one episode from each initial state of an environment.
 
     Args:
         environment: The worlds.
         policy: From observations to actions, without exploration.
         states: The environment's initial states.
-        progress: Called with the share done.
-        watch: Called before each step with what is there.
+        progress: Called with the share done, 0..1.
+        watch: Called before each step with the running episodes.
     """
     count, worlds = len(states.qpos), environment.num_envs
     success, length = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
@@ -124,7 +124,7 @@ def run_episodes(
 
 
 def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Return Wilson's interval of a share (Wilson, J. Am. Stat. Assoc. 22, 1927), 95 % by default."""
+    """Return Wilson's interval of a proportion (Wilson, J. Am. Stat. Assoc. 22, 1927), 95 % by default."""
     if trials == 0:
         return 0.0, 1.0
     share = successes / trials

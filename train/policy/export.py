@@ -1,4 +1,4 @@
-"""A trained policy for elsewhere: ONNX or TorchScript, with what one needs to run it in the metadata."""
+"""Export of a policy as ONNX or TorchScript, with everything needed to run it in the metadata."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torch import nn
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
 from concent_warp.train.cfg import TrainCfg
-from concent_warp.train.environment.observation import Layout
+from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.learning.normalisation import bound_observations
 from concent_warp.train.learning.ppo import network
 from concent_warp.train.run import TrainingRun
@@ -37,23 +37,21 @@ SUFFIXES = (".onnx", ".pt")
 
 
 def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str, Any]:
-    """Write a run's policy without exploration, and return its metadata.
+    """Write a deterministic policy, and return its metadata.
 
     Args:
-        run: What the policy was trained with.
-        weights: Its checkpoint.
+        run: Inputs of the policy's training.
+        weights: Checkpoint of the policy.
         out: File to write: ``.onnx`` for ONNX, ``.pt`` for TorchScript.
 
     Raises:
-        TrainError: The file has another ending.
+        TrainError: The file has another suffix.
     """
     if out.suffix not in SUFFIXES:
-        raise TrainError(
-            "the format of the export is not known", where=out, expected=f"a name in {' or '.join(SUFFIXES)}"
-        )
+        raise TrainError("the export format is unknown", where=out, expected=f"a name in {' or '.join(SUFFIXES)}")
     task = run.task()
     described = _describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
-    module = _policy_module(run.cfg, Layout.of(task).size, task.robot.actions, weights["actor_state_dict"])
+    module = _policy_module(run.cfg, ObservationLayout.of(task).size, task.robot.actions, weights["actor_state_dict"])
     partial = out.with_name(f".{out.name}.partial")
     write = _write_onnx if out.suffix == ".onnx" else _write_torchscript
     write(module, described, partial)
@@ -67,7 +65,7 @@ def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapp
     settings = network(cfg.ppo, actor=True)
     del settings["class_name"]
     actor = MLPModel(example, {"actor": ["policy"]}, "actor", actions, **settings)
-    bound_observations(actor)
+    bound_observations(actor, cfg.ppo.max_observation)
     try:
         actor.load_state_dict(weights)
     except RuntimeError as error:
@@ -76,11 +74,11 @@ def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapp
 
 
 def _write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None:
-    """Write a policy as ONNX, weights within, for batches of any size."""
+    """Write a policy as ONNX, with the weights inside, for batches of any size."""
     import onnx
 
     example = torch.zeros(2, described["observation"]["size"])
-    quiet = contextlib.redirect_stdout(io.StringIO())  # the exporter talks, on every channel
+    quiet = contextlib.redirect_stdout(io.StringIO())  # the exporter prints and logs
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -108,7 +106,7 @@ def _write_torchscript(module: nn.Module, described: dict[str, Any], path: Path)
 
 
 def _describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
-    """Return what one needs to run a task's policy elsewhere, as plain data; in m, rad and s."""
+    """Return the metadata of a task's policy as plain data, in m, rad and s."""
     dt = task.replay.timestep
     return {
         "format": FORMAT,
@@ -127,7 +125,7 @@ def _describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
 
 
 def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
-    """Return names, order and meaning of the numbers that the policy takes."""
+    """Return names, order and meaning of the parts of the observation."""
     m, robot = task.compiled, task.robot
     joints = [m.joint(j).name for j in robot.joint]
     hinges = [name for name, turning in zip(joints, robot.turning, strict=True) if turning]
@@ -143,7 +141,7 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     for i, body in enumerate(task.objects):
         what = "position [m], world frame, then the first two columns of the rotation matrix"
         meaning[f"object {i + 1}"] = (what, [m.body(body).name])
-    layout = Layout.of(task)
+    layout = ObservationLayout.of(task)
     parts = []
     for name, width in layout.parts:
         what, of = meaning.get(name, ("a contact slot, see slots", []))
@@ -152,13 +150,13 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "input": INPUT,
         "size": layout.size,
         "parts": parts,
-        "normalisation": "within the policy: give it the numbers as they are" if cfg.ppo.normalise else "none",
+        "normalisation": "within the policy: pass values unnormalised" if cfg.ppo.normalise else "none",
         "slots": _described_slots(task),
     }
 
 
 def _described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
-    """Return when the slots are to show the next stage, None where there is one alone."""
+    """Return the rule by which the slots advance to the next stage, None for a single stage."""
     if len(task.chained) == 1:
         return None
     chain = cfg.environment.chain
@@ -166,12 +164,12 @@ def _described_chain(cfg: TrainCfg, task: Task) -> dict[str, Any] | None:
         "tolerance": chain.tolerance,
         "hold": chain.hold,
         "meaning": "the slots show the first stage at the start, and the next one as soon as all displacements of the "
-        "stage have been shorter than tolerance [m] for hold control periods on end",
+        "stage have been shorter than tolerance [m] for hold consecutive control periods",
     }
 
 
 def _described_slots(task: Task) -> dict[str, Any]:
-    """Return what each contact slot is made from, in each stage."""
+    """Return the contact pair of each slot in each stage."""
     table, m = task.table, task.compiled
     pairs = []
     for s, k in ((stage, slot) for stage in task.chained for slot in np.flatnonzero(table.used[stage])):
@@ -198,7 +196,7 @@ def _described_slots(task: Task) -> dict[str, Any]:
 
 
 def _described_action(task: Task) -> dict[str, Any]:
-    """Return what the numbers do that the policy gives."""
+    """Return the meaning of the parts of the action."""
     m, robot = task.compiled, task.robot
     rows = []
     for i, (actuator, joint) in enumerate(zip(robot.actuator, robot.joint, strict=True)):
@@ -214,19 +212,19 @@ def _described_action(task: Task) -> dict[str, Any]:
         "size": robot.actions,
         "range": [-1.0, 1.0],
         "meaning": "once a control period: command += scale * action; then the command is kept within lead of the "
-        "joint's measured position where there is a lead, then within limits; it is held until the next",
+        "joint's measured position where there is a lead, then within limits; it is constant until the next",
         "parts": rows,
     }
 
 
 def _limits(task: Task, actuator: int) -> list[float] | None:
-    """Return the smallest and largest command of an actuator, None where it has no limits."""
+    """Return the smallest and largest command of an actuator, None without limits."""
     m = task.compiled
     return [float(v) for v in m.actuator_ctrlrange[actuator]] if m.actuator_ctrllimited[actuator] else None
 
 
 def _described_gripper(task: Task) -> dict[str, Any] | None:
-    """Return how the gripper's number and its opening are meant, None without a gripper."""
+    """Return the meaning of the gripper's action and opening, None without a gripper."""
     m, robot = task.compiled, task.robot
     if not len(robot.gripper):
         return None

@@ -1,4 +1,4 @@
-"""A trained policy: its weights with everything that it was made from."""
+"""A trained policy with the inputs of its training."""
 
 from __future__ import annotations
 
@@ -27,22 +27,21 @@ class Policy:
     """
 
     run: TrainingRun
-    """Model, demonstration, contact events and settings that it was trained with."""
+    """Model, demonstration, contact events and settings of the training."""
     weights: Mapping[str, Any] = field(repr=False)
-    """The checkpoint: tensors and plain data."""
+    """Checkpoint: tensors and plain data by name."""
     folder: Path
-    """Its run folder."""
+    """Run folder."""
 
     @staticmethod
     def load(source: str | Path) -> Policy:
-        """Load a policy.
+        """Return a policy.
 
         Args:
-            source: Run folder of a training, a checkpoint file in one, or the name of a policy that comes with the
-                package.
+            source: Run folder of a training, a checkpoint file in one, or the name of a pretrained policy.
 
         Raises:
-            TrainError: There is no such training or policy, or the file is no checkpoint.
+            TrainError: The training or the policy does not exist, or the file is no checkpoint.
         """
         path = Path(source)
         if isinstance(source, str) and not path.exists() and path.name == source:
@@ -58,7 +57,7 @@ class Policy:
 
     @property
     def pretrained(self) -> bool:
-        """Whether it comes with the package."""
+        """Whether the policy comes with the package."""
         return self.folder.parent == FOLDER
 
     def act_in(self, environment: Environment) -> PolicyFunction:
@@ -68,16 +67,16 @@ class Policy:
         return trainer.policy()
 
     def scaled(self, action_scale: float = 1.0, setpoint_lead_scale: float = 1.0) -> Policy:
-        """Return the policy with smaller steps of its commands.
+        """Return the policy with smaller command steps and leads.
 
         Args:
-            action_scale: Size of the steps as a share of that in training, above 0 and at most 1: below 1 the robot
-                moves more slowly.
-            setpoint_lead_scale: How far commands may run ahead of the joints, likewise: with the stiffness of the
-                drives, this is the largest force that the robot exerts.
+            action_scale: Size of command steps relative to training, above 0 and at most 1: below 1 the robot moves
+                more slowly.
+            setpoint_lead_scale: Largest difference of command and joint position relative to training, above 0 and at
+                most 1: with the stiffness of the drives it bounds the force that the robot exerts.
 
         Raises:
-            TrainError: One of them is out of bounds.
+            TrainError: A scale is out of bounds.
         """
         for name, scale in (("action scale", action_scale), ("setpoint lead scale", setpoint_lead_scale)):
             if not 0 < scale <= 1:
@@ -99,7 +98,7 @@ class Policy:
         """Write the policy as ONNX (``.onnx``) or TorchScript (``.pt``) and return its metadata.
 
         Raises:
-            TrainError: The file has another ending.
+            TrainError: The file has another suffix.
         """
         from concent_warp.train.policy.export import export
 
@@ -107,14 +106,14 @@ class Policy:
 
 
 def load_policy(source: str | Path) -> Policy:
-    """Load a policy, see `Policy.load`.
+    """Return a trained or pretrained policy.
 
     Args:
-        source: Run folder of a training, a checkpoint file in one, or the name of a policy that comes with the package:
-            "shape_sorter" inserts, "pick_align_insert" does the whole task.
+        source: Run folder of a training, a checkpoint file in one, or the name of a pretrained policy:
+            "shape_sorter" inserts, "pick_align_insert" performs the whole task.
 
     Raises:
-        TrainError: There is no such training or policy, or the file is no checkpoint.
+        TrainError: The training or the policy does not exist, or the file is no checkpoint.
 
     Example:
         >>> import concent_warp as cw

@@ -1,4 +1,4 @@
-"""A policy at work in one world, step by step, with what there is to see."""
+"""A policy in one world, step by step, with the states that a viewer shows."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.policy.episodes import Episodes, PolicyFunction
 from concent_warp.train.task.task import Task
 
-TOUCH = 5e-4
-"""Gap below which a sphere counts as touching something [m]."""
-
 
 @dataclass(frozen=True)
 class PlayedState:
-    """What there is to see between two steps."""
+    """State of the world between two steps."""
 
     position: np.ndarray
     """Body origins [m], world frame, shape (nbody, 3)."""
@@ -27,23 +24,30 @@ class PlayedState:
     touching: np.ndarray
     """Which spheres of the model touch another body, shape (S,) bool."""
     stage: str
-    """Name of the stage that the policy is in."""
+    """Name of the present stage."""
     pairs: np.ndarray
-    """Contact points of its target event and the points that they are to come to [m], world frame, shape (P, 2, 3)."""
+    """Contact points of the stage's target event and their target points [m], world frame, shape (P, 2, 3)."""
     time: float
     """Time since the episode began [s]."""
 
 
 class Player:
-    """One world, the first of an environment, and a policy."""
+    """Runs episodes of a policy in the first world of an environment."""
 
-    def __init__(self, environment: Environment, policy: PolicyFunction, episodes: int) -> None:
-        """Start the first of the episodes that the environment has initial states for."""
+    def __init__(self, environment: Environment, policy: PolicyFunction, states: int, touch_gap: float = 5e-4) -> None:
+        """Start the first episode.
+
+        Args:
+            environment: The worlds.
+            policy: From observations to actions, without exploration.
+            states: Number of the environment's initial states, from which episodes start in turn.
+            touch_gap: Gap below which a sphere counts as touching a body [m].
+        """
         self.environment, self.policy = environment, policy
-        self.touches = TouchingSpheres(environment.task)
+        self.touches = TouchingSpheres(environment.task, touch_gap)
         self.ended: list[str] = []
-        """Outcomes of the episodes that have ended."""
-        self._states, self._next = episodes, 0
+        """Outcomes of the ended episodes, in order."""
+        self._states, self._next = states, 0
         self.begin()
 
     def begin(self) -> None:
@@ -60,8 +64,8 @@ class Player:
             self.begin()
         return outcome
 
-    def moment(self) -> PlayedState:
-        """Return what there is to see now."""
+    def state(self) -> PlayedState:
+        """Return the present state."""
         environment, task = self.environment, self.environment.task
         position = environment.physics.position[0].cpu().numpy().astype(float)
         quaternion = environment.physics.quaternion[0].cpu().numpy().astype(float)
@@ -77,13 +81,13 @@ class Player:
 
 
 class TouchingSpheres:
-    """Tells which spheres of a model touch something, also those that the physics leaves out."""
+    """Computes which spheres of a model touch a body, those outside the physics included."""
 
-    def __init__(self, task: Task) -> None:
-        """Compile the model with all of its spheres."""
+    def __init__(self, task: Task, gap: float) -> None:
+        """Compile the model with all of its spheres; `gap` is the distance that counts as contact [m]."""
         self._m, sphere_geom = compile_model(task.model, None)
         self._d = mujoco.MjData(self._m)
-        self._m.geom_margin[sphere_geom] = TOUCH
+        self._m.geom_margin[sphere_geom] = gap
         self._sphere = np.full(self._m.ngeom, -1)
         self._sphere[sphere_geom] = np.arange(len(sphere_geom))
         self._count = len(sphere_geom)
@@ -93,8 +97,8 @@ class TouchingSpheres:
 
         Args:
             qpos: Positions, shape (nq,).
-            position: Body origins [m], shape (nbody, 3); read of bodies that stand where a world has them.
-            quaternion: Body orientations, shape (nbody, 4); likewise.
+            position: Body origins [m], shape (nbody, 3); read for mocap bodies.
+            quaternion: Body orientations, shape (nbody, 4), likewise.
         """
         m, d = self._m, self._d
         d.qpos[:] = qpos

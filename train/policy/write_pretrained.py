@@ -1,8 +1,8 @@
-"""Run folders reduced to what running the policy takes, as the pretrained policies in `train/pretrained` are.
+"""Run folders reduced to what running the policy needs, the form of the pretrained policies in `train/pretrained`.
 
-Kept are the policy's weights, model, contact events, commands and measurements of the demonstration, and settings; left
-out are optimiser, value function, worlds and generators, tracked points and images. `origin.toml` says which command
-made a policy, and with which versions.
+They have the policy's weights, model, contact events, commands and measurements of the demonstration, and settings,
+without optimiser, value function, environment state, tracked points and images. `origin.toml` has command and versions
+of the training.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.pretrained import ORIGIN
 
 COMMAND = "settings.toml"
-"""File of a run folder in which `concent train` writes its command."""
+"""File of a run folder with the command of `concent train`."""
 
 
 def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
-    """Write a run's policy with what it needs to a folder, in one piece or not at all; return what `origin.toml` says.
+    """Write a policy with what it needs to a folder atomically; return the content of `origin.toml`.
 
     Args:
         policy: The policy, loaded from a run folder.
-        out: Folder to make.
+        out: Folder to create.
         overwrite: Replace an earlier policy in the folder.
 
     Raises:
-        ConcentError: The folder is there and is not to be, or cannot be, replaced.
+        ConcentError: The folder exists and is not replaced.
     """
     import tomli_w
     import torch
@@ -58,7 +58,7 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
 
 
 def _origin_of(settings: Path) -> dict[str, Any]:
-    """Return the command and the versions that a run folder was made by, as far as it says so."""
+    """Return command and versions of a training from its settings file; empty without one."""
     if not settings.is_file():
         return {}
     stored = tomllib.loads(settings.read_text())
@@ -67,5 +67,5 @@ def _origin_of(settings: Path) -> dict[str, Any]:
 
 
 def _without_folders(command: str) -> str:
-    """Return a command with the files in it named without the folders that they lay in."""
+    """Return a command with the folders removed from its file names."""
     return shlex.join(Path(part).name if "/" in part else part for part in shlex.split(command))

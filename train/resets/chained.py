@@ -1,11 +1,10 @@
-"""Initial states of a chain of stages: objects anywhere, and the demonstration bent to lead from one to the other.
+"""Initial states of a chain of stages: displaced objects, and the demonstration deformed to fit them.
 
-Object 1 is put elsewhere by a rigid motion A about the vertical, object 2 by another, B. A demonstrated moment becomes
-one of the task with these places: until object 1 is grasped, the hand's pose is moved by a part of A that grows from
-none at the start to all of it at the object; hand and object together are then moved by what leads from A to B on the
-way; and all by B from their first contact on. So are relative poses kept where there is contact, as the paper's
-appendix D wants it in its cases 1, 2 and 3. On top come displacements of each state by itself, as in the training of
-one stage.
+Object 1 is displaced by a planar rigid motion A, object 2 by another, B. A demonstrated state is displaced accordingly:
+before the grasp, the hand by a share of A that grows from 0 at the start to 1 at object 1; during transport, hand and
+object 1 by an interpolation from A to B; from the first contact of the objects, all by B. Relative poses are thus kept
+wherever there is contact, as in cases 1, 2 and 3 of the paper's appendix D. Each state is displaced individually
+besides, as in the training of one stage.
 """
 
 from __future__ import annotations
@@ -16,44 +15,41 @@ import mujoco
 import numpy as np
 
 from concent_warp.train.cfg import ResetCfg
-from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, place, vertical_rotation
+from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, move_body, vertical_rotation
 from concent_warp.train.task.task import Task
-
-FARTHER = 3.0
-"""By how much more the hand is displaced at the start of its way to object 1 than at its end, as a factor."""
 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """A rigid motion about the vertical."""
+    """A rotation about a vertical axis and a translation."""
 
     pivot: np.ndarray
-    """Point that is turned about and shifted [m], shape (3,)."""
+    """Point on the axis of rotation [m], shape (3,)."""
     shift: np.ndarray
-    """[m], shape (3,)."""
+    """Translation [m], shape (3,)."""
     turn: float
-    """[rad]."""
+    """Rotation about the vertical [rad]."""
 
-    def of(self, point: np.ndarray) -> np.ndarray:
-        """Return the shift of a point [m], shape (3,)."""
+    def displacement_of(self, point: np.ndarray) -> np.ndarray:
+        """Return the displacement of a point [m], shape (3,)."""
         return self.pivot + vertical_rotation(self.turn) @ (point - self.pivot) + self.shift - point
 
 
 class ChainedResetSampler(ResetSampler):
-    """Draws states of all stages of a chain, and starts of the whole."""
+    """Samples states of all stages of a chain, and initial states of the whole chain."""
 
     def __init__(self, task: Task, cfg: ResetCfg, seed: int, device: str) -> None:
-        """Prepare to draw."""
+        """Prepare models, addresses and demonstrated poses."""
         super().__init__(task, cfg, seed, device)
         assert task.demonstrated is not None
         self.stages = task.demonstrated
-        self.grasp, self.touch = self.moments()
-        self.held_at = [self.poses(time) for time in (0.0, self.grasp, self.touch)]
+        self.grasp, self.touch = self.contact_times()
+        self.key_positions = [self.positions(time) for time in (0.0, self.grasp, self.touch)]
 
-    def moments(self) -> tuple[float, float]:
-        """Return when the robot first holds object 1, and when object 1 first touches object 2 [s].
+    def contact_times(self) -> tuple[float, float]:
+        """Return the times of the grasp of object 1 and of its first contact with object 2 [s].
 
-        The end of the demonstration where that does not happen.
+        The end of the demonstration if they do not occur.
         """
         contacts, end = self.task.events.body_contacts, self.task.events.duration
         names = [self.m.body(body).name for body in self.task.objects]
@@ -62,74 +58,74 @@ class ChainedResetSampler(ResetSampler):
         first = min(grasped, default=end)
         return first, min((t for t in touched if t > first), default=end)
 
-    def poses(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the tool and object 1 are at a demonstrated moment [m], shape (3,) each."""
+    def positions(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions of tool and object 1 at a demonstrated time [m], shape (3,) each."""
         self.d.qpos[:] = self.task.replay.qpos[self.task.replay.row(time)]
         mujoco.mj_kinematics(self.m, self.d)
         return self.d.site_xpos[self.task.robot.tool].copy(), self.d.xpos[self.task.objects[0]].copy()
 
-    def draft(self) -> ResetCandidate:
-        """Draw a moment of some stage, or a start, and places of the objects."""
+    def candidate(self) -> ResetCandidate:
+        """Sample a time of a stage, or an initial state of the chain, and poses of the objects."""
         begins = bool(self.rng.random() < self.cfg.free) and self.task.first == 0
         stage = self.task.first if begins else int(self.rng.choice(self.task.chained))
         time = 0.0 if begins else self.rng.uniform(self.stages.start[stage], self.stages.end[stage])
-        draft = self.demonstrated(time, bool(self.rng.random() < self.cfg.demonstrated), stage)
-        draft.begins, draft.apart = begins, draft.case == 1
-        self.bend(draft, self.rearranged(draft))
-        # Elsewhere than in contact it is not as demonstrated, so that overlaps have to be looked for.
-        draft.kept = draft.kept and draft.case == 3
-        return draft
+        candidate = self.demonstrated(time, bool(self.rng.random() < self.cfg.demonstrated), stage)
+        candidate.begins, candidate.hand_free = begins, candidate.case == 1
+        self.deform(candidate, self.displace_objects(candidate))
+        # Outside case 3 relative poses differ from the demonstration, so overlaps must be checked.
+        candidate.as_demonstrated = candidate.as_demonstrated and candidate.case == 3
+        return candidate
 
-    def rearranged(self, draft: ResetCandidate) -> tuple[PlanarMotion, PlanarMotion]:
-        """Put object 2 elsewhere, and return what is done to objects 1 and 2."""
+    def displace_objects(self, candidate: ResetCandidate) -> tuple[PlanarMotion, PlanarMotion]:
+        """Displace object 2, and return the motions of objects 1 and 2."""
         motions = []
         for k in (0, 1):
             aside = self.rng.uniform(-self.cfg.place[k], self.cfg.place[k], 2)
             shift, turn = np.array([*aside, 0.0]), self.rng.uniform(-self.cfg.heading[k], self.cfg.heading[k])
-            motions.append(PlanarMotion(self.held_at[0][1], shift, turn))
+            motions.append(PlanarMotion(self.key_positions[0][1], shift, turn))
         if len(self.task.objects) < 2:
             return motions[0], motions[0]
         free, mocap = self.free[1], self.mocap[1]
         if free is None and mocap is None:
             return motions[0], PlanarMotion(np.zeros(3), np.zeros(3), 0.0)
-        poses, address = (draft.mocap.ravel(), 7 * mocap) if mocap is not None else (draft.qpos, free)
+        poses, address = (candidate.mocap.ravel(), 7 * mocap) if mocap is not None else (candidate.qpos, free)
         assert address is not None
         second = PlanarMotion(poses[address : address + 3].copy(), motions[1].shift, motions[1].turn)
-        place(poses, address, second.pivot, (second.shift, second.turn))
+        move_body(poses, address, second.pivot, (second.shift, second.turn))
         return motions[0], second
 
-    def bend(self, draft: ResetCandidate, motions: tuple[PlanarMotion, PlanarMotion]) -> None:
-        """Move hand and object 1 to where they are on the way between objects that stand elsewhere."""
+    def deform(self, candidate: ResetCandidate, motions: tuple[PlanarMotion, PlanarMotion]) -> None:
+        """Displace hand and object 1 according to the motions of the objects."""
         first, second = motions
-        tool, held = self.poses(draft.time)
+        tool, grasped = self.positions(candidate.time)
         pivot, turn_matrix = tool, self.d.site_xmat[self.task.robot.tool].reshape(3, 3).copy()
-        address, farther = self.free[0], 1.0
-        if draft.case == 1:
+        address, factor = self.free[0], 1.0
+        if candidate.case == 1:
             share = self.progress(tool, 0, at=0)
             moved = PlanarMotion(first.pivot, share * first.shift, share * first.turn)
             if address is not None:
-                place(draft.qpos, address, first.pivot, (first.shift, first.turn))
-            if draft.begins:
+                move_body(candidate.qpos, address, first.pivot, (first.shift, first.turn))
+            if candidate.begins:
                 return
-            farther += FARTHER * (1 - share)
-            self.wander(draft, 1 - share)
+            factor += self.cfg.approach * (1 - share)
+            self.scatter_joints(candidate, 1 - share)
         else:
-            share = self.progress(held, 1, at=1) if draft.case == 2 and draft.time < self.touch else 1.0
-            shift = (1 - share) * first.of(held) + share * second.of(held)
-            moved = PlanarMotion(held, shift, (1 - share) * first.turn + share * second.turn)
-        own, own_turn = (np.zeros(3), 0.0) if draft.kept else self.displacement(lift=True)
-        shift, turn = moved.of(pivot) + farther * own, moved.turn + own_turn
-        draft.position, draft.rotation = pivot + shift, vertical_rotation(turn) @ turn_matrix
-        if draft.case > 1 and address is not None:
-            place(draft.qpos, address, pivot, (shift, turn))
+            share = self.progress(grasped, 1, at=1) if candidate.case == 2 and candidate.time < self.touch else 1.0
+            shift = (1 - share) * first.displacement_of(grasped) + share * second.displacement_of(grasped)
+            moved = PlanarMotion(grasped, shift, (1 - share) * first.turn + share * second.turn)
+        own, own_turn = (np.zeros(3), 0.0) if candidate.as_demonstrated else self.displacement(lift=True)
+        shift, turn = moved.displacement_of(pivot) + factor * own, moved.turn + own_turn
+        candidate.position, candidate.rotation = pivot + shift, vertical_rotation(turn) @ turn_matrix
+        if candidate.case > 1 and address is not None:
+            move_body(candidate.qpos, address, pivot, (shift, turn))
 
-    def progress(self, point: np.ndarray, which: int, at: int) -> float:
-        """Return how far a point is on its way from the demonstrated moment `at` to the one that follows, 0..1."""
-        start, end = self.held_at[at][which], self.held_at[at + 1][which]
+    def progress(self, point: np.ndarray, body: int, at: int) -> float:
+        """Return the share of the path from key position `at` to the next that a point has covered, 0..1."""
+        start, end = self.key_positions[at][body], self.key_positions[at + 1][body]
         whole = float(np.linalg.norm(end - start))
         return float(np.clip(1 - np.linalg.norm(end - point) / whole, 0, 1)) if whole > 1e-6 else 1.0
 
-    def wander(self, draft: ResetCandidate, share: float) -> None:
-        """Start the search for joint positions elsewhere, so that arms with joints to spare take other postures too."""
+    def scatter_joints(self, candidate: ResetCandidate, share: float) -> None:
+        """Displace the initial posture of inverse kinematics, so that redundant arms take various postures."""
         robot, reach = self.task.robot, share * self.cfg.joints
-        draft.qpos[robot.qpos] += self.rng.uniform(-reach, reach, len(robot.qpos))
+        candidate.qpos[robot.qpos] += self.rng.uniform(-reach, reach, len(robot.qpos))

@@ -1,4 +1,4 @@
-"""Inverse kinematics of many tool poses at once, on the device: Newton's Levenberg-Marquardt from several seeds."""
+"""Inverse kinematics of many tool poses on the device: Newton's Levenberg-Marquardt from several initial postures."""
 
 from __future__ import annotations
 
@@ -8,17 +8,11 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import TrainError
+from concent_warp.train.cfg import NewtonSolverCfg
 from concent_warp.train.task.robot import Robot
 
 if TYPE_CHECKING:
     import newton
-
-ITERATIONS = 40
-SEEDS = 4
-NOISE = 0.1
-"""Spread of the further seeds around the posture to start from [rad or m]."""
-POSITION, ANGLE = 3e-4, 3e-3
-"""Errors that are accepted [m, rad]."""
 
 
 def solve_inverse_kinematics_batch(
@@ -27,6 +21,7 @@ def solve_inverse_kinematics_batch(
     qpos: np.ndarray,
     position: np.ndarray,
     rotation: np.ndarray,
+    cfg: NewtonSolverCfg | None = None,
     *,
     device: str | None = None,
     seed: int = 0,
@@ -36,23 +31,24 @@ def solve_inverse_kinematics_batch(
     Args:
         m: Compiled model.
         robot: The robot.
-        qpos: States whose postures to start from, shape (P, nq).
+        qpos: States with the initial postures, shape (P, nq).
         position: Tool positions [m], world frame, shape (P, 3).
         rotation: Tool orientations, shape (P, 3, 3).
+        cfg: Iterations, initial postures and tolerances.
         device: Warp's name of the device.
-        seed: Seed of the further postures.
+        seed: Seed of the further initial postures.
 
     Returns:
-        Joint positions in the order of the robot's joints, shape (P, J), and whether they reach within the joint
-        limits, shape (P,) bool.
+        Joint positions in the order of the robot's joints, shape (P, J), and whether they meet the tolerances
+        within the joint limits, shape (P,) bool.
 
     Raises:
-        TrainError: The arm's joints are not those between the world and the tool.
+        TrainError: The joints between the world and the tool are not the arm's.
     """
     import newton.ik as ik
     import warp as wp
 
-    count = len(qpos)
+    cfg, count = cfg or NewtonSolverCfg(), len(qpos)
     if not count:
         return np.empty((0, len(robot.qpos))), np.empty(0, dtype=bool)
     chain, joints, link, offset = _tool_chain(m, robot, device)
@@ -72,26 +68,32 @@ def solve_inverse_kinematics_batch(
                 ik.IKObjectiveRotation(
                     link, wp.quat(*np.roll(offset[1], -1)), wp.array(np.roll(quaternion, -1, axis=1), dtype=wp.vec4)
                 ),
-                ik.IKObjectiveJointLimit(lower, upper, weight=10.0),
+                ik.IKObjectiveJointLimit(lower, upper, weight=cfg.limit_weight),
             ],
             jacobian_mode=ik.IKJacobianType.ANALYTIC,
             sampler=ik.IKSampler.GAUSS,
-            n_seeds=SEEDS,
-            noise_std=NOISE,
+            n_seeds=cfg.seeds,
+            noise_std=cfg.noise,
             rng_seed=seed,
         )
         start: Any = wp.array(qpos[:, address] - reference, dtype=float)
         found: Any = wp.zeros_like(start)
-        solver.step(start, found, iterations=ITERATIONS)
+        solver.step(start, found, iterations=cfg.iterations)
         angles = found.numpy().astype(float) + reference
     order = [list(joints).index(j) for j in robot.joint]
-    return angles[:, order], _within_tolerance(m, robot, qpos, angles[:, order], position, rotation)
+    return angles[:, order], _within_tolerance(m, robot, qpos, angles[:, order], position, rotation, cfg)
 
 
 def _within_tolerance(
-    m: mujoco.MjModel, robot: Robot, qpos: np.ndarray, angles: np.ndarray, position: np.ndarray, rotation: np.ndarray
+    m: mujoco.MjModel,
+    robot: Robot,
+    qpos: np.ndarray,
+    angles: np.ndarray,
+    position: np.ndarray,
+    rotation: np.ndarray,
+    cfg: NewtonSolverCfg,
 ) -> np.ndarray:
-    """Return whether joint positions (P, J) bring the tool to its poses within the limits, shape (P,) bool."""
+    """Return whether joint positions (P, J) meet poses and joint limits within the tolerances, shape (P,) bool."""
     d = mujoco.MjData(m)
     limited = m.jnt_limited[robot.joint].astype(bool)
     low, high = m.jnt_range[robot.joint].T
@@ -103,7 +105,9 @@ def _within_tolerance(
         mujoco.mj_kinematics(m, d)
         mujoco.mju_mat2Quat(quaternion, (rotation[i] @ d.site_xmat[robot.tool].reshape(3, 3).T).ravel())
         mujoco.mju_quat2Vel(turn, quaternion, 1.0)
-        fine[i] = np.linalg.norm(position[i] - d.site_xpos[robot.tool]) < POSITION and np.linalg.norm(turn) < ANGLE
+        fine[i] = (
+            np.linalg.norm(position[i] - d.site_xpos[robot.tool]) < cfg.position and np.linalg.norm(turn) < cfg.angle
+        )
     return fine
 
 
@@ -117,7 +121,7 @@ def _tool_chain(
         position [m] and a quaternion wxyz.
 
     Raises:
-        TrainError: The arm's joints are not those between the world and the tool.
+        TrainError: The joints between the world and the tool are not the arm's.
     """
     import newton
     import warp as wp

@@ -1,4 +1,4 @@
-"""How initial states are drawn: a demonstrated moment, a displacement that keeps the contact chain, and a trial."""
+"""Initial states of one stage: demonstrated times, displaced with the contact chain kept, and checked to settle."""
 
 from __future__ import annotations
 
@@ -11,310 +11,321 @@ import numpy as np
 from concent_warp.errors import TrainError
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.cfg import ResetCfg
-from concent_warp.train.resets.inverse_kinematics import reach
+from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
 from concent_warp.train.resets.inverse_kinematics_batch import solve_inverse_kinematics_batch
 from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
 
-ROUNDS = 20
-"""Rounds, of as many drafts as states are wanted, after which the search is given up."""
-
 
 @dataclass(frozen=True)
 class ResetStates:
-    """M states at rest to start episodes from."""
+    """M initial states of episodes, at rest."""
 
     qpos: np.ndarray
-    """Shape (M, nq)."""
+    """Positions, shape (M, nq)."""
     qvel: np.ndarray
-    """Shape (M, nv)."""
+    """Velocities, shape (M, nv)."""
     ctrl: np.ndarray
     """Commands that hold the state, shape (M, nu)."""
     mocap: np.ndarray
     """Poses of mocap bodies, position [m] and quaternion, shape (M, nmocap, 7)."""
     stage: np.ndarray
-    """Stage that they belong to, shape (M,) int."""
+    """Stages of the states, shape (M,) int."""
     begins: np.ndarray
-    """Whether all stages are still to come, the robot being where the demonstration begins, shape (M,) bool."""
+    """Whether a state is before the first stage, the robot as at the start of the demonstration, shape (M,) bool."""
     time: np.ndarray
-    """Demonstrated moments that they came from [s], shape (M,)."""
+    """Demonstrated times of the states [s], shape (M,)."""
     case: np.ndarray
-    """Case of the paper's, 1..3, shape (M,) int."""
+    """Case of the paper's appendix D, 1..3, shape (M,) int."""
     discarded: dict[str, int]
-    """How many were discarded, by reason."""
+    """Number of discarded candidates, by reason."""
 
 
 @dataclass
 class ResetCandidate:
-    """A state on its way."""
+    """A candidate of an initial state."""
 
     time: float
-    """Demonstrated moment [s]."""
+    """Demonstrated time [s]."""
     case: int
-    kept: bool
-    """Whether it stays as demonstrated."""
+    """Case of the paper's appendix D, 1..3."""
+    as_demonstrated: bool
+    """Whether it is not displaced."""
     qpos: np.ndarray
-    """Positions so far, objects already where they are to be, shape (nq,)."""
+    """Positions, shape (nq,); the objects' are final, the arm's where `position` is None."""
     ctrl: np.ndarray
     """Commands, shape (nu,)."""
     stage: int
-    """Stage that it belongs to."""
+    """Stage of the state."""
     mocap: np.ndarray
     """Poses of mocap bodies, shape (nmocap, 7)."""
     begins: bool = False
-    """Whether it is a start of the whole chain."""
-    apart: bool = False
+    """Whether it is an initial state of the whole chain."""
+    hand_free: bool = False
     """Whether the hand must not touch an object."""
     position: np.ndarray | None = None
-    """Where the tool is to be [m], shape (3,); None where the joints are decided already."""
+    """Target position of the tool [m], shape (3,); None if the joints are final."""
     rotation: np.ndarray | None = None
-    """The tool's orientation there, shape (3, 3)."""
+    """Target orientation of the tool, shape (3, 3)."""
 
 
 class ResetSampler:
-    """Draws states of one stage and tries them in C MuJoCo.
+    """Samples states of one stage and checks them in C MuJoCo.
 
-    Moments are drawn from shortly before the stage that precedes it to the stage's first contact; for states that are
-    not displaced, to the middle of the target event's window, so that some have all but reached it. Where the stage
-    begins with object 1 in the hand, so do all its states.
+    Times are sampled from shortly before the preceding stage to the stage's first contact; for states that are not
+    displaced, to the middle of the target event's window, so that some have almost met the target. In a stage that
+    starts with object 1 grasped, all states have it grasped.
     """
 
     def __init__(self, task: Task, cfg: ResetCfg, seed: int, device: str) -> None:
-        """Prepare to draw."""
+        """Prepare models and addresses; `device` is Warp's name of the device of Newton's solver."""
         self.task, self.cfg, self.device = task, cfg, device
         self.newton = cfg.solver == "newton" or (cfg.solver == "auto" and device.startswith("cuda"))
         self.rng = np.random.default_rng([seed, 1])
         self.discarded: dict[str, int] = {"unreachable": 0, "overlapping": 0, "chain broken": 0}
         self.m = task.compiled
         self.d = mujoco.MjData(self.m)
-        # Overlaps are judged with all spheres: those left out of the physics must not start within another object.
+        # Overlaps are checked with all spheres: those outside the physics must not start inside another object either.
         self.full, sphere_geom = compile_model(task.model, None)
         self.full_data = mujoco.MjData(self.full)
         self.is_sphere = np.zeros(self.full.ngeom, dtype=bool)
         self.is_sphere[sphere_geom] = True
         self.free = [self.free_joint(body) for body in task.objects]
         self.mocap = [mocap_id(self.m, body) for body in task.objects]
-        self.places = np.hstack([self.d.mocap_pos, self.d.mocap_quat])
+        self.fixture_poses = np.hstack([self.d.mocap_pos, self.d.mocap_quat])
         stage = task.events.stages[task.stage]
-        self.keeps = task.keeps(task.stage)
+        self.starts_grasped = task.starts_grasped(task.stage)
         earlier = task.events.stages[task.stage - 1].start if task.stage else 0.0
         self.window = max(earlier - cfg.before, 0.0), stage.start, stage.event.time
         self.robot_bodies = {e.body for e in task.events.entities if e.role == "robot"}
 
     def free_joint(self, body: int) -> int | None:
-        """Return where the position of a free body starts in qpos; None of a body that is not free."""
+        """Return the address of a free body's position in qpos, None for other bodies."""
         joint = self.m.body_jntadr[body]
         free = joint >= 0 and self.m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
         return int(self.m.jnt_qposadr[joint]) if free else None
 
-    def states(self, count: int, progress: Callable[[float], None] | None) -> ResetStates:
-        """Return `count` states."""
+    def sample(self, count: int, progress: Callable[[float], None] | None) -> ResetStates:
+        """Return `count` states.
+
+        Raises:
+            TrainError: Too many candidates were discarded.
+        """
         found: list[tuple[np.ndarray, ResetCandidate]] = []
-        for _ in range(ROUNDS):
-            for draft in self.solved([self.draft() for _ in range(count)]):
-                if (settled := self.tried(draft)) is not None:
-                    found.append((settled, draft))
+        for _ in range(self.cfg.passes):
+            for candidate in self.with_joints([self.candidate() for _ in range(count)]):
+                if (settled := self.checked(candidate)) is not None:
+                    found.append((settled, candidate))
                     if progress is not None and len(found) % 32 == 0:
                         progress(len(found) / count)
                 if len(found) == count:
-                    return self.collected(found)
+                    return self.stacked(found)
         raise TrainError(
             "too few initial states keep the contact chain",
             expected=count,
             found=f"{len(found)}, and discarded {self.discarded}",
-            fix="displace them less, with --environment.reset.position and .turn",
+            fix="lower the displacements --environment.reset.position and --environment.reset.turn",
         )
 
-    def collected(self, found: list[tuple[np.ndarray, ResetCandidate]]) -> ResetStates:
-        """Return settled states in one."""
-        drafts = [draft for _, draft in found]
+    def stacked(self, found: list[tuple[np.ndarray, ResetCandidate]]) -> ResetStates:
+        """Return settled positions and candidates as arrays."""
+        candidates = [candidate for _, candidate in found]
         return ResetStates(
             qpos=np.array([qpos for qpos, _ in found]),
             qvel=np.zeros((len(found), self.m.nv)),
-            ctrl=np.array([draft.ctrl for draft in drafts]),
-            mocap=np.array([draft.mocap for draft in drafts]),
-            stage=np.array([draft.stage for draft in drafts]),
-            begins=np.array([draft.begins for draft in drafts]),
-            time=np.array([draft.time for draft in drafts]),
-            case=np.array([draft.case for draft in drafts]),
+            ctrl=np.array([candidate.ctrl for candidate in candidates]),
+            mocap=np.array([candidate.mocap for candidate in candidates]),
+            stage=np.array([candidate.stage for candidate in candidates]),
+            begins=np.array([candidate.begins for candidate in candidates]),
+            time=np.array([candidate.time for candidate in candidates]),
+            case=np.array([candidate.case for candidate in candidates]),
             discarded=self.discarded,
         )
 
-    def draft(self) -> ResetCandidate:
-        """Draw a moment and a displacement."""
+    def candidate(self) -> ResetCandidate:
+        """Sample a time and a displacement."""
         start, onset, end = self.window
-        kept = self.rng.random() < self.cfg.demonstrated
-        time = self.rng.uniform(start, end if kept else onset)
-        while self.keeps and self.case(time) == 1:
-            time = self.rng.uniform(start, end if kept else onset)
-        draft = self.demonstrated(time, kept, self.task.stage)
-        if not kept and draft.case == 1:
-            self.scatter(draft)
-        elif not kept:
-            self.displace(draft)
-            self.turn_in_hand(draft)
-        return draft
+        as_demonstrated = self.rng.random() < self.cfg.demonstrated
+        time = self.rng.uniform(start, end if as_demonstrated else onset)
+        while self.starts_grasped and self.case(time) == 1:
+            time = self.rng.uniform(start, end if as_demonstrated else onset)
+        candidate = self.demonstrated(time, as_demonstrated, self.task.stage)
+        if not as_demonstrated and candidate.case == 1:
+            self.scatter(candidate)
+        elif not as_demonstrated:
+            self.displace(candidate)
+            self.rotate_in_grasp(candidate)
+        return candidate
 
-    def demonstrated(self, time: float, kept: bool, stage: int) -> ResetCandidate:
-        """Return a demonstrated moment as it is."""
+    def demonstrated(self, time: float, as_demonstrated: bool, stage: int) -> ResetCandidate:
+        """Return the state at a demonstrated time."""
         row = self.task.replay.row(time)
         qpos, ctrl = self.task.replay.qpos[row].copy(), self.task.replay.ctrl[row].copy()
-        return ResetCandidate(time, self.case(time), kept, qpos, ctrl, stage, self.places.copy())
+        return ResetCandidate(time, self.case(time), as_demonstrated, qpos, ctrl, stage, self.fixture_poses.copy())
 
-    def solved(self, drafts: list[ResetCandidate]) -> Iterator[ResetCandidate]:
-        """Give the drafts with their joints decided, those left out that the hand cannot reach."""
+    def with_joints(self, candidates: list[ResetCandidate]) -> Iterator[ResetCandidate]:
+        """Yield candidates with joint positions by inverse kinematics; discard unreachable ones."""
         robot = self.task.robot
-        asked = [i for i, draft in enumerate(drafts) if draft.position is not None]
+        targets = [i for i, candidate in enumerate(candidates) if candidate.position is not None]
         if self.newton:
             angles, fine = solve_inverse_kinematics_batch(
                 self.m,
                 robot,
-                np.array([drafts[i].qpos for i in asked]).reshape(-1, self.m.nq),
-                np.array([drafts[i].position for i in asked]).reshape(-1, 3),
-                np.array([drafts[i].rotation for i in asked]).reshape(-1, 3, 3),
+                np.array([candidates[i].qpos for i in targets]).reshape(-1, self.m.nq),
+                np.array([candidates[i].position for i in targets]).reshape(-1, 3),
+                np.array([candidates[i].rotation for i in targets]).reshape(-1, 3, 3),
+                self.cfg.newton_solver,
                 device=self.device,
             )
-            answers = {i: angles[k] if fine[k] else None for k, i in enumerate(asked)}
+            solutions = {i: angles[k] if fine[k] else None for k, i in enumerate(targets)}
         else:
-            answers = {}
-        for i, draft in enumerate(drafts):
-            if draft.position is not None and draft.rotation is not None:
+            solutions = {}
+        for i, candidate in enumerate(candidates):
+            if candidate.position is not None and candidate.rotation is not None:
                 if not self.newton:
-                    self.d.qpos[:] = draft.qpos
-                    answers[i] = reach(self.m, self.d, robot, draft.position, draft.rotation)
-                joints = answers[i]
+                    self.d.qpos[:] = candidate.qpos
+                    solutions[i] = solve_inverse_kinematics(
+                        self.m, self.d, robot, candidate.position, candidate.rotation, self.cfg.posture_solver
+                    )
+                joints = solutions[i]
                 if joints is None:
                     self.discarded["unreachable"] += 1
                     continue
-                draft.qpos[robot.qpos] = joints
-            yield draft
+                candidate.qpos[robot.qpos] = joints
+            yield candidate
 
-    def tried(self, draft: ResetCandidate) -> np.ndarray | None:
-        """Return positions of a draft at rest, shape (nq,), None where it is discarded; sets its commands."""
-        if not draft.kept and self.overlap(draft) > self.cfg.overlap:
+    def checked(self, candidate: ResetCandidate) -> np.ndarray | None:
+        """Return the settled positions of a candidate, shape (nq,), None if it is discarded; sets its commands."""
+        if not candidate.as_demonstrated and self.overlap(candidate) > self.cfg.overlap:
             self.discarded["overlapping"] += 1
             return None
-        # What the demonstrated commands lead the joints by is lag and pressing; at rest, they are where the joints are.
+        # Demonstrated commands differ from the joints by lag and contact forces; at rest they equal the joints.
         robot = self.task.robot
-        draft.ctrl[robot.actuator] = np.clip(draft.qpos[robot.qpos], *self.range_of(robot.actuator))
-        settled = self.settle(draft)
+        candidate.ctrl[robot.actuator] = np.clip(candidate.qpos[robot.qpos], *self.command_limits(robot.actuator))
+        settled = self.settle(candidate)
         if settled is None:
             self.discarded["chain broken"] += 1
         return settled
 
-    def range_of(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the limits of commands."""
+    def command_limits(self, actuators: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and upper limits of commands, shape of `actuators`; infinite without limits."""
         limited = self.m.actuator_ctrllimited[actuators].astype(bool)
         low, high = self.m.actuator_ctrlrange[actuators].T
         return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
     def case(self, time: float) -> int:
-        """Return the case of a demonstrated moment."""
+        """Return the case of a demonstrated time [s], 1..3."""
         names = [self.m.body(body).name for body in self.task.objects]
-        holding = touching = False
+        grasped = touching = False
         for contact in self.task.events.body_contacts:
             if contact.start <= time < contact.end:
-                holding |= contact.a in self.robot_bodies and contact.b == names[0]
+                grasped |= contact.a in self.robot_bodies and contact.b == names[0]
                 touching |= len(names) > 1 and {contact.a, contact.b} == set(names[:2])
-        return 1 + holding + (holding and touching)
+        return 1 + grasped + (grasped and touching)
 
-    def scatter(self, draft: ResetCandidate) -> None:
-        """Displace the robot's joints and every free object by themselves (case 1)."""
-        robot, cfg, moved = self.task.robot, self.cfg, draft.qpos
+    def scatter(self, candidate: ResetCandidate) -> None:
+        """Displace the robot's joints and every free object independently (case 1)."""
+        robot, cfg, moved = self.task.robot, self.cfg, candidate.qpos
         moved[robot.qpos] += self.rng.uniform(-cfg.joints, cfg.joints, len(robot.qpos))
         limited = self.m.jnt_limited[robot.joint].astype(bool)
         low, high = self.m.jnt_range[robot.joint].T
         moved[robot.qpos] = np.where(limited, np.clip(moved[robot.qpos], low, high), moved[robot.qpos])
         for address in self.free:
             if address is not None:
-                place(moved, address, moved[address : address + 3], self.displacement(lift=False))
+                move_body(moved, address, moved[address : address + 3], self.displacement(lift=False))
 
-    def displace(self, draft: ResetCandidate) -> None:
-        """Move hand and objects as one; where the hand is to be is left to inverse kinematics (cases 2 and 3)."""
-        if self.free[0] is None:  # what is held hangs on a joint of its own, and cannot be moved along
-            draft.kept = True
+    def displace(self, candidate: ResetCandidate) -> None:
+        """Displace objects, and the target pose of the hand with them (cases 2 and 3)."""
+        if self.free[0] is None:  # an object on a joint cannot move with the hand
+            candidate.as_demonstrated = True
             return
-        together = draft.case == 3 and self.free[1] is not None
+        together = candidate.case == 3 and self.free[1] is not None
         shift, turn = self.displacement(lift=not together)
         d, tool = self.d, self.task.robot.tool
-        d.qpos[:] = draft.qpos
+        d.qpos[:] = candidate.qpos
         mujoco.mj_kinematics(self.m, d)
         pivot = d.site_xpos[tool].copy()
-        draft.position, draft.rotation = pivot + shift, vertical_rotation(turn) @ d.site_xmat[tool].reshape(3, 3)
+        candidate.position, candidate.rotation = (
+            pivot + shift,
+            vertical_rotation(turn) @ d.site_xmat[tool].reshape(3, 3),
+        )
         for address in self.free[: 1 + together]:
             assert address is not None
-            place(draft.qpos, address, pivot, (shift, turn))
+            move_body(candidate.qpos, address, pivot, (shift, turn))
 
-    def turn_in_hand(self, draft: ResetCandidate) -> None:
-        """Turn object 1 in the hand about the axis along which it is held, as it turns where an edge of it catches."""
-        address, table, stage = self.free[0], self.task.table, draft.stage
-        held = self.task.held[stage] & (table.body_b[stage] == self.task.objects[0])
-        if not self.cfg.held or address is None or not held.any():
+    def rotate_in_grasp(self, candidate: ResetCandidate) -> None:
+        """Rotate object 1 in the hand about the axis between the fingers, as contact at an edge rotates it."""
+        address, table, stage = self.free[0], self.task.table, candidate.stage
+        grasped = self.task.robot_slots[stage] & (table.body_b[stage] == self.task.objects[0])
+        if not self.cfg.grasp_turn or address is None or not grasped.any():
             return
-        axis = np.linalg.svd(table.normal[stage][held])[2][0]
-        half = 0.5 * self.rng.uniform(-self.cfg.held, self.cfg.held)
+        axis = np.linalg.svd(table.normal[stage][grasped])[2][0]
+        half = 0.5 * self.rng.uniform(-self.cfg.grasp_turn, self.cfg.grasp_turn)
         turned = np.zeros(4)
         mujoco.mju_mulQuat(
-            turned, draft.qpos[address + 3 : address + 7], np.array([np.cos(half), *np.sin(half) * axis])
+            turned, candidate.qpos[address + 3 : address + 7], np.array([np.cos(half), *np.sin(half) * axis])
         )
-        draft.qpos[address + 3 : address + 7] = turned
+        candidate.qpos[address + 3 : address + 7] = turned
 
     def displacement(self, *, lift: bool) -> tuple[np.ndarray, float]:
-        """Return a drawn shift [m], shape (3,), and a turn about the vertical [rad]."""
+        """Return a sampled translation [m], shape (3,), and rotation about the vertical [rad]."""
         cfg = self.cfg
         aside = self.rng.uniform(-cfg.position, cfg.position, 2)
         up = self.rng.uniform(0, cfg.lift) if lift else 0.0
         return np.array([*aside, up]), float(self.rng.uniform(-cfg.turn, cfg.turn))
 
-    def overlap(self, draft: ResetCandidate) -> float:
+    def overlap(self, candidate: ResetCandidate) -> float:
         """Return the deepest penetration of a sphere in another object or the surroundings [m], 0 for none.
 
-        The hand counts only where it is to be clear of the objects.
+        The hand counts only if it must not touch an object.
         """
         d = self.full_data
-        d.qpos[:], d.qvel[:] = draft.qpos, 0
-        d.mocap_pos[:], d.mocap_quat[:] = draft.mocap[:, :3], draft.mocap[:, 3:]
+        d.qpos[:], d.qvel[:] = candidate.qpos, 0
+        d.mocap_pos[:], d.mocap_quat[:] = candidate.mocap[:, :3], candidate.mocap[:, 3:]
         mujoco.mj_fwdPosition(self.full, d)
         robot = self.task.robot
         hand = {int(self.full.site_bodyid[robot.tool])} | {self.full.body(n).id for n in self.robot_bodies}
         deepest = 0.0
         for contact in d.contact:
             bodies = {int(self.full.geom_bodyid[g]) for g in contact.geom}
-            if self.is_sphere[contact.geom].any() and (draft.apart or not bodies & hand):
+            if self.is_sphere[contact.geom].any() and (candidate.hand_free or not bodies & hand):
                 deepest = max(deepest, -float(contact.dist))
         return deepest
 
-    def settle(self, draft: ResetCandidate) -> np.ndarray | None:
+    def settle(self, candidate: ResetCandidate) -> np.ndarray | None:
         """Return positions after the settling time, None where the state fell apart."""
         m, d = self.m, self.d
         mujoco.mj_resetData(m, d)
-        d.qpos[:], d.ctrl[:] = draft.qpos, draft.ctrl
-        d.mocap_pos[:], d.mocap_quat[:] = draft.mocap[:, :3], draft.mocap[:, 3:]
+        d.qpos[:], d.ctrl[:] = candidate.qpos, candidate.ctrl
+        d.mocap_pos[:], d.mocap_quat[:] = candidate.mocap[:, :3], candidate.mocap[:, 3:]
         mujoco.mj_kinematics(m, d)
-        before = self.watched(draft)
+        before = self.monitored_position(candidate)
         for _ in range(round(self.cfg.settle / m.opt.timestep)):
             mujoco.mj_step(m, d)
         mujoco.mj_kinematics(m, d)
         if d.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(d.qpos).all():
             return None
-        if np.linalg.norm(self.watched(draft) - before) > self.cfg.slip:
+        if np.linalg.norm(self.monitored_position(candidate) - before) > self.cfg.slip:
             return None
         return d.qpos.copy()
 
-    def watched(self, draft: ResetCandidate) -> np.ndarray:
-        """Return what must not move while a draft settles [m]: object 1 in the hand, or where the hand is clear."""
-        if draft.case > 1:
-            return self.in_hand()
-        return self.d.xpos[self.task.objects[0]].copy() if draft.apart else np.zeros(3)
+    def monitored_position(self, candidate: ResetCandidate) -> np.ndarray:
+        """Return the position that must not move while a candidate settles [m], shape (3,).
 
-    def in_hand(self) -> np.ndarray:
-        """Return object 1's origin in the frame of the tool [m], shape (3,)."""
+        It is that of object 1 in the hand, or in the world if the hand must not touch it.
+        """
+        if candidate.case > 1:
+            return self.position_in_hand()
+        return self.d.xpos[self.task.objects[0]].copy() if candidate.hand_free else np.zeros(3)
+
+    def position_in_hand(self) -> np.ndarray:
+        """Return the origin of object 1 in the frame of the tool [m], shape (3,)."""
         d, tool = self.d, self.task.robot.tool
         return d.site_xmat[tool].reshape(3, 3).T @ (d.xpos[self.task.objects[0]] - d.site_xpos[tool])
 
 
-def place(qpos: np.ndarray, address: int, pivot: np.ndarray, move: tuple[np.ndarray, float]) -> None:
-    """Turn and shift a free body in place, about a pivot [m], shape (3,)."""
+def move_body(qpos: np.ndarray, address: int, pivot: np.ndarray, move: tuple[np.ndarray, float]) -> None:
+    """Rotate a free body about the vertical through a pivot [m], shape (3,), and translate it, in place."""
     shift, turn = move
     pivot = np.array(pivot)
     qpos[address : address + 3] = pivot + vertical_rotation(turn) @ (qpos[address : address + 3] - pivot) + shift

@@ -1,17 +1,17 @@
 """Initial states along the demonstration that keep the contact chain (paper, section 3.2.1 and appendix D).
 
-At a demonstrated moment the robot holds object 1 or does not, and object 1 touches object 2 or does not.
+At a demonstrated time the robot grasps object 1 or not, and object 1 touches object 2 or not.
 
-1. No hand on an object: robot joints and objects are displaced each by themselves.
-2. Object 1 in the hand: both are moved as one, and inverse kinematics finds the joints.
-3. Object 1 in the hand and on object 2: all three move as one.
+1. No grasp: robot joints and objects are displaced independently.
+2. Object 1 is grasped: hand and object are displaced together; inverse kinematics gives the joints.
+3. Object 1 is grasped and touches object 2: hand and both objects are displaced together.
 
-Where one stage is trained, object 2 stays where it is fixed, and states between cases 2 and 3 are drawn: as
-demonstrated on object 2, or displaced, and lifted off it. Where stages are chained, objects stand anywhere, and all
-moments of the demonstration are drawn from (`ChainedResetSampler`).
+For one stage, object 2 stays where it is fixed, and states between cases 2 and 3 are sampled: as demonstrated on object
+2, or displaced and lifted off it. For a chain of stages, objects are placed anywhere, and states of the whole
+demonstration are sampled (`ChainedResetSampler`).
 
-States whose inverse kinematics fails, whose displacement makes objects overlap, or whose chain breaks while they settle
-are discarded, and counted.
+States are discarded, and counted, if inverse kinematics fails, objects overlap, or the contact chain breaks while the
+state settles.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ def sample_reset_states(
     device: str = "cpu",
     progress: Callable[[float], None] | None = None,
 ) -> ResetStates:
-    """Draw initial states of the task's stage, or of all its stages.
+    """Return sampled initial states of the task's stage, or of all stages of a chain.
 
     Args:
         task: The task.
-        cfg: How far states are displaced, and what is discarded.
+        cfg: Displacements and thresholds.
         seed: Seed.
-        count: States wanted; those of the settings by default.
+        count: Number of states; `cfg.states` by default.
         device: Warp's name of the device for the inverse kinematics.
         progress: Called with the share done.
 
     Raises:
-        TrainError: Too few of the states drawn can be used.
+        TrainError: Too many of the sampled states were discarded.
     """
-    drawing = ResetSampler if task.demonstrated is None else ChainedResetSampler
-    return drawing(task, cfg, seed, device).states(cfg.states if count is None else count, progress)
+    sampler = ResetSampler if task.demonstrated is None else ChainedResetSampler
+    return sampler(task, cfg, seed, device).sample(cfg.states if count is None else count, progress)

@@ -1,6 +1,6 @@
-"""Fixed objects that stand elsewhere in every world: the box is clamped, and its place differs from episode to episode.
+"""Fixed objects as mocap bodies, so that their poses can differ between worlds and episodes.
 
-MuJoCo lets no position of a static body change. A mocap body is as immovable, and its pose is part of the state.
+MuJoCo does not let the position of a static body change; the pose of a mocap body is part of the state.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import mujoco
 from concent_warp.scene.scene import Scene
 
 
-def movable(scene: Scene) -> Scene:
-    """Return a scene whose fixed objects are mocap bodies: those that are fixed to the world itself.
+def with_movable_fixtures(scene: Scene) -> Scene:
+    """Return a scene in which the objects fixed to the world are mocap bodies.
 
-    Contacts with what is static are left out, as they are of a static body.
+    Their contacts with static bodies are excluded, as those between static bodies are.
     """
     m, spec = scene.model, scene.spec()
     static = [b for b in range(m.nbody) if m.body_weldid[b] == 0 and m.body(b).name]
@@ -32,6 +32,6 @@ def movable(scene: Scene) -> Scene:
 
 
 def mocap_id(m: mujoco.MjModel, body: int) -> int | None:
-    """Return which mocap body of a model a body is, None of others."""
+    """Return the mocap index of a body, None if it is no mocap body."""
     found = int(m.body_mocapid[body])
     return None if found < 0 else found

@@ -1,4 +1,4 @@
-"""How a policy addresses a robot: the arm's joints and commands, the gripper, the tool."""
+"""Addresses of the arm's joints and commands, the gripper and the tool in a compiled model."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Robot:
     actuator: np.ndarray
     """Their actuators, shape (J,) int."""
     gripper: np.ndarray
-    """Actuators of the gripper, moved by one number together; none where the robot has no gripper, shape (G,) int."""
+    """Actuators of the gripper, commanded by one number, shape (G,) int; empty without a gripper."""
     opening: np.ndarray
-    """Gripper opening as a sum over qpos, shape (nq,)."""
+    """Weights of the positions whose sum is the gripper opening, shape (nq,)."""
     tool: int
     """Id of the tool's site."""
     step: np.ndarray
     """Largest step of each command of the action, shape (A,), A = J, and one more with a gripper."""
     lead: np.ndarray
-    """How far each arm command may run ahead of its joint, shape (J,)."""
+    """Largest difference of each arm command and its joint, shape (J,)."""
 
     @property
     def actions(self) -> int:
@@ -43,10 +43,10 @@ class Robot:
 
     @staticmethod
     def of(m: mujoco.MjModel, cfg: ActionCfg) -> Robot:
-        """Find the robot in a model.
+        """Return the robot of a compiled model.
 
         Raises:
-            TrainError: There is no such tool site, or an actuator drives no joint of one degree of freedom.
+            TrainError: The tool site is missing, or an actuator drives no hinge or slide joint.
         """
         names = [m.actuator(i).name for i in range(m.nu)]
         gripper = [names.index(name) for name in cfg.gripper_actuators if name in names]
@@ -84,7 +84,7 @@ class Robot:
 
 
 def _opening(m: mujoco.MjModel, gripper: list[int]) -> np.ndarray:
-    """Return the weights, shape (nq,), with which positions add up to the mean length that the actuators hold."""
+    """Return the weights, shape (nq,), with which positions sum to the mean length of the gripper's actuators."""
     weights = np.zeros(m.nq)
     for i in gripper:
         target = int(m.actuator_trnid[i, 0])

@@ -1,7 +1,7 @@
-"""Stages one after the other: when a target event counts as met, and which stage a demonstrated moment belongs to.
+"""Stages of a chain: when a target event is met, and to which stage a demonstrated time belongs.
 
-Paper, section 3.2.1 and appendix B: every state of a stage is rewarded for its one target event. A world moves on to
-the next stage when all contact pairs of its target have been within a tolerance for some steps.
+Every state of a stage is rewarded for its one target event (paper, section 3.2.1 and appendix B). The next stage
+follows when all contact pairs of the target have been within a tolerance for some steps.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from concent_warp.train.cfg import ChainCfg
 
 @dataclass(frozen=True)
 class DemonstratedStages:
-    """The stage that a world would be in, had it come along the demonstration."""
+    """Stages along the demonstration, by the rule that advances the worlds."""
 
     stage: np.ndarray
     """Stage at each step, shape (K,) int."""
     start: dict[int, float]
     """Time at which each stage begins [s]."""
     end: dict[int, float]
-    """Time until which states are taken from it [s]: until its target is met; in the last one, to the target event."""
+    """End of the time from which its states are sampled [s]: its target is met; in the last stage, the target event."""
 
 
 def demonstrated_stages(
@@ -39,13 +39,13 @@ def demonstrated_stages(
     cfg: ChainCfg,
     period: int,
 ) -> DemonstratedStages:
-    """Return the stages of a demonstration by the rule by which worlds move on.
+    """Return the stages along a demonstration, by the rule that advances the worlds.
 
     Args:
         m: Compiled model.
         table: Contact pairs of the stages.
-        stages: All of them, in their order.
-        qpos: Positions as the model replays the demonstration, shape (K + 1, nq).
+        stages: All stages in order.
+        qpos: Positions of the replayed demonstration, shape (K + 1, nq).
         timestep: Time between them [s].
         cfg: The rule.
         period: Simulation steps between two checks.
@@ -56,24 +56,24 @@ def demonstrated_stages(
     d = mujoco.MjData(m)
     count, last = len(qpos) - 1, len(stages) - 1
     stage = np.empty(count, dtype=int)
-    now, held, closest = 0, 0, np.inf
+    now, steps_within, closest = 0, 0, np.inf
     start = {now: 0.0}
     for row in range(0, count, period):
         d.qpos[:] = qpos[row]
         mujoco.mj_kinematics(m, d)
         distance = _worst_distance(table, d, now)
         closest = min(closest, distance)
-        held = held + 1 if distance < cfg.tolerance else 0
+        steps_within = steps_within + 1 if distance < cfg.tolerance else 0
         stage[row : row + period] = now
-        if held >= cfg.hold and now < last:
-            now, held, closest = now + 1, 0, np.inf
+        if steps_within >= cfg.hold and now < last:
+            now, steps_within, closest = now + 1, 0, np.inf
             start[now] = min(row + period, count) * timestep
     if now < last:
         raise TrainError(
             f"the replayed demonstration does not meet the target of stage {stages[now].name!r}",
             expected=f"all pairs within {cfg.tolerance * 1e3:g} mm for {cfg.hold} control steps",
             found=f"{closest * 1e3:.1f} mm at best",
-            fix="allow more with --environment.chain.tolerance, or fit the model's contact geometry",
+            fix="raise --environment.chain.tolerance, or fit the model's contact geometry",
         )
     end = {s: start[s + 1] for s in range(last)}
     end[last] = max(stages[last].event.time, start[last])
@@ -81,7 +81,7 @@ def demonstrated_stages(
 
 
 def _worst_distance(table: PairTable, d: mujoco.MjData, stage: int) -> float:
-    """Return the distance of the pair of a stage's target that is farthest apart [m]; `d` holds the poses."""
+    """Return the largest distance of the contact pairs of a stage's target [m] at the poses of `d`."""
     used = table.used[stage]
 
     def points(body: np.ndarray, local: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What is trained: a model, a demonstration, and the contact events that the policy is to bring about."""
+"""The task of a training: model, demonstration, and the contact events that the policy is to bring about."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
 from concent_warp.train.cfg import ALL, EnvironmentCfg
-from concent_warp.train.task.movable_fixtures import movable
+from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.slots import slot_table
 from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stages
@@ -26,10 +26,10 @@ from concent_warp.train.task.stages import DemonstratedStages, demonstrated_stag
 
 @dataclass(frozen=True)
 class Replay:
-    """The demonstration as the model replays it; K steps."""
+    """The demonstration replayed by the model, K steps."""
 
     timestep: float
-    """[s]."""
+    """Time between steps [s]."""
     qpos: np.ndarray
     """Positions, shape (K + 1, nq)."""
     qvel: np.ndarray
@@ -37,42 +37,42 @@ class Replay:
     ctrl: np.ndarray
     """Commands, shape (K, nu)."""
     contacts: int
-    """Most contacts at a time."""
+    """Largest number of simultaneous contacts."""
     constraints: int
-    """Most constraint rows at a time."""
+    """Largest number of simultaneous constraint rows."""
 
     def row(self, time: float) -> int:
-        """Return the step at a time [s]."""
+        """Return the index of the step at a time [s]."""
         return min(max(round(time / self.timestep), 0), len(self.ctrl) - 1)
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be trained, a stage or a chain of them, with everything about it that does not change."""
+    """A stage or a chain of stages to be trained, with all that does not depend on the worlds' state."""
 
     model: Model
-    """Objects that are fixed in the scene are mocap bodies here, so that worlds can have them in different places."""
+    """The model; its fixed objects are mocap bodies, so that their poses can differ between worlds."""
     events: ContactEventSequence
     first: int
-    """The stage that a chain begins with; `stage` itself where it is trained alone."""
+    """First stage of a chain; equal to `stage` if one stage is trained."""
     stage: int
-    """The stage whose target event ends the task."""
+    """Stage whose target event ends the task."""
     compiled: mujoco.MjModel
-    """The model with the collidable spheres alone."""
+    """Compiled model with only the collidable spheres."""
     collidable: np.ndarray
     """Spheres in the physics, shape (S,) bool."""
     replay: Replay
     robot: Robot
     objects: tuple[int, ...]
-    """Body ids of the objects; object 1 first, the one that the robot handles most, then object 2, and so on."""
+    """Body ids of the objects by the time for which the robot touches them; object 1 is the most handled one."""
     table: PairTable
     """Contact pairs of all stages."""
-    held: np.ndarray
-    """Whether a slot's pair is of the robot, shape (stages, slots) bool."""
-    place: np.ndarray | None
-    """Where object 1 is to be in the frame of object 2 [m], shape (3,); None in a stage of the robot alone."""
+    robot_slots: np.ndarray
+    """Whether a slot's pair has a robot link, shape (stages, slots) bool."""
+    target_position: np.ndarray | None
+    """Target position of object 1 in the frame of object 2 [m], shape (3,); None without a contact of both."""
     demonstrated: DemonstratedStages | None = None
-    """Which stage the demonstration is in, where several are trained."""
+    """Stages along the demonstration; None if one stage is trained."""
 
     @staticmethod
     def build(
@@ -81,19 +81,20 @@ class Task:
         cfg: EnvironmentCfg,
         events: ContactEventSequence | None = None,
     ) -> Task:
-        """Make a task.
+        """Return a task.
 
         Args:
-            model: Scene, spheres and effects.
-            demonstration: What the policy is to reproduce.
+            model: Scene, contact geometry and effects.
+            demonstration: The demonstration.
             cfg: Stage, collisions, action and observation.
-            events: Contact events of the demonstration; extracted here where they are not given.
+            events: Contact events of the demonstration; extracted by default.
 
         Raises:
-            TrainError: The model has no spheres, an effect that cannot be trained with, or no such stage.
+            TrainError: The model has no contact geometry or an effect that training does not support, or the
+                demonstration lacks the stage.
         """
         if model.geometry is None:
-            raise TrainError("the model has no contact geometry to train with", fix="make one with concent fit")
+            raise TrainError("the model has no contact geometry", fix="fit one with concent fit")
         events = extract(model, demonstration, MujocoEngine(model, threads=1)) if events is None else events
         first, stage = _chain(events, cfg.stage)
         collidable = np.ones(len(model.geometry), dtype=bool)
@@ -101,17 +102,19 @@ class Task:
             touched = [e.sphere for e in events.entities if e.sphere is not None]
             collidable[:] = False
             collidable[touched] = True
-        replayer, model = model, replace(model, scene=movable(model.scene))
+        replayer, model = model, replace(model, scene=with_movable_fixtures(model.scene))
         compiled, _ = compile_model(model, collidable)
-        odd = [a.effect for a in model.effects if a.effect.commands and a.effect.late(compiled, a.array) is None]
-        if odd:
+        unsupported = [
+            a.effect for a in model.effects if a.effect.commands and a.effect.late(compiled, a.array) is None
+        ]
+        if unsupported:
             raise TrainError(
-                "effects on the commands can be trained with where they are delays and lags",
-                found=[effect.name for effect in odd],
+                "training supports delays and lags of commands, but no other effects on them",
+                found=[effect.name for effect in unsupported],
             )
-        table, held = slot_table(compiled, events, cfg.observation.slots)
-        objects = tuple(int(compiled.body(name).id) for name in _ranked(model, events))
-        replay = _replayed(compiled, replayer, demonstration, collidable)
+        table, robot_slots = slot_table(compiled, events, cfg.observation.slots)
+        objects = tuple(int(compiled.body(name).id) for name in _objects_by_handling(model, events))
+        replay = _replay(compiled, replayer, demonstration, collidable)
         task = Task(
             model=model,
             events=events,
@@ -123,8 +126,8 @@ class Task:
             robot=Robot.of(compiled, cfg.action),
             objects=objects,
             table=table,
-            held=held,
-            place=_place(compiled, replay, events, stage, objects),
+            robot_slots=robot_slots,
+            target_position=_target_position(compiled, replay, events, stage, objects),
         )
         if first == stage:
             return task
@@ -135,24 +138,24 @@ class Task:
 
     @property
     def chained(self) -> tuple[int, ...]:
-        """The stages that are trained, in their order."""
+        """The trained stages, in order."""
         return tuple(range(self.first, self.stage + 1))
 
-    def keeps(self, stage: int) -> bool:
-        """Return whether a stage begins with object 1 in the hand, which is to stay there."""
-        return self.events.stages[stage].bodies[0] != "robot" and bool(self.held[stage].any())
+    def starts_grasped(self, stage: int) -> bool:
+        """Return whether a stage starts with object 1 grasped, and keeps it grasped."""
+        return self.events.stages[stage].bodies[0] != "robot" and bool(self.robot_slots[stage].any())
 
-    def holds(self, stage: int) -> tuple[bool, ...]:
-        """Return whether the target event of a stage that begins with something in the hand has it hold each object."""
-        touched = self.table.body_b[stage][self.held[stage]]
-        return tuple(self.keeps(stage) and body in touched for body in self.objects)
+    def grasped_objects(self, stage: int) -> tuple[bool, ...]:
+        """Return whether each object is grasped from the start of a stage to its target event."""
+        touched = self.table.body_b[stage][self.robot_slots[stage]]
+        return tuple(self.starts_grasped(stage) and body in touched for body in self.objects)
 
 
 def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
-    """Return the first and the last of the stages that a name asks for.
+    """Return the indices of the first and the last trained stage.
 
     Raises:
-        TrainError: There is no such stage, or none at all.
+        TrainError: The demonstration has no such stage.
     """
     names = [stage.name for stage in events.stages]
     if name == ALL and names:
@@ -162,22 +165,22 @@ def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
     return names.index(name), names.index(name)
 
 
-def _ranked(model: Model, events: ContactEventSequence) -> list[str]:
-    """Return the names of the objects, those first that robot links touched for longest."""
+def _objects_by_handling(model: Model, events: ContactEventSequence) -> list[str]:
+    """Return the names of the objects, in descending order of the time for which robot links touch them."""
     assert model.geometry is not None
     robot = {e.body for e in events.entities if e.role == "robot"}
-    held = dict.fromkeys(model.geometry.bodies, 0.0)
+    touched = dict.fromkeys(model.geometry.bodies, 0.0)
     for contact in events.body_contacts:
-        if contact.a in robot and contact.b in held:
-            held[contact.b] += contact.end - contact.start
-    return sorted(held, key=lambda name: -held[name])
+        if contact.a in robot and contact.b in touched:
+            touched[contact.b] += contact.end - contact.start
+    return sorted(touched, key=lambda name: -touched[name])
 
 
-def _replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, collidable: np.ndarray) -> Replay:
-    """Replay a demonstration in C MuJoCo and count what contact buffers it needs.
+def _replay(m: mujoco.MjModel, model: Model, demonstration: Demonstration, collidable: np.ndarray) -> Replay:
+    """Return a demonstration replayed in C MuJoCo, with the largest numbers of contacts and constraints.
 
     Raises:
-        TrainError: The replay does not stay finite.
+        TrainError: The replay diverges.
     """
     engine = MujocoEngine(model, collidable=collidable, threads=1)
     steps = step_count(demonstration, engine.timestep)
@@ -185,7 +188,7 @@ def _replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, col
     ctrl = commands(m, demonstration, steps)
     rollout = engine.run(Variants(1, qpos=qpos[None], qvel=qvel[None]), ctrl).numpy()
     if rollout.diverged[0]:
-        raise TrainError("the replay of the demonstration does not stay finite", where=demonstration.name)
+        raise TrainError("the replay of the demonstration diverges", where=demonstration.name)
     d = mujoco.MjData(m)
     contacts = constraints = 0
     for k in range(0, steps, 4):
@@ -195,12 +198,12 @@ def _replayed(m: mujoco.MjModel, model: Model, demonstration: Demonstration, col
     return Replay(engine.timestep, rollout.qpos[0], rollout.qvel[0], ctrl, contacts, constraints)
 
 
-def _place(
+def _target_position(
     m: mujoco.MjModel, replay: Replay, events: ContactEventSequence, stage: int, objects: tuple[int, ...]
 ) -> np.ndarray | None:
     """Return the demonstrated origin of object 1 in the frame of object 2 at a stage's target event [m], shape (3,).
 
-    None where the stage's target event has no contact between the two.
+    None if the stage's target event has no contact between the two.
     """
     pairs = events.stages[stage].event.pairs
     bodies = {(m.body(events.entity[p.a].body).id, m.body(events.entity[p.b].body).id) for p in pairs}
