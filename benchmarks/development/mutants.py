@@ -16,6 +16,7 @@ import random
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,17 @@ def drawn(root: Path, room: str, count: int, seed: int) -> list[Mutant]:
     rng = random.Random(f"{room} {seed}")
     order = sorted(places)
     rng.shuffle(order)
-    return [rng.choice(places[place]) for place in order[:count]]
+    chosen = (rng.choice(places[place]) for place in order)
+    return list(islice((mutant for mutant in chosen if _is_made(root, mutant)), count))
+
+
+def _is_made(root: Path, mutant: Mutant) -> bool:
+    """Return whether cosmic-ray can make a mutant: it cannot replace an exception that is an attribute of a module."""
+    try:
+        mutated((root / mutant.file).read_text(), mutant)
+    except AttributeError:
+        return False
+    return True
 
 
 def mutants(root: Path, room: str, path: Path) -> Iterator[tuple[tuple[int, int], Mutant]]:

@@ -50,6 +50,15 @@ def test_only_what_python_runs_is_changed(script, tree):
     assert len(found) == 4  # the product and its number are two places of one line
 
 
+def test_an_exception_that_cannot_be_replaced_is_left_out(script, tree):
+    code = "import zlib\n\n\ndef f(x):\n    try:\n        return g(x)\n    except (OSError, zlib.error):\n        return 0\n"
+    (tree / "kernels" / "sums.py").write_text(code)
+    mutants = script("benchmarks.development.mutants")
+    found = [m for seed in range(20) for m in mutants.drawn(tree, "kernels", 10, seed)]
+    assert any(m.operator == "NumberReplacer" for m in found)
+    assert all(mutants.mutated(code, m) != code for m in found)
+
+
 def test_each_mutant_changes_its_line_alone_and_differs_from_the_others(script, tree):
     mutants = script("benchmarks.development.mutants")
     every = [m for _, m in mutants.mutants(tree, "kernels", tree / "kernels" / "sums.py")]
