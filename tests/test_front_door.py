@@ -59,7 +59,8 @@ assert "format" in inspect.signature(render).parameters
 assert cw.train.cfg.TrainCfg is cw.TrainCfg
 assert "truth" in inspect.signature(cw.ground).parameters
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    found = subprocess.run([sys.executable, "-c", code], timeout=60, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
 
 
 def test_listed_names_are_those_that_type_checkers_see():

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +253,9 @@ def main(args: Args) -> None:
     begun = time.monotonic()
     args.out.mkdir(parents=True, exist_ok=True)
     kept = args.out / "results.jsonl"
-    sample = [m for room in args.rooms for m in drawn(ROOT, room, args.sample, args.seed)]
+    by_room = [drawn(ROOT, room, args.sample, args.seed) for room in args.rooms]
+    # In turn, so that what is done when it is stopped is a fair part of each.
+    sample = [m for turn in zip_longest(*by_room) for m in turn if m is not None]
     sample = [m for m in sample if not args.files or m.file.startswith(args.files)]
     done = {row["key"] for row in map(json.loads, kept.read_text().splitlines())} if kept.is_file() else set()
     missing = [m for m in sample if m.key not in done]

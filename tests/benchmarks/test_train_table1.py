@@ -1,3 +1,7 @@
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
 import pytest
 
 
@@ -49,3 +53,70 @@ def test_lead_scale_and_time_of_training_tell_rows_apart(train_table1):
     assert [line.split("|")[2:5] for line in lines] == [
         [" 150 ", " 1 ", " 70.0% "], [" 60 ", " 0.5 ", " 60.0% "], [" 60 ", " 1 ", " 50.0% "],
     ]  # fmt: skip
+
+
+def test_successes_are_pooled_over_seeds_with_wilsons_interval(train_table1):
+    rows = [row("ours", 3, 150), {**row("ours", 4, 30), "episodes": 40}]
+    share, shown = train_table1.pooled(rows)
+    assert share == 180 / 240
+    assert shown == ["75.0%", "69.2% to 80.1%", "180 of 240", "3: 75%, 4: 75%"]
+    none, shown = train_table1.pooled([row("ours", 0, 0)])
+    assert none == 0
+    assert shown[1] == "0.0% to 1.9%"
+
+
+def test_targets_met_are_a_mean_over_policies_of_means_over_episodes(train_table1):
+    assert train_table1.targets([{**row("ours", 0, 1), "met": [3, 0]}]) == 0.5
+    many = {**row("ours", 1, 1), "met": [3, 3, 3, 3, 0]}
+    assert train_table1.targets([{**row("ours", 0, 1), "met": [0]}, many]) == pytest.approx(0.4)
+
+
+XML = """
+<mujoco><worldbody>
+  <body name="a"><joint name="a" type="slide" axis="1 0 0"/><geom size="0.01"/></body>
+  <body name="b" mocap="true"><geom size="0.01"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def two_targets():
+    """A task of two stages whose targets are 0.1 m and 0.2 m away from the first body, and its environment."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    point_b = np.array([[[0.1, 0.0, 0.0], [0.9, 0.0, 0.0]], [[0.2, 0.0, 0.0], [0.2, 0.0, 0.0]]])
+    table = SimpleNamespace(
+        used=np.array([[True, False], [True, True]]),
+        body_a=np.full((2, 2), 1), body_b=np.full((2, 2), 2), point_a=np.zeros((2, 2, 3)), point_b=point_b,
+    )  # fmt: skip
+    task = SimpleNamespace(table=table, events=SimpleNamespace(stages=("pick", "insert")))
+    return task, SimpleNamespace(physics=SimpleNamespace(model=model))
+
+
+def met(train_table1, two_targets, path, mocap=0.0):
+    task, environment = two_targets
+    qpos = np.array(path)[:, None] + mocap
+    return train_table1.targets_met(task, environment, qpos, np.array([[mocap, 0, 0, 1, 0, 0, 0]]))
+
+
+def test_a_target_is_met_after_its_pairs_have_been_together_for_long_enough(train_table1, two_targets):
+    hold, near = train_table1.HOLD, 0.9 * train_table1.TOLERANCE
+    assert met(train_table1, two_targets, [0.0, 0.05, 0.0]) == 0
+    assert met(train_table1, two_targets, [0.1 + near] * (hold - 1) + [0.0]) == 0
+    assert met(train_table1, two_targets, [0.1 + near] * hold) == 1
+    assert met(train_table1, two_targets, [0.1 + 1.1 * train_table1.TOLERANCE] * 3 * hold) == 0
+    assert met(train_table1, two_targets, [0.1] * hold, mocap=0.3) == 1
+
+
+def test_targets_count_in_their_order_alone(train_table1, two_targets):
+    hold = train_table1.HOLD
+    assert met(train_table1, two_targets, [0.1] * hold + [0.2] * hold) == 2
+    assert met(train_table1, two_targets, [0.2] * hold + [0.1] * hold) == 1
+    assert met(train_table1, two_targets, [0.1] * hold + [0.2] * (hold - 1)) == 1
+    assert met(train_table1, two_targets, [0.1] * hold + [0.2] * hold + [0.0] * 9) == 2
+
+
+def test_a_stage_without_pairs_is_never_met(train_table1, two_targets):
+    task, environment = two_targets
+    task.table.used[0] = False
+    assert train_table1.apart(task, 0, mujoco.MjData(environment.physics.model)) == np.inf
+    assert met(train_table1, two_targets, [0.1] * 20) == 0

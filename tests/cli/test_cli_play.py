@@ -116,6 +116,7 @@ def test_episodes_are_counted_on_the_page(page):
     if not is_running(page):
         click(page, "Running")
     page.wait_for(r"[1-9]\d* episodes?: [1-9]\d* (success|missed)")
+    assert page.messages == []
 
 
 def test_policy_is_shown_in_the_stand_in_world_for_so_many_episodes(capsys):
