@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,7 +13,7 @@ from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import Phase, StageLike, phases_by_body, stage_phases, tell_a_task
 from concent_warp.comparison.residuals import instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
-from concent_warp.comparison.worst_spans import ranked, worst_places
+from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
 from concent_warp.errors import EventsError, ModelError, RecordingError
 from concent_warp.events.extract_events import extract_events
 from concent_warp.files import write_json
@@ -43,6 +43,8 @@ class CompareCfg:
     """Demonstrations to compare on; all where empty."""
     seed: int = 0
     """Seed of the bootstrap."""
+    worst_spans: WorstSpanCfg = field(default_factory=WorstSpanCfg)
+    """Settings of the search for spans of large error."""
 
 
 def compare(
@@ -97,7 +99,15 @@ def compare(
             remarks = (f"No contact stages: {error}",)
     stages = {name: sequence.stages for name, sequence in (events or {}).items()}
     moving = cfg.phases != "none" and not tell_a_task(stages)
-    found = compare_replays(named, chosen, engine, phases=None if moving else stages, seed=cfg.seed, progress=progress)
+    found = compare_replays(
+        named,
+        chosen,
+        engine,
+        phases=None if moving else stages,
+        seed=cfg.seed,
+        span_cfg=cfg.worst_spans,
+        progress=progress,
+    )
     found = replace(found, events=events or {}, remarks=remarks)
     if out is not None:
         write_json(Path(out), found.to_json())
@@ -112,6 +122,7 @@ def compare_replays(
     phases: Mapping[str, Sequence[StageLike]] | None = None,
     demonstrations: Sequence[str] | None = None,
     seed: int = 0,
+    span_cfg: WorstSpanCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Replay demonstrations in each model and compare what it predicts with what was measured.
@@ -127,6 +138,7 @@ def compare_replays(
             of the last model instead (`phases_by_body`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
+        span_cfg: Settings of the search for spans of large error.
         progress: Called with the share done, 0..1.
 
     Raises:
@@ -137,6 +149,7 @@ def compare_replays(
     if not models:
         raise ModelError("there is no model to compare")
     chosen = recording.only(demonstrations or ()).demonstrations
+    span_cfg = span_cfg or WorstSpanCfg()
     found, diverged, partners = {}, {}, {}
     moving: dict[str, dict[str | None, tuple[Phase, ...]]] = {}
     last = tuple(models)[-1]
@@ -163,10 +176,12 @@ def compare_replays(
     elif phases is not None:
         moving = {}
     spans = {name: by_body[None] for name, by_body in moving.items()}
-    places = [
-        place
+    worst = [
+        span
         for d in chosen
-        for place in worst_places(found[last, d.name], moving.get(d.name, {None: ()}), partners[d.name], d.name)
+        for span in find_worst_spans(
+            found[last, d.name], moving.get(d.name, {None: ()}), partners[d.name], d.name, span_cfg
+        )
     ]
     return Comparison(
         models=dict(models),
@@ -175,6 +190,7 @@ def compare_replays(
         phases=spans,
         diverged=diverged,
         seed=seed,
-        places=ranked(places),
+        worst_spans=rank_worst_spans(worst, span_cfg),
+        span_cfg=span_cfg,
         staged=phases is not None,
     )

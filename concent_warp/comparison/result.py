@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.bootstrap import LEVEL, RULE, effective_count, mean_interval
+from concent_warp.comparison.html import comparison_html
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.worst_spans import WorstSpan
+from concent_warp.comparison.units import shown, times, unit_shown
+from concent_warp.comparison.worst_spans import WorstSpan, WorstSpanCfg
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.estimation.noise import Source
 from concent_warp.events.sequence import ContactEventSequence
@@ -101,8 +103,10 @@ class Comparison:
     """Time [s] at which a replay stopped being finite, by model and demonstration; absent where it stayed so."""
     seed: int = 0
     """Seed of the bootstrap."""
-    places: tuple[WorstSpan, ...] = ()
-    """Where the last model fails worst, the worst first."""
+    worst_spans: tuple[WorstSpan, ...] = ()
+    """Spans of time in which the last model fails worst, the worst first."""
+    span_cfg: WorstSpanCfg = field(default_factory=WorstSpanCfg)
+    """Settings with which these were found."""
     staged: bool = True
     """Whether the phases are contact stages; else they are ways of moving."""
     events: Mapping[str, ContactEventSequence] = field(default_factory=dict)
@@ -259,12 +263,29 @@ class Comparison:
                 "summaries": [asdict(self.summarise(m, *main)) for m in self.models],
                 "difference": self._difference_json(*main),
             },
-            "places": [{**asdict(place), "sentence": place.sentence(demonstration=True)} for place in self.places],
+            "worst_spans": [
+                {**asdict(span), "sentence": span.sentence(demonstration=True)} for span in self.worst_spans
+            ],
             "summaries": [asdict(self.summarise(m, c, p)) for c, p in rows for m in self.models],
             "differences": [d for c, p in rows if (d := self._difference_json(c, p))],
             "interval": {"level": LEVEL, "rule": RULE, "seed": self.seed},
         }
         return finite(document)
+
+    def _repr_html_(self) -> str:
+        """Return mean errors and x noise of all channels, and the worst spans, as HTML, for notebooks."""
+        models = list(self.models)
+        header = ["channel", "unit", *(f"mean error, {m}" for m in models), *(f"x noise, {m}" for m in models)]
+        header += ["verdict"] if len(models) > 1 else []
+        rows = []
+        for channel in self.channels:
+            found = [self.summarise(model, channel) for model in models]
+            row = [channel, unit_shown(found[0].unit)]
+            row += [shown(summary.mean, summary.unit) for summary in found]
+            row += ["-" if summary.ratio is None else times(summary.ratio) for summary in found]
+            rows.append(row + ([self.difference(channel).verdict] if len(models) > 1 else []))
+        spans = self.worst_spans[: self.span_cfg.max_shown]
+        return comparison_html(header, rows, [span.sentence(demonstration=True) for span in spans])
 
     def _difference_json(self, channel: str, phases: tuple[str, ...]) -> dict[str, Any] | None:
         if len(self.models) < 2:

@@ -13,7 +13,7 @@ import numpy as np
 
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
-from concent_warp.comparison.worst_spans import WorstSpan, alike
+from concent_warp.comparison.worst_spans import WorstSpan, span_kind
 from concent_warp.diagnosis.cfg import FailureCfg
 from concent_warp.diagnosis.forces.describe import body_sentence, joint_sentence
 from concent_warp.diagnosis.forces.locate import locate_forces
@@ -53,12 +53,12 @@ def locate_failures(
     cfg = cfg or FailureCfg()
     started = _with_starts(model, recording, windows, offsets)
     try:
-        spans = compare_replays({"model": model}, started, engine).places
+        spans = compare_replays({"model": model}, started, engine).worst_spans
     except ConcentError:
         spans = ()
     distinct: dict[tuple, WorstSpan] = {}
     for span in spans:
-        distinct.setdefault(alike(span), span)
+        distinct.setdefault(span_kind(span), span)
     several = len(recording.demonstrations) > 1
     found = [_span_entry(span, several) for span in list(distinct.values())[: cfg.max_spans]]
     if cfg.max_seconds > 0 and (forces := _unexplained_forces(model, recording, engine, cfg)) is not None:

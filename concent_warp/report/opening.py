@@ -9,7 +9,6 @@ import numpy as np
 
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.result import Comparison
-from concent_warp.comparison.worst_spans import LEAST
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ def openings(comparison: Comparison, demonstrations: Sequence[str]) -> dict[str,
     Errors are those of the last model; of the first one where the last is nowhere above the noise.
     """
     last = {name: _opening(comparison, comparison.after, name) for name in demonstrations}
-    if any(opening.ratio >= LEAST for opening in last.values()):
+    if any(opening.ratio >= comparison.span_cfg.min_ratio for opening in last.values()):
         return last
     return {name: _opening(comparison, comparison.before, name) for name in demonstrations}
 

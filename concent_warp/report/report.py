@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Recording
 
 MOST_DEMONSTRATIONS = 6
-"""Demonstrations with charts and replay, those with the worst places before others; further ones are in the tables
+"""Demonstrations with charts and replay, those with the worst spans before others; further ones are in the tables
 alone, so that the page stays small."""
 
 
@@ -89,7 +89,7 @@ def write_report(
         "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (
             "How far the simulation is from the measurement at each instant of the replay. The bands are "
-            f"{_bands(comparison)}, found in the replay of the last model; numbers mark the worst places. "
+            f"{_bands(comparison)}, found in the replay of the last model; numbers mark the worst spans. "
             "Click to move the replay to that instant."
         ),
         "schedule": _page_file("schedule.html") if events else "",
@@ -249,5 +249,5 @@ def _script_safe(text: str) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-PLACE_SWITCH = '<label><input type="checkbox" id="mark" checked> worst places</label>'
+PLACE_SWITCH = '<label><input type="checkbox" id="mark" checked> worst spans</label>'
 SPHERE_SWITCH = '<label><input type="checkbox" id="spheres"> objects as spheres</label>'

@@ -7,7 +7,7 @@ from html import escape
 
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.units import words
-from concent_warp.comparison.worst_spans import LEAST, WorstSpan, alike
+from concent_warp.comparison.worst_spans import WorstSpan, span_kind
 from concent_warp.estimation.noise import WORDS
 
 MOST_SPANS = 6
@@ -17,9 +17,9 @@ MOST_SPANS = 6
 def numbered_spans(comparison: Comparison) -> list[tuple[int, WorstSpan]]:
     """Return the spans that the page lists, numbered from 1: the worst of each kind."""
     found, seen = [], set()
-    for place in comparison.places:
-        if alike(place) not in seen and len(found) < MOST_SPANS:
-            seen.add(alike(place))
+    for place in comparison.worst_spans:
+        if span_kind(place) not in seen and len(found) < MOST_SPANS:
+            seen.add(span_kind(place))
             found.append((len(found) + 1, place))
     return found
 
@@ -35,7 +35,7 @@ def worst_span_list(comparison: Comparison, shown: Collection[str]) -> str:
     """Return the worst spans as a list; those in a demonstration that is `shown` can be clicked."""
     places = numbered_spans(comparison)
     if not places:
-        return f"<p>The error is nowhere above {LEAST:g} x noise.</p>"
+        return f"<p>The error is nowhere above {comparison.span_cfg.min_ratio:g} x noise.</p>"
     several = len(comparison.demonstrations) > 1
     items = []
     for number, place in places:

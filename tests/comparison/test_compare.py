@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from html import escape
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import Phase
 from concent_warp.comparison.table import markdown_table, rich_table
-from concent_warp.comparison.units import shown
+from concent_warp.comparison.units import shown, times
 from concent_warp.effects.library.drives import ActuatorDelay
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.errors import ModelError, RecordingError
@@ -224,9 +225,9 @@ def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):
 
 
 def test_places_are_those_of_the_last_model(comparison):
-    assert "rail" not in {c for p in comparison.places for c in p.channels}
+    assert "rail" not in {c for p in comparison.worst_spans for c in p.channels}
     swapped = compare_replays({"right": model(2), "wrong": model(6)}, recorded(model(2)), "mujoco")
-    assert "rail" in {c for p in swapped.places for c in p.channels}
+    assert "rail" in {c for p in swapped.worst_spans for c in p.channels}
 
 
 def delayed(recording):
@@ -256,3 +257,20 @@ def test_effects_of_a_model_act_in_its_replay_and_in_what_it_reads(effect, value
     without, added = (found.summarise(name, "rail") for name in ("without", "with"))
     assert without.mean > 20 * (added.noise or np.inf)
     assert added.mean < 1.2 * (added.noise or 0)
+
+
+def test_html_has_a_row_for_each_channel_and_escapes_names():
+    truth = model(2)
+    found = compare_replays({"wrong <6>": model(6), "right": truth}, recorded(truth), "mujoco")
+    page = found._repr_html_()
+    assert page.count("<tr>") == 1 + len(found.channels)
+    assert "<th>x noise, wrong &lt;6&gt;</th>" in page
+    assert "<6>" not in page
+    ratio = found.summarise("right", "rail").ratio
+    assert ratio is not None
+    assert f"<td>{times(ratio)}</td>" in page
+    assert "<td>fallen</td>" in page
+    assert "<ol>" not in page  # the last model is nowhere above the noise
+    (span, *_) = compare_replays({"right": truth, "wrong": model(6)}, recorded(truth), "mujoco").worst_spans
+    page = replace(found, worst_spans=(replace(span, demonstration="<demo>"),))._repr_html_()
+    assert f"<li>{escape(replace(span, demonstration='<demo>').sentence(demonstration=True))}</li>" in page

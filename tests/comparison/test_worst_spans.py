@@ -8,12 +8,19 @@ import pytest
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.worst_spans import LEAST, _channel_places, _smoothed, ranked, worst_places
+from concent_warp.comparison.worst_spans import (
+    WorstSpanCfg,
+    _channel_spans,
+    _smoothed,
+    find_worst_spans,
+    rank_worst_spans,
+)
 from concent_warp.estimation.sensors import Kind
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
 
+CFG = WorstSpanCfg()
 TIME = np.arange(0, 4, 0.01)
 RNG = np.random.default_rng(0)
 
@@ -37,8 +44,8 @@ PHASES = (Phase("free", -np.inf, 2.5), Phase("insert", 2.5, np.inf))
 
 
 def test_two_bumps_are_two_places_the_worse_first():
-    found = worst_places(
-        [residual(bump(1, 0.1, 2e-3) + bump(3.2, 0.15, -4e-3, axis=2))], {None: PHASES}, None, "demo_0"
+    found = find_worst_spans(
+        [residual(bump(1, 0.1, 2e-3) + bump(3.2, 0.15, -4e-3, axis=2))], {None: PHASES}, None, "demo_0", CFG
     )
     assert [p.phase for p in found] == ["insert", "free"]
     assert [p.peak for p in found] == pytest.approx([3.2, 1.0], abs=0.03)
@@ -46,21 +53,21 @@ def test_two_bumps_are_two_places_the_worse_first():
     assert [p.direction for p in found] == ["along -z", "along +x"]
     assert found[0].ratio == pytest.approx(found[0].error / (1e-4 * np.sqrt(3)))
     assert found[0].ratio == pytest.approx(20, rel=0.2)
-    assert found[0].onset == pytest.approx(3.2 - 0.15 * np.sqrt(2 * np.log(4e-3 / (LEAST * 1.73e-4))), abs=0.04)
+    assert found[0].onset == pytest.approx(3.2 - 0.15 * np.sqrt(2 * np.log(4e-3 / (CFG.min_ratio * 1.73e-4))), abs=0.04)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_alone_has_no_places(seed):
     value = np.random.default_rng(seed).normal(0, 1e-4, (len(TIME), 3))
     quiet = replace(residual(0), value=value, error=np.linalg.norm(value, axis=1))
-    assert list(_channel_places(quiet, PHASES, None, "demo_0")) == []
+    assert list(_channel_spans(quiet, PHASES, None, "demo_0", CFG)) == []
 
 
 def test_channels_of_one_body_that_fail_together_are_one_place():
     wrong = bump(3, 0.2, 3e-3)
     turned = residual(bump(3.05, 0.2, 0.1, axis=1), "block_orientation", "orientation", "rad", std=1e-2)
     other = residual(wrong, "lid_position", body="lid")
-    found = worst_places([residual(wrong), turned, other], {None: PHASES}, None, "demo_0")
+    found = find_worst_spans([residual(wrong), turned, other], {None: PHASES}, None, "demo_0", CFG)
     assert {p.channels for p in found} == {("block_position", "block_orientation"), ("lid_position",)}
     merged = next(p for p in found if p.body == "block")
     assert "block position (and orientation), insert phase" in merged.sentence()
@@ -69,22 +76,22 @@ def test_channels_of_one_body_that_fail_together_are_one_place():
 
 def test_a_shoulder_of_a_peak_is_no_second_place():
     decay = np.where(TIME > 1, np.exp(-(TIME - 1) / 0.8), 0)[:, None] * [5e-3, 0, 0]
-    assert len(list(_channel_places(residual(decay), PHASES, None, "d"))) == 1
+    assert len(list(_channel_spans(residual(decay), PHASES, None, "d", CFG))) == 1
 
 
 def test_an_error_that_stays_is_traced_to_the_phase_it_arose_in():
     jump = np.interp(TIME, [2.0, 2.4], [0, 4e-3])[:, None] * [1, 0, 0]
-    place = next(_channel_places(residual(jump), PHASES, None, "d"))
+    place = next(_channel_spans(residual(jump), PHASES, None, "d", CFG))
     assert (place.phase, place.arose) == ("insert", "free")
     assert place.sentence().endswith("mostly from the free phase")
-    late = next(_channel_places(residual(bump(3.2, 0.1, 4e-3)), PHASES, None, "d"))
+    late = next(_channel_spans(residual(bump(3.2, 0.1, 4e-3)), PHASES, None, "d", CFG))
     assert late.arose == late.phase == "insert"
     assert "mostly from" not in late.sentence()
 
 
 def test_a_residual_that_swings_points_to_and_fro():
     wave = np.sin(100 * TIME)[:, None] * [0, 2e-3, 0]
-    place = next(_channel_places(residual(wave), (), None, "d"))
+    place = next(_channel_spans(residual(wave), (), None, "d", CFG))
     assert place.direction == "to and fro along y"
     assert place.phase is None
     assert np.linalg.norm(place.vector) < 0.5
@@ -93,7 +100,7 @@ def test_a_residual_that_swings_points_to_and_fro():
 def test_a_diverged_replay_is_the_worst_place_and_stays_json():
     r = residual(bump(1, 0.1, 2e-3))
     lost = replace(r, error=np.where(TIME > 2, np.inf, r.error))
-    found = worst_places([lost], {None: PHASES}, None, "demo_0")
+    found = find_worst_spans([lost], {None: PHASES}, None, "demo_0", CFG)
     assert found[0].size == "diverged"
     assert found[0].start == pytest.approx(2.01)
     assert found[1].peak == pytest.approx(1, abs=0.03)
@@ -101,7 +108,7 @@ def test_a_diverged_replay_is_the_worst_place_and_stays_json():
 
 def test_without_known_noise_a_place_is_told_in_units():
     exact = replace(residual(bump(1, 0.1, 0.02)), noise=None, std=None)
-    place = next(_channel_places(exact, (), None, "d"))
+    place = next(_channel_spans(exact, (), None, "d", CFG))
     assert place.ratio is None
     assert place.size.endswith(" mm")
     assert "noise" not in place.sentence()
@@ -109,8 +116,8 @@ def test_without_known_noise_a_place_is_told_in_units():
 
 def test_smoothing_counts_only_what_was_measured():
     ratio = np.where(np.arange(400) % 3 == 0, np.nan, 2.0)
-    assert _smoothed(TIME, ratio) == pytest.approx(2.0)
-    assert _smoothed(TIME[:1], np.array([2.0])) == pytest.approx([2.0])
+    assert _smoothed(TIME, ratio, CFG) == pytest.approx(2.0)
+    assert _smoothed(TIME[:1], np.array([2.0]), CFG) == pytest.approx([2.0])
 
 
 PUSH = """
@@ -164,7 +171,7 @@ def pushed():
 
 
 def test_the_worst_place_names_body_phase_partner_and_direction(pushed):
-    place = next(p for p in pushed.places if p.channels[0] == "block_position")
+    place = next(p for p in pushed.worst_spans if p.channels[0] == "block_position")
     assert "along +x" in place.direction
     assert place.against[0].startswith("box (-x")
     assert place.start > 0.3
@@ -176,22 +183,24 @@ def test_the_worst_place_names_body_phase_partner_and_direction(pushed):
 
 
 def test_joints_name_what_the_body_that_they_move_touches(pushed):
-    place = next(p for p in pushed.places if p.channels[0] == "rail")
+    place = next(p for p in pushed.worst_spans if p.channels[0] == "rail")
     assert place.against[0].startswith("block (-x")
     assert place.direction == "measured above the model"
 
 
 def test_places_are_in_the_json_with_their_sentence(pushed):
     document = json.loads(json.dumps(pushed.to_json(), allow_nan=False))
-    assert [p["sentence"] for p in document["places"]] == [p.sentence(demonstration=True) for p in pushed.places]
+    assert [p["sentence"] for p in document["worst_spans"]] == [
+        p.sentence(demonstration=True) for p in pushed.worst_spans
+    ]
     assert document["phases_are"] == "ways of moving"
     assert document["summaries"][0]["ratio"] > 3
 
 
 def test_places_alike_in_many_demonstrations_leave_room_for_others():
-    place = next(_channel_places(residual(bump(1, 0.1, 4e-3)), PHASES, None, "d"))
+    place = next(_channel_spans(residual(bump(1, 0.1, 4e-3)), PHASES, None, "d", CFG))
     many = [replace(place, demonstration=f"demo_{i}", ratio=50.0 + i) for i in range(30)]
     other = replace(place, channels=("lid_position",), demonstration="demo_3", ratio=5.0)
-    found = ranked([other, *many])
+    found = rank_worst_spans([other, *many], CFG)
     assert [p.ratio for p in found] == [79, 78, 77, 5]
     assert [p.recurs for p in found] == [30, 30, 30, 1]

@@ -168,8 +168,8 @@ def test_demonstrations_with_the_worst_places_are_shown_before_others(case):
     from dataclasses import replace
 
     names = tuple(f"demo_{i}" for i in range(9))
-    place = case.comparison.places[0]
-    many = replace(case.comparison, demonstrations=names, places=(replace(place, demonstration="demo_7"),))
+    place = case.comparison.worst_spans[0]
+    many = replace(case.comparison, demonstrations=names, worst_spans=(replace(place, demonstration="demo_7"),))
     assert shown_demonstrations(many, 3) == ("demo_0", "demo_1", "demo_7")
 
 

@@ -16,7 +16,7 @@ from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import CompareCfg, compare
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import markdown_table, rich_table
-from concent_warp.comparison.worst_spans import LEAST, alike
+from concent_warp.comparison.worst_spans import span_kind
 from concent_warp.estimation.noise import WORDS
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
@@ -51,7 +51,7 @@ class Arguments:
     """How time is divided: auto takes the contact stages of a task found in the replay of the model and, without any,
     phases of motion."""
     places: int = 5
-    """How many of the worst places to name."""
+    """How many of the worst spans to name."""
     overwrite: bool = False
     """Replace the report if it is there."""
 
@@ -101,18 +101,18 @@ def _say_places(comparison: Comparison, most: int) -> None:
     """Write where the last model fails worst."""
     lines = _place_lines(comparison, most)
     if most > 0:
-        say("\n[bold]Worst places[/bold]" if lines else f"\nNowhere above {LEAST:g} x noise.")
+        say("\n[bold]Worst spans[/bold]" if lines else f"\nNowhere above {comparison.span_cfg.min_ratio:g} x noise.")
     for i, line in enumerate(lines):
         say(escape(f"{i + 1}. {line}"))
 
 
 def _place_lines(comparison: Comparison, most: int) -> list[str]:
-    """Return the worst places in words, one for each that recurs in several demonstrations."""
+    """Return the worst spans in words, one for each that recurs in several demonstrations."""
     several = len(comparison.demonstrations) > 1
     lines, seen = [], set()
-    for place in comparison.places:
-        if alike(place) not in seen and len(lines) < most:
-            seen.add(alike(place))
+    for place in comparison.worst_spans:
+        if span_kind(place) not in seen and len(lines) < most:
+            seen.add(span_kind(place))
             line = place.sentence(demonstration=several)
             lines.append(line + (f" [{place.recurs} demonstrations alike]" if place.recurs > 1 else ""))
     return lines

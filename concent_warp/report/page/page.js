@@ -27,7 +27,7 @@ function leftMargin() {
   return 18 + 7 * Math.max(5, ...labels.map((label) => label.length));
 }
 const placesHere = (channel) => data.places.filter((p) => p.demonstration === state.demonstration.name && (!channel || p.channels.includes(channel)));
-/** Channels whose noise is known, those with the worst places and the largest error first. */
+/** Channels whose noise is known, those with the worst spans and the largest error first. */
 function stripChannels() {
   const d = state.demonstration, last = data.models[data.models.length - 1].name;
   if (!d.strips) {

@@ -1,5 +1,5 @@
 "use strict";
-// The timeline: a strip for each channel, coloured by how far the error stands above the noise, with the worst places marked.
+// The timeline: a strip for each channel, coloured by how far the error stands above the noise, with the worst spans marked.
 
 /** Steps of the colour scale: from this many times the noise on. */
 const HEAT = [1.5, 3, 6, 12, 25, 50];
