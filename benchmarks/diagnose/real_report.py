@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.pages import FOLDER, machine_line, table, write_page
+from concent_warp.comparison.units import p_value_text
 
 NAME = "diagnose_real"
 COLOURS = ("#1f5fa8", "#c8571b", "#3a8f5c")
+NULL_SAMPLES_P = 1 / 401
+"""Smallest p-value of data recorded without it, from 400 samples."""
 
 
 def write_report(result: dict[str, Any]) -> None:
@@ -65,7 +68,7 @@ Accepted, in this order:
 """
     head = ["effect", "parameters, 95 % interval", "cross-validated gain", "p"]
     accepted = [f for f in diagnosis["effects"] if f["accepted"]]
-    text += table(head, [[f["name"], parameters(f), gain(f), f"{f['p']:.2g}"] for f in accepted])
+    text += table(head, [[f["name"], parameters(f), gain(f), p_text(f)] for f in accepted])
     for names in diagnosis["groups"]:
         if len(names) > 1:
             text += f"\nThe data do not distinguish {names[0]} from {', '.join(names[1:])}.\n"
@@ -85,6 +88,11 @@ Accepted, in this order:
         text += "\nFitted and not accepted: "
         text += "; ".join(f"{f['name']} (step {f['step'] + 1}: {f.get('reason', '')})" for f in rejected) + ".\n"
     return text
+
+
+def p_text(finding: dict[str, Any]) -> str:
+    """Return the p-value of a finding as the cell of a table."""
+    return p_value_text(finding["p"], finding.get("p_smallest", NULL_SAMPLES_P)).removeprefix("p ").removeprefix("= ")
 
 
 def steps(rows: list[dict[str, Any]], k: int) -> str:

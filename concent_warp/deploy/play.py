@@ -102,25 +102,25 @@ def _make_player(
 
 def _watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -> None:
     """Run and show the policy under the page's controls, until a number of episodes have ended."""
-    wishes, period = view.wishes, player.environment.control_step
+    controls, period = view.controls, player.environment.control_step
     due = time.monotonic()
     _show(player, view, player.state())
     while episodes is None or len(player.ended) < episodes:
-        if wishes.reset:
-            wishes.reset = False
+        if controls.reset:
+            controls.reset = False
             player.begin()
             _show(player, view, player.state())
-        if not (wishes.running or wishes.step):
+        if not (controls.running or controls.step):
             view.changed.wait(cfg.poll)
             view.changed.clear()
             due = time.monotonic()
             continue
-        wishes.step = False
+        controls.step = False
         outcome = player.step()
         if outcome is not None:
-            view.tell(f"**{outcome}**  \n{counted(player.ended)}")
-            due += cfg.pause / wishes.speed
-        due = max(due + period / wishes.speed, time.monotonic())
+            view.set_message(f"**{outcome}**  \n{counted(player.ended)}")
+            due += cfg.pause / controls.speed
+        due = max(due + period / controls.speed, time.monotonic())
         _wait_until(due, view)
         _show(player, view, player.state())
 
@@ -137,7 +137,7 @@ def _show(player: Player, view: LiveView, state: PlayedState) -> None:
     """Show a state with its stage, time and contacts."""
     view.show(state.position, state.quaternion, state.touching, state.pairs)
     touching = int(state.touching.sum())
-    view.tell(
+    view.set_message(
         f"**Stage {state.stage}**, {state.time:.2f} s  \n"
         f"{touching} of {len(state.touching)} spheres touch  \n"
         f"{counted(player.ended)}"

@@ -1,4 +1,4 @@
-"""The 3D viewer in the browser: a scene that moves as its caller says, its contact spheres, targets and controls.
+"""The 3D viewer in the browser: a scene at given poses, its contact spheres, targets and controls.
 
 It is a server of viser's: it needs no window and no graphics card, whoever opens its page draws.
 """
@@ -21,33 +21,35 @@ from concent_warp.report.scene_data import SHAPES, VISIBLE_GROUPS, mesh_arrays
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 KEPT, LEFT_OUT, TOUCHING = (20, 60, 150), (95, 100, 110), (185, 20, 0)
-"""Colours of spheres: in the physics, left out of it, and touching something."""
+"""Colours of spheres: simulated, not simulated, and in contact."""
 TARGET, PAIR = (20, 150, 60), (240, 170, 0)
-"""Colours of target points, and of the points that are to come to them, each with its line."""
+"""Colours of target points, and of the points to be moved there, each with its line."""
 GLASS = 0.35
-"""Opacity of what has spheres within."""
+"""Opacity of geoms that contain spheres."""
 POINT = 0.003
 """Radius of target points [m]."""
 PLANE = 1.0
 """Half size at which an infinite plane is drawn [m]."""
 BRIGHTNESS = 0.25
-"""Of what surrounds the scene, relative to viser's."""
+"""Intensity of the environment light, relative to viser's default."""
 VIEW = 0.5
 """Field of view [rad]."""
 SPEEDS = (0.1, 4.0)
-"""Slowest and fastest replay, relative to the time in the world."""
+"""Slowest and fastest replay, relative to simulated time."""
 
 
 @dataclass
 class ViewerControls:
-    """What whoever watches has asked for; written by the page, read and taken back by what shows."""
+    """State of the page's controls; written by the page, requests reset by the caller."""
 
     running: bool = True
+    """Whether the simulation runs."""
     step: bool = False
-    """Go on by one step."""
+    """Request for one step."""
     reset: bool = False
-    """Begin anew."""
+    """Request for a new episode."""
     speed: float = 1.0
+    """Speed relative to simulated time."""
 
 
 class LiveView:
@@ -63,15 +65,15 @@ class LiveView:
         port: int,
         speed: float = 1.0,
     ) -> None:
-        """Start to serve.
+        """Start the server.
 
         Args:
             drawn: Model whose geoms are drawn.
             geometry: Spheres of its bodies, S of them.
-            kept: Which of them are in the physics, shape (S,) bool.
+            kept: Which of them are simulated, shape (S,) bool.
             host: Address to serve on; 127.0.0.1 is this machine alone.
             port: Port; the next free one where it is taken.
-            speed: Speed to begin with, relative to the time in the world.
+            speed: Initial speed, relative to simulated time.
 
         Raises:
             ConcentError: The address cannot be served on, or the speed is not among those of the page.
@@ -80,7 +82,7 @@ class LiveView:
 
         if not SPEEDS[0] <= speed <= SPEEDS[1]:
             raise ConcentError("the speed is not right", expected=f"{SPEEDS[0]:g} to {SPEEDS[1]:g}", found=speed)
-        self.wishes, self.changed = ViewerControls(speed=speed), threading.Event()
+        self.controls, self.changed = ViewerControls(speed=speed), threading.Event()
         self._geometry, self._kept = geometry, np.asarray(kept, dtype=bool)
         try:
             socket.create_server((host, 0)).close()  # viser would wait for ever
@@ -90,7 +92,7 @@ class LiveView:
             self._server = viser.ViserServer(host=host, port=port, label="ConCent", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.scene.set_up_direction("+z")
-        # Its lights wash colours out.
+        # Viser's default lights desaturate colours.
         self._server.scene.configure_environment_map(environment_intensity=BRIGHTNESS)
         self._server.scene.configure_default_lights(cast_shadow=False)
         self._frames: dict[int, Any] = {}
@@ -104,34 +106,34 @@ class LiveView:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     @property
     def watched(self) -> bool:
-        """Whether anybody has the page open."""
+        """Whether a client has the page open."""
         return bool(self._server.get_clients())
 
     def stop(self) -> None:
-        """Serve no longer."""
+        """Stop the server."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def look_at(self, point: Sequence[float], away: Sequence[float]) -> None:
-        """Have pages open with a view of a point [m] from a point that is `away` from it [m]."""
+    def look_at(self, point: Sequence[float], offset: Sequence[float]) -> None:
+        """Set the initial view: the point looked at [m], and the camera's offset from it [m]."""
         camera = self._server.initial_camera
         camera.look_at = np.asarray(point, dtype=float)
-        camera.position = np.add(point, away)
+        camera.position = np.add(point, offset)
         camera.fov = VIEW
 
     def show(self, position: np.ndarray, quaternion: np.ndarray, touching: np.ndarray, pairs: np.ndarray) -> None:
-        """Draw a moment.
+        """Draw one state.
 
         Args:
             position: Body origins [m], shape (nbody, 3).
             quaternion: Body orientations, wxyz, shape (nbody, 4).
             touching: Which spheres touch something, shape (S,) bool.
-            pairs: Points and the targets that they are to come to [m], world frame, shape (P, 2, 3).
+            pairs: Points and their targets [m], world frame, shape (P, 2, 3).
         """
         with self._server.atomic():
             for body, frame in self._frames.items():
@@ -139,10 +141,10 @@ class LiveView:
             self._colour_spheres(touching)
             self._move_targets(pairs)
 
-    def tell(self, text: str) -> None:
-        """Write a remark in Markdown on the page."""
-        if self._said.content != text:
-            self._said.content = text
+    def set_message(self, text: str) -> None:
+        """Show a message in Markdown on the page."""
+        if self._message.content != text:
+            self._message.content = text
 
     def _draw_bodies(self, m: mujoco.MjModel) -> None:
         """Draw the geoms of every body in a frame of its own."""
@@ -194,7 +196,7 @@ class LiveView:
             )
 
     def _colour_spheres(self, touching: np.ndarray) -> None:
-        """Colour the spheres by what touches, where that has changed."""
+        """Update the colours of spheres whose contact has changed."""
         colour = np.where(self._kept[:, None], KEPT, LEFT_OUT)
         colour = np.where(np.asarray(touching)[:, None], TOUCHING, colour).astype(np.uint8)
         for name, handle in self._spheres.items():
@@ -204,7 +206,7 @@ class LiveView:
         self._colour = colour
 
     def _move_targets(self, pairs: np.ndarray) -> None:
-        """Draw the pairs, in handles that last for as long as their number."""
+        """Draw the pairs, in handles that are kept while their number stays."""
         points = pairs.reshape(-1, 3).astype(np.float32)
         if self._targets and len(points) == len(self._targets[0].batched_positions):
             dots, lines = self._targets
@@ -239,35 +241,35 @@ class LiveView:
         self._targets = [dots, lines]
 
     def _make_controls(self) -> None:
-        """Put the controls on the page."""
-        gui, wishes = self._server.gui, self.wishes
-        self._said = gui.add_markdown("")
-        running = gui.add_checkbox("Running", wishes.running)
+        """Add the controls to the page."""
+        gui, controls = self._server.gui, self.controls
+        self._message = gui.add_markdown("")
+        running = gui.add_checkbox("Running", controls.running)
         step, reset = gui.add_button("Step"), gui.add_button("Reset")
-        speed = gui.add_slider("Speed", min=SPEEDS[0], max=SPEEDS[1], step=0.1, initial_value=wishes.speed)
+        speed = gui.add_slider("Speed", min=SPEEDS[0], max=SPEEDS[1], step=0.1, initial_value=controls.speed)
         spheres = gui.add_checkbox("Spheres", True)
         shapes = gui.add_checkbox("Shapes of objects", False)
         self._shows_targets = gui.add_checkbox("Targets", True)
 
         @running.on_update
         def _(_: object) -> None:
-            wishes.running = running.value
+            controls.running = running.value
             self.changed.set()
 
         @step.on_click
         def _(_: object) -> None:
-            running.value = wishes.running = False
-            wishes.step = True
+            running.value = controls.running = False
+            controls.step = True
             self.changed.set()
 
         @reset.on_click
         def _(_: object) -> None:
-            wishes.reset = True
+            controls.reset = True
             self.changed.set()
 
         @speed.on_update
         def _(_: object) -> None:
-            wishes.speed = float(speed.value)
+            controls.speed = float(speed.value)
             self.changed.set()
 
         @spheres.on_update
