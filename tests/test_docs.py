@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -122,3 +123,27 @@ def resolved(name: str) -> object:
             found = getattr(found, part)
         return found
     raise ModuleNotFoundError(name)
+
+
+def test_house_shows_the_layers_that_are_checked():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = next(contract["layers"] for contract in settings["contracts"] if contract["type"] == "layers")
+    (shown,) = re.findall(r"```text\n(cli\n.*?)```", (ROOT / "docs" / "house.md").read_text(), re.DOTALL)
+    assert shown.split("\n")[:-1] == [layer for layer in layers if layer != "__main__"]
+
+
+def test_house_lists_every_room_and_sub_room():
+    table = (ROOT / "docs" / "house.md").read_text().split("## Rooms")[1].split("## Who may import whom")[0]
+    listed: dict[str, set[str]] = {}
+    for row in table.splitlines():
+        cells = row.split("|")
+        if len(cells) == 5:
+            listed |= {
+                name: set(re.findall(r"`(\w+)`", cells[3])) for name in re.findall(r"`(\w+)(?:\.py)?`", cells[1])
+            }
+    packages = {path.name: path for path in (ROOT / "concent_warp").iterdir() if (path / "__init__.py").is_file()}
+    packages |= {name: ROOT / name for name in ("kernels", "train", "render")}
+    modules = {path.stem for path in (ROOT / "concent_warp").glob("*.py")} - {"__init__", "__main__"}
+    assert set(listed) == {*packages, *modules}
+    for name, folder in packages.items():
+        assert listed[name] == {path.name for path in folder.iterdir() if (path / "__init__.py").is_file()}, name
