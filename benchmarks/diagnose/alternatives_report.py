@@ -46,8 +46,8 @@ it is accepted (a group counts as right if the hidden effect is in it).
 
 ## Data with a known truth
 
-{len(known)} data sets of Reality, each with a second recording for scoring. Twelve data sets do not show which method
-is better on a single effect.
+{len(known)} data sets of Reality, each with a second recording for scoring. So few do not show
+which method is better on a single effect.
 """
     head = ["", *WAYS]
     text += "\n" + table(head, summary(known)) if known else ""

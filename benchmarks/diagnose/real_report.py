@@ -36,10 +36,10 @@ root mean square over the rest of the window (0.2 s of tosses, 0.3 s of swings),
 of swings). Intervals are bootstrapped over the units; p is Wilcoxon's signed-rank test, two-sided and not corrected. A
 *decoy* is an effect that is fitted on top of the final model although the diagnosis did not accept it.
 
-What the figures do not show: all three verdicts are "none of these", so that a part of the discrepancy has no
-explanation here; orientation of the tosses does not improve. No ground truth of the effects exists. Windows of one log
-are not independent, so their p-values are too small. Two rules for the noise level (a lower bound from the quietest
-stretches, the resolution of the encoder) were set after a look at these data. Other jobs ran on the machine.
+What the figures do not show: which effects are truly there. With the verdict "none of these" a
+part of the discrepancy is unexplained. Windows of one log are not independent, so their p-values are too small. Two
+rules for the noise level (a lower bound from the quietest stretches, the resolution of the encoder) were chosen on
+these data. Other jobs ran on the machine.
 
 ![Error on held-out data after each addition](diagnose_real.png)
 """

@@ -281,8 +281,7 @@ of the frames in which block and box touch with those of Reality.
 What the figures do not show: how exactly stages are found in insert. There the replayed motion itself differs: the
 block slips off the rim earlier or later, depending on the geometry (row *block 2 mm below the rim*), and in Reality as
 in the model it then rests in the mouth of the hole, 2 to 4 mm deep, where it may or may not touch a wall. With a hole
-that is too wide in the model, no align exists. The fitted geometry has larger errors than the inset one in pick and
-align, and about the same in insert.
+that is too wide in the model, no align exists.
 
 """
     return text + "\n".join(section(name, result) for name, result in results.items())

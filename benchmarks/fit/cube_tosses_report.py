@@ -109,13 +109,9 @@ def interpretation(document: dict[str, Any]) -> list[str]:
     lines = [
         "## What the figures do not show",
         "",
-        "- Fits of positions alone do not improve the whole toss: its position error falls by -1 to 0 %, its"
-        " orientation is worse in four of six fits. The cube of the published size, unfitted, has about the same"
-        " error over windows.",
-        "- With friction fitted as well the position of the whole toss improves by 19 to 29 %, its orientation gets"
-        f" worse in all six fits. With the published friction of {document['friction']} the cube slides too far"
-        " whatever its size. A contact takes the larger friction of board and sphere, so a fit can raise friction and"
-        " not lower it.",
+        *[whole_toss(results) for kind in (False, True) if (results := of_kind(document, kind))],
+        f"- With the published friction of {document['friction']} the cube slides too far whatever its size. A contact"
+        " takes the larger friction of board and sphere, so a fit can raise friction and not lower it.",
         "- Windows begin at measured states and end before differences at the start have grown; the fit minimises"
         " them.",
         "- The unit of length of the data is uncertain by about 2 %: the resting cube implies an edge of"
@@ -134,6 +130,23 @@ def interpretation(document: dict[str, Any]) -> list[str]:
         "- Effects that the model lacks, such as restitution and rounded corners, act on the fitted size as well."
     )
     return lines
+
+
+def of_kind(document: dict[str, Any], friction: bool) -> list[dict[str, Any]]:
+    """Return the fits with or without friction among the fitted parameters."""
+    return [r for r in document["results"] if r["friction"] == friction]
+
+
+def whole_toss(results: list[dict[str, Any]]) -> str:
+    """Return how the errors of whole tosses change, as an item of a list."""
+    falls = {name: [100 * r[name]["fall"] for r in results] for name in ("position", "rotation")}
+    words = "positions and friction" if results[0]["friction"] else "positions alone"
+    low, high = min(falls["position"]), max(falls["position"])
+    worse = sum(fall < 0 for fall in falls["rotation"])
+    return (
+        f"- Over whole tosses, with {words} fitted, the error of position falls by {low:.0f} to {high:.0f} %, and the"
+        f" error of orientation grows in {worse} of {len(results)} fits."
+    )
 
 
 def spread(results: list[dict[str, Any]]) -> str:

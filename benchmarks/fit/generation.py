@@ -1,16 +1,15 @@
-"""Speed of the evolution strategy: a generation beside bare MuJoCo-Warp, and the time from recording to converged fit.
+"""Speed of the evolution strategy: a generation against bare MuJoCo-Warp, and the time from recording to converged fit.
 
     python -m benchmarks.fit.generation                           # 1,024 candidates on CUDA, 8 on a CPU
     python -m benchmarks.fit.generation --converge                # whole fits, population by population
     python -m benchmarks.fit.generation --table                   # the page from the stored results
 
-A *generation* draws candidates of the contact geometry, replays the whole demonstration with all of them at once,
-compares point clouds by the Chamfer distance, and moves the estimate. *bare* is `mujoco_warp.step` captured in a graph
-and launched once a step, with the same model, collidable spheres, candidates and buffer sizes, commands copied in
-between, and nothing else. Both are warm: compilation and capture are in neither. They take turns, and the share is the
-median of the shares of neighbours.
-
-Before each generation a fit replays its estimate once in C MuJoCo, to see which spheres touch: *survey* is that time.
+A *generation* samples candidates of the contact geometry, replays the whole demonstration with all of them together,
+compares point clouds by the Chamfer distance, and updates the estimate. *bare* is `mujoco_warp.step` captured in a
+graph and launched once a step, with the same model, collidable spheres, candidates and buffer sizes, and copies of the
+commands in between. Neither includes compilation and capture. They alternate; the share is the median over neighbours.
+Before each generation a fit replays its estimate once in C MuJoCo to find the spheres in contact: *survey* is that
+time. Other scenes and numbers of spheres are not measured.
 """
 
 from __future__ import annotations
@@ -319,13 +318,15 @@ def fit_table(rows: list[dict[str, Any]]) -> str:
 def page(results: dict[str, Any]) -> str:
     """Return the page."""
     text = f"# Speed of the fit\n\n{(__doc__ or '').split(chr(10) * 2, 2)[2].strip()}\n\n"
-    text += f"`python benchmarks/{NAME}.py`. Median (range) over generations; times of parts in seconds.\n\n"
+    text += "`python -m benchmarks.fit.generation`. Median (range) over generations; times of parts in seconds.\n\n"
     for kind, title in (("generation", "A generation"), ("fit", "From recording to converged fit")):
         text += f"## {title}\n\n"
         if kind == "generation":
-            text += f"To be reached on a GPU: a share of {BOUND:.0%} with 1,024 candidates.\n\n"
+            text += f"Bound on a GPU: a share of {BOUND:.0%} with 1,024 candidates.\n\n"
         else:
-            text += "From the recording's file; the first fit on a machine compiles for about half a minute more.\n"
+            text += (
+                "Time from the recording's file; the first fit on a machine compiles for about half a minute more.\n"
+            )
             text += f"Converged: the best Chamfer distance is within {SETTLED - 1:.0%} of the last one.\n\n"
         found = {key: value for key, value in results.items() if key.startswith(kind)}
         for result in found.values():

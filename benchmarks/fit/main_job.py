@@ -1,12 +1,12 @@
-"""The main job from a user's seat: time by stage and peak memory of ``concent demo``, against their bounds.
+"""Time by stage and peak memory of ``concent demo``, against their bounds.
 
     python -m benchmarks.fit.main_job              # as `make demo` runs it, into runs/main_job
     python -m benchmarks.fit.main_job --tests      # also the time of `make check`
     python -m benchmarks.fit.main_job --table      # the page from the stored results
 
-The command runs in a process of its own on two cores. Stages are told by the files that the run leaves behind. Memory
-is the sum of the resident sets of the process and all that it starts, read ten times a second; pages that they share
-count in each, so that it is rather too high.
+The command runs in its own process on two cores. The ends of stages are the times at which their files are written.
+Memory is the sum of the resident sets of the process and its children, sampled ten times a second; shared pages count
+in each of them, so that it is an upper bound. A loaded or slower host takes longer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NAME = "main_job"
 SECONDS, PROCESSOR_SECONDS, BYTES, TEST_SECONDS = 180, 240, 3 * 2**30, 720
 """Bounds on the time, processor time and memory of the main job, and on the time of all checks."""
 PERIOD = 0.1
-"""Time between two looks at the memory [s]."""
+"""Sampling period of the memory [s]."""
 STAGES = {
     "start": ("settings.toml",),
     "record": ("demo.h5",),

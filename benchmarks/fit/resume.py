@@ -1,13 +1,12 @@
-"""A fit that is killed, again and again, and resumed: does it come to the same result, and leave nothing half-written?
+"""Fits that are killed and resumed: same result, no partial file.
 
     python -m benchmarks.fit.resume            # about 5 minutes
     python -m benchmarks.fit.resume --table    # the page from the stored results
 
-A small ``concent fit`` runs once without interruption. Then it is started anew, killed with SIGKILL at a moment drawn
-at random from the whole of its time on the processor, resumed, killed again, and so on; the last run of a trial goes to
-the end.
-After each kill every file of the run folder is read. At the end the folder is compared with that of the first run.
-Further trials kill it in the middle of writing its state, or interrupt it with SIGINT, as Ctrl-C does.
+A small ``concent fit`` runs once without interruption. In each trial it is started again, killed with SIGKILL at a
+random processor time, resumed, killed again, and in the end run to completion. After each kill every file of the run
+folder is read; at the end the folder is compared with that of the first run. Further trials kill it while it writes its
+state, or interrupt it with SIGINT, as Ctrl-C does. Loss of power, which may lose written files, is not tested.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ from concent_warp.model import Model
 
 NAME = "resume"
 WRITTEN = "checkpoint.npz"
-"""File in the middle of whose writing a run is killed; others are written too quickly to be caught at it."""
+"""File during whose writing a run is killed; others are written too quickly."""
 LAST = 0.75
-"""Moments are drawn from this share of the time of the whole process: in the rest it only cleans up behind itself."""
+"""Moments are sampled from this share of the time of the process; the rest is its clean-up."""
 CLOCKED = {"settings.toml", "checkpoint.npz", "history.json", "report.html"}
-"""Files that hold times or the command that was given, which differ from run to run."""
+"""Files with times or the command, which differ between runs."""
 
 
 Moment = float | str
-"""Processor time of a process [s], or the file in the middle of whose writing it is."""
+"""Processor time of a process [s], or the file that it is writing."""
 
 
 @dataclass(frozen=True)
@@ -289,28 +288,28 @@ def page(result: dict[str, Any]) -> str:
 
 `python -m benchmarks.fit.resume`. {machine_line(result["machine"])}
 
-Times are of the processor, since the start of the process; the whole fit takes {result["seconds"][1]:.0f} s, report
-included, and leaves {result["files"]} files. *partial* are files that were being written when the process died: they
-have names of their own, and the resumed run replaces them. *identical*: the same files; model, geometry, contact
-events, schedules and comparison byte by byte; the loss of each generation.
+Times are processor times since the start of the process; the whole fit takes {result["seconds"][1]:.0f} s, report
+included, and leaves {result["files"]} files. *partial* are files that were being written at the kill: they have other
+names, and the resumed run replaces them. *identical*: the same files; model, geometry, contact events, schedules and
+comparison byte by byte; the loss of each generation.
 
-**{same} of {len(killed + interrupted)} fits came to the identical result and left nothing half-written**, after
+**{same} of {len(killed + interrupted)} fits have the identical result and no partial file**, after
 {len(stops)} kills and {sum(len(each["stops"]) for each in interrupted)} interruptions.
 
 ## SIGKILL
 
 {table(head, rows(result["killed"]))}
-In the middle of writing {WRITTEN}:
+While writing {WRITTEN}:
 
 {table(head, rows(result["writing"]))}
 ## SIGINT
 
 {table(head, rows(interrupted))}
 """
-    text += "What it said last:\n\n"
+    text += "Last message:\n\n"
     for each in interrupted:
         for stop in each["stops"]:
-            remarks = ", when all was written" * (stop["files"] - stop["partial"] == result["files"])
+            remarks = ", after the last file" * (stop["files"] - stop["partial"] == result["files"])
             remarks += ", with a traceback" * stop["traceback"]
             text += f"- after {stop['after']:.1f} s{remarks}: `{stop['said']}`\n"
     return text

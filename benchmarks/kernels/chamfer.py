@@ -5,9 +5,9 @@
     python -m benchmarks.kernels.chamfer --table FILE.json ...  writes docs/benchmarks/chamfer.md from results
 
 A pair is a point of one set with one of the other, counted once though both directions are computed:
-pairs/s = worlds * n * m / time. Times are of kernels that are compiled already, inputs in the device's memory; sets are
-independent uniform points in a cube of 0.3 m edge. Several copies of the inputs take turns, so that a cache does not
-hold them.
+pairs/s = worlds * n * m / time. Kernels are compiled before, inputs are in the device's memory; sets are independent
+uniform points in a cube of 0.3 m edge. Several copies of the inputs alternate so that caches do not hold them. The
+figures leave out the preparation of point sets.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ def against_kd_tree(repeats: int) -> list[Row]:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What the figures were measured on."""
+    """Return the facts of the machine."""
     facts: dict[str, Any] = {
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
@@ -340,7 +340,7 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def timed_table(first: str, rows: list[Row]) -> str:
-    """A table of timed rows; those that did not run say why."""
+    """Return a table of timed rows, with the reason where one did not run."""
     cells = []
     for r in rows:
         if "failed" in r:
@@ -353,7 +353,7 @@ def timed_table(first: str, rows: list[Row]) -> str:
 
 
 def section(result: dict[str, Any]) -> str:
-    """The part of the page for one machine."""
+    """Return the section of one machine."""
     facts = result["machine"]
     others = {key.replace("_", " "): value for key, value in facts.items() if key not in ("processor", "date")}
     on = ", ".join(f"{key} {value}" for key, value in others.items())
@@ -369,8 +369,8 @@ def section(result: dict[str, Any]) -> str:
         head = ["pairs of sets x n x m", "kernel, ms", "10^9 pairs/s", "k-d tree, ms"]
         head += ["ratio", "with gradient, ms", "relative error"]
         text += "Time of one processor core; both directions. "
-        text += "All worlds share the second set of a frame, whose tree is built once.\n"
-        text += "The k-d tree needs less than all pairs, so that it overtakes the kernel as sets grow.\n\n"
+        text += "All worlds share the second set of a frame, and its tree is built once.\n"
+        text += "The k-d tree does not compare all pairs, so its disadvantage shrinks with larger sets.\n\n"
         text += table(head, cells) + "\n"
     titles = {
         "rivals": ("Against torch", "method"),

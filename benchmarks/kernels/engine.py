@@ -3,12 +3,12 @@
     python -m benchmarks.kernels.engine --device cuda:0 --output docs/benchmarks/data/engine_h200.json
     python -m benchmarks.kernels.engine --table        # the page from the stored results
 
-The work is that of one generation of the evolution strategy: a demonstration of the shape sorter, replayed by many
-worlds whose spheres differ. *bare* is `mujoco_warp.step` captured in a graph and launched once a step, with the
-commands copied in between, and nothing else. *engine* is the whole of `WarpEngine.run` on kept graphs: geometry and
-commands loaded, worlds reset, every step watched for overflow and instability, records at 30 Hz, results copied out.
-Compilation and capture are not in either; the first run's time is reported apart. *mujoco* is `MujocoEngine` on all
-CPUs. The figures say nothing about other scenes: time per step grows with spheres and contacts.
+The work is one generation of the evolution strategy: a demonstration of the shape sorter, replayed by many worlds with
+different spheres. *bare* is `mujoco_warp.step` captured in a graph and launched once a step, with copies of the
+commands in between. *engine* is all of `WarpEngine.run` with existing graphs: geometry and commands loaded, worlds
+reset, every step checked for overflow and instability, records at 30 Hz, results copied out. Neither includes
+compilation and capture, which are in *first run*. *mujoco* is `MujocoEngine` on all CPUs. Other scenes are not
+measured: time per step grows with spheres and contacts.
 """
 
 from __future__ import annotations
@@ -165,14 +165,14 @@ def section(result: dict[str, Any]) -> str:
     text = f"""## {result["device"]}
 
 Measured {result["date"]} with {versions}. {result["spheres"]} spheres, {steps:,} steps a run, the fastest run counts.
-Worlds in which the solver was cut short: {limited}.
+Worlds in which the solver reached its limit of iterations: {limited}.
 
 {table(head, rows)}"""
     if mujoco_rate := result.get("mujoco_steps_per_second"):
         best = max(r["engine_steps_per_second"] for r in result["warp"])
         text += f"""
-C MuJoCo on the {result["cpus"]} CPU cores of the same machine: {mujoco_rate:,.0f} steps/s. The engine at its best makes
-{best / mujoco_rate:.1f} times as many.
+C MuJoCo on the {result["cpus"]} CPU cores of the same machine: {mujoco_rate:,.0f} steps/s. The engine's best rate is
+{best / mujoco_rate:.1f} times that.
 """
     return text
 

@@ -4,18 +4,18 @@
     python -m benchmarks.kernels.rl_kernels --table                         the page from the stored data, without runs
 
 A scene like the shape sorter just before insertion: a block of 128 spheres above or in a box of 192, between two
-fingers, under a hand and three links, each world with poses of its own. 40 spheres of the block and 38 of the box are
+fingers, under a hand and three links, with different poses in each world. 40 spheres of the block and 38 of the box are
 collidable; the others are checked virtually: the block's against the meshes of box, hand, fingers, links and table and
 against the box's collidable spheres, the box's against the meshes of the robot.
 
 *contact pairs* is `ContactPairs`, eight slots; *meshes* and *spheres* are `VirtualCollision` with the pairs of either
-kind. The torch version does the same in float32 as one would write it down: every pair of a sphere and a triangle, with
-the solid angle of the triangle for the sign, and every pair of spheres, a chunk of worlds at a time so that memory
-holds it; neither bounding boxes nor a search tree, which torch has not. So its ratio says what the tree is worth, too.
+kind. The torch version does the same in float32 without a search tree: every pair of a sphere and a triangle, with the
+solid angle of the triangle for the sign, and every pair of spheres, in parts that fit in memory. Its ratio on meshes
+therefore includes the gain of the tree.
 
-Kernels are captured in a graph and replayed, torch runs eagerly; medians, of torch on meshes one run. The largest
-difference of the two results is given for the fewest worlds: of features and rewards, relative to their largest value.
-The figures leave out the physics and the policy, and other scenes: time grows with spheres near meshes and with faces.
+Kernels are captured in a graph and replayed, torch runs eagerly; medians, of torch on meshes one run. *difference* is
+the largest difference of the two results for the fewest worlds, relative to their largest value. The figures leave out
+physics and policy, and other scenes: time grows with spheres near meshes and with faces.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CHUNK = {"cpu": 1_000_000, "cuda": 20_000_000}
 
 @dataclass(frozen=True)
 class Scene:
-    """What the kernels and torch both start from."""
+    """Inputs of the kernels and of torch."""
 
     table: PairTable
     spheres: list[SphereSet]

@@ -1,18 +1,17 @@
-"""Images of splats a second, by size, number of Gaussians and batch, against gsplat where it is installed.
+"""Images of splats per second, by size, number of Gaussians and batch, against gsplat where it is installed.
 
     python -m benchmarks.render.rasteriser                         measure on the CPU; writes the data and the page
     python -m benchmarks.render.rasteriser --device cuda:0 --out F.jsonl           the same on a GPU, with gsplat
     python -m benchmarks.render.rasteriser --table                 the page from the stored data, without runs
 
 The scene is a cube of 40 mm that fills half of the image's height, its faces covered evenly by flat Gaussians as wide
-as the gaps between them, of harmonics of degree 3. Each image has a camera of its own. *images/s* is without gradients,
-on CUDA from a recorded graph; *with gradients* is an image and the gradients of all parameters. Lists have twice the
-room that they take. gsplat renders the same Gaussians from the same cameras, antialiased as here, and its figures
-include its own Python, as the calls of its users do; *difference* is the largest and the mean between its images and
-ours, in units of full brightness. *Error* is the largest and the mean difference to a rasteriser in float64, without
-tiles and lists, of colours in two 64 x 64 images; the largest are those of a few pixels where Gaussians within a
-millionth of their depth of one another are blended in the other order. The fastest of the repetitions counts on a CPU
-that is shared, the median on CUDA.
+as the gaps between them, with harmonics of degree 3. Each image has its own camera. *images/s* is without gradients, on
+CUDA from a recorded graph; *with gradients* is an image and the gradients of all parameters. Lists are twice as long as
+needed. gsplat renders the same Gaussians from the same cameras with antialiasing, its Python calls included;
+*difference* is the largest and the mean difference of the images, in units of full brightness. *error* is the largest
+and the mean difference to a rasteriser in float64 without tiles and lists, in two 64 x 64 images; the largest are of
+pixels where Gaussians of nearly equal depth are blended in the other order. On the shared CPU the fastest repetition
+counts, on CUDA the median. Scenes with more overlap take longer; gsplat is faster with large batches.
 """
 
 from __future__ import annotations
@@ -198,7 +197,7 @@ def write(rows: dict[str, dict[str, Any]]) -> None:
         "gsplat, images/s", "with gradients", "difference",
     )  # fmt: skip
     parts = [
-        "# Images of splats a second\n\nWritten by `benchmarks/render/rasteriser.py`; do not edit.\n",
+        "# Images of splats per second\n\nWritten by `benchmarks/render/rasteriser.py`; do not edit.\n",
         *(f"{part}\n" for part in (__doc__ or "").split("\n\n")[2:]),
     ]
     for name in dict.fromkeys(row["machine_name"] for row in rows.values()):

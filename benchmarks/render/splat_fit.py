@@ -1,16 +1,16 @@
-"""Splats fitted to photographs of Reality's objects, judged by photographs that were not fitted.
+"""Splats fitted to photographs of Reality's objects, scored on held-out photographs.
 
     python -m benchmarks.render.splat_fit  measure on the CPU; writes the data, the page and the picture
     python -m benchmarks.render.splat_fit --photographs runs/photos --make      only make the photographs of all cases
     python -m benchmarks.render.splat_fit --device cuda:0 --photographs runs/photos --out F.jsonl    the same on a GPU
     python -m benchmarks.render.splat_fit --table                 the page from the stored data, without runs
 
-Block and box of the shape sorter as Reality's camera sees them, with their printed pattern, are photographed from
-all sides without anything around them, three by three rays a pixel; every eighth photograph is held out. `concent
-splat-fit` does the same with a folder of photographs. *Before black* is the peak signal-to-noise ratio of whole images,
-most of which is empty; *object* is that over the pixels that mask or splats cover. With noise, each colour of each
-photograph, also of those held out, is off by 2/255 at random: there 42 dB is the most that could be reached. The
-photographs are made by the CPU; a host where Warp has no CPU takes them from a folder.
+Block and box of the shape sorter with their printed pattern are photographed from all sides by Reality's camera against
+black, three by three rays a pixel; every eighth photograph is held out. `concent splat-fit` does the same with a folder
+of photographs. *before black* is the peak signal-to-noise ratio of whole images, which are mostly empty; *object* is
+that over the pixels that mask or splats cover. *noise of 2/255* is added to each colour of each photograph, held-out
+ones included: 42 dB is the limit there. Photographs are rendered on a CPU; a host where Warp has none reads them from
+a folder. The figures do not show real photographs, with inexact camera poses, backgrounds and masks.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def write(rows: dict[str, dict[str, Any]]) -> None:
             for row in of_device
         ]  # fmt: skip
         parts.append(table(head, lines))
-    parts.append("![Photographs that were not fitted, and below them the splats](splat_fit.png)\n")
-    parts.append("*Above: photographs of block and box that were not fitted. Below: the splats.*")
+    parts.append("![Held-out photographs, and below them the splats](splat_fit.png)\n")
+    parts.append("*Above: held-out photographs of block and box. Below: the splats.*")
     write_page(NAME, "\n".join(parts))
 
 

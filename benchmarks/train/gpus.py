@@ -133,8 +133,8 @@ def page(rows: list[Row]) -> str:
 
 Insertion stage of the shape sorter with the arm, `concent train` under torchrun, {options}; each GPU has
 the given number of worlds. Steps are those of all GPUs; rates are those of the second half of the training, with
-learning. Seconds leave out start and compilation. Success is that of the episodes of a round, while exploring; medians
-over the seeds.
+learning. Seconds leave out start and compilation. Success is that of the episodes of an iteration, while exploring;
+medians over the seeds. One seed each does not show how learning differs between numbers of GPUs.
 
 {table(head, lines)}
 {machine_line(rows[0]["machine"])} Made by `python -m benchmarks.train.gpus --out F`, then `--report F`.

@@ -31,9 +31,8 @@ object 1 in place, with actions sampled from the policy; *without exploration* i
 mean actions, from unseen reset states in the same simulation, with Wilson's 95 % interval. Seconds are those of
 rollouts and updates; reading the model, sampling reset states, compilation and capture are *start*.
 
-What the figures do not show: success in Reality ([Table 1](train_table1.md)), which varies strongly between seeds that
-all reach 100 % here. All tables have two to six seeds. A training stops when its time is over, so the seconds of two
-cases on different hosts are not comparable.
+What the figures do not show: success in Reality ([Table 1](train_table1.md)), which varies strongly between seeds
+with equal success here. A training stops when its time is over, so that seconds on different hosts are not comparable.
 """
 
 

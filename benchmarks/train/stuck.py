@@ -1,11 +1,12 @@
-"""Is it the quicker physics of the training that keeps a policy from succeeding in Reality, or the model?
+"""States in which policies fail in Reality, and whether the physics of the training, or the model's own, solve them.
 
     python -m benchmarks.train.stuck runs/a/policy runs/b/policy ...    # run folders of one stage, then the page
 
-Each policy is run from the same initial states in the physics that it was trained in, in the model's own (elliptic
-cones, its time step) and in Reality. Then the states in which it failed there are put into both simulations,
-at rest, and it is run on from them for as long as an episode lasts. Nothing is drawn at random between the worlds. Of
-the states in which it got stuck the page tells how far object 1 has turned and slid in the hand, in the median.
+Each policy runs from the same initial states in the physics of its training, in the model's own (elliptic cones, its
+time step) and in Reality. The states in which it neither succeeds nor fails in Reality (*stuck*) are set in both
+simulations, at rest, and the policy continues from them for the length of an episode. No parameter is sampled. *turned*
+and *slid* are medians over the stuck states of the motion of object 1 in the hand. The figures do not show why a state
+is not solved, nor other tasks.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from concent_warp.train.run import TrainingRun
 
 NAME = "train_stuck"
 LOST = 0.05
-"""Distance of a contact pair with the robot at which the block counts as lost [m]; in Reality it is held
-elsewhere."""
+"""Distance of a contact pair with the robot at which the block counts as lost [m]; in Reality it is grasped at other
+points."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Args:
     """Command line."""
 
     policies: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Run folders; none makes the page anew."""
+    """Run folders; without any, the page is written from the stored data."""
     episodes: int = 64
     seed: int = 1
     """Of the initial states."""
@@ -53,7 +54,7 @@ class Args:
 
 
 def measure(folder: Path, args: Args) -> dict[str, Any]:
-    """Return how a policy does in the three worlds, and from where it failed in the last of them."""
+    """Return the successes of a policy in the three worlds, and from the states in which it fails in Reality."""
     loaded = Policy.load(folder).scaled(setpoint_lead_scale=args.setpoint_lead_scale)
     run = loaded.run
     task = run.task()
@@ -153,12 +154,12 @@ def page(data: dict[str, dict[str, Any]]) -> str:
         "Episodes in which object 1 is in place at the end:",
         table(head, lines),
         machine_line(first["machine"]),
-        "How they were trained:\n\n" + "\n".join(settings),
+        "Settings of the trainings:\n\n" + "\n".join(settings),
     ])  # fmt: skip
 
 
 def in_the_hand(row: dict[str, Any]) -> list[str]:
-    """Return how far object 1 has turned and slid where a policy got stuck, empty where that was not measured."""
+    """Return how far object 1 is turned and shifted in the hand in stuck states, empty where it was not measured."""
     if row.get("turned") is None:
         return ["", ""]
     return [f"{row['turned']:.0f} deg", f"{1e3 * row['slid']:.0f} mm"]

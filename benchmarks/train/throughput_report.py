@@ -48,7 +48,7 @@ contact in a separate run; in the timed run a few may. *dropped* is the share of
 with its graphs, beyond one of 16 worlds.
 
 What the figures do not show: default settings. The first section is without surface points in the penalty, which are on
-by default; the second has them, with pyramidal cones and steps twice as long. With 256 worlds the gain is 1.2 to 1.3.
+by default; the second has them, with pyramidal cones and steps twice as long.
 """
 
 
