@@ -1,4 +1,4 @@
-"""Let the expert perform in the stand-in world and write down what its instruments saw."""
+"""Recordings of the scripted expert in Reality."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 @dataclass(frozen=True)
 class RealityCfg:
-    """A day in the stand-in laboratory: the shape sorter shown by the scripted expert."""
+    """Settings of recordings in Reality: the shape sorter demonstrated by the scripted expert."""
 
     task: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
-    """Nominal places and sizes; the places are drawn anew around these for each demonstration."""
+    """Nominal positions and sizes; the block's pose is sampled around these for each demonstration."""
     expert: ExpertCfg = field(default_factory=ExpertCfg)
     world: WorldCfg = field(default_factory=WorldCfg)
     sensing: SensingCfg = field(default_factory=SensingCfg)
     footage: FootageCfg = field(default_factory=FootageCfg)
     place_spread: float = 0.02
-    """Half width of the square in which the block is placed [m]."""
+    """Half width of the square in which the block's position is sampled [m]."""
     yaw_spread: float = 0.15
-    """Half width of the block's and the box's rotation [rad]."""
+    """Half width of the block's rotation about the vertical [rad]."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What no instrument saw; for benchmarks that judge a fit."""
+    """True states and contacts of a recording, for benchmarks that score a fit."""
 
     time: np.ndarray
     """Times [s], one each step, shape (T,)."""
     qpos: np.ndarray
-    """States of the stand-in world, shape (T, nq); its joints are those of the scene."""
+    """Positions, shape (T, nq); the joints are those of the scene."""
     block_position: np.ndarray
     """Block origin [m], world frame, shape (T, 3)."""
     contacts: dict[tuple[str, str], np.ndarray]
@@ -62,10 +62,10 @@ def record(
     effects: tuple[HiddenEffect, ...] = (),
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, list[Truth]]:
-    """Record one demonstration per seed, all in the same scene, and return what happened besides.
+    """Return a recording with one demonstration per seed in the same scene, and the truth of each.
 
-    The box stands where the configuration has it, in every demonstration; the block's place and the expert's offsets
-    are drawn from the seed. `progress` is called with the share done, 0..1.
+    The box has the configured pose in every demonstration; the block's pose and the expert's offsets are sampled from
+    the seed. `progress` is called with the share done, 0..1.
     """
     scene = cfg.task.build()
     demonstrations, truths = [], []
@@ -115,7 +115,7 @@ def _perform(
     arm = arm_joints(model, gripper)
     path = aligned(path, start_rotation)
     angles = solve_path(model, task.robot.tcp_site, arm, data.qpos, path.position, path.rotation)
-    # The expert knows the drives as they are drawn, not what is hidden in them.
+    # The expert knows the nominal drives, not the hidden effects in them.
     angles += deflection(scene.model, task.robot.tcp_site, arm, data.qpos, angles, path.force)
     action = np.zeros((len(path.time), model.nu))
     for column in range(model.nu):
@@ -137,7 +137,7 @@ def _perform(
     image = {}
     if cfg.sensing.images:
         rows = sampled(truth.time, cfg.sensing.image_rate)
-        # A source of its own, so that all else is the same with and without images.
+        # A generator of its own, so that all else is the same with and without images.
         image[CAMERA] = film(cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
     if cfg.footage.cameras:
         rows = sampled(truth.time, cfg.footage.rate)
@@ -154,7 +154,7 @@ def _perform(
 
 
 def _judge(model: mujoco.MjModel, log: WorldLog, task: ShapeSorterCfg) -> Truth:
-    """Return what truly happened."""
+    """Return the true states and contacts of a log."""
     address = model.sensor_adr[model.sensor("block_position").id]
     position = np.array(log.sensordata)[:, address : address + 3]
     names = {pair for pairs in log.pairs for pair in pairs}

@@ -1,4 +1,4 @@
-"""Step the stand-in world along the commands and log what happens, untouched by any instrument."""
+"""Simulation of Reality under recorded commands, logged without sensor noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from concent_warp.scene.scene import Scene
 
 @dataclass
 class WorldLog:
-    """Raw readings, one list entry per step or per frame."""
+    """Noise-free readings, one list entry per step or per camera frame."""
 
     time: list[float] = field(default_factory=list)
     qpos: list[np.ndarray] = field(default_factory=list)
@@ -29,7 +29,7 @@ class WorldLog:
 def settle(
     model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray, effects: tuple[HiddenEffect, ...] = ()
 ) -> None:
-    """Let objects and arm come to rest before the recording starts, under the forces of the effects."""
+    """Simulate until objects and arm are at rest before the recording starts, with the forces of the effects."""
     data.ctrl[:] = ctrl
     for _ in range(round(0.3 / model.opt.timestep)):
         _act(model, data, effects)
@@ -38,7 +38,7 @@ def settle(
 
 
 def _act(model: mujoco.MjModel, data: mujoco.MjData, effects: tuple[HiddenEffect, ...]) -> None:
-    """Apply the forces of the effects, and none else, in the next step."""
+    """Set the applied forces of the next step to those of the effects."""
     data.qfrc_applied[:] = 0
     data.xfrc_applied[:] = 0
     for effect in effects:

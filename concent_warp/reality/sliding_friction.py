@@ -1,9 +1,9 @@
-"""Sliding friction as a force of its own at each contact point, by the textbook's law rather than the simulator's.
+"""Sliding friction as a force at each contact point by Coulomb's formula, in place of the simulator's contact model.
 
-MuJoCo's contacts of the two bodies are made frictionless; what rubs is computed here from the normal forces N of the
-step before and the velocity v at each point: f = -N (mu_x v_x, mu_y v_y) / |v|, Coulomb's law with a tensor of friction
-where a surface has a grain (Zmitrowicz, "A theoretical model of anisotropic dry friction", Wear 73(1), 1981). Below a
-creep speed it fades, so that a body comes to rest within microns; it does not hold a body on a slope.
+MuJoCo's contacts of the two bodies are frictionless; the force is computed from the normal forces N of the previous
+step and the velocity v at each point: f = -N (mu_x v_x, mu_y v_y) / |v|, with an anisotropic coefficient of friction
+(Zmitrowicz, "A theoretical model of anisotropic dry friction", Wear 73(1), 1981). Below a creep speed it fades, so that
+a body comes to rest within microns; it does not hold a body on a slope.
 """
 
 from __future__ import annotations

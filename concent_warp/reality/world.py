@@ -1,7 +1,7 @@
-"""The stand-in's physics: exact convex shapes, elliptic cones, a finer step, and any hidden effect.
+"""Physics of Reality: exact convex shapes, elliptic cones, a shorter time step, and hidden effects.
 
-It starts from the same drawing of the workshop (places and sizes) that the user's scene has, and shares none of the
-contact assumptions of the models fitted to it.
+Reality is built from the same nominal scene (positions and sizes) as the user's model, and shares none of the contact
+assumptions of the models fitted to it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from concent_warp.scene.scene import Scene
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """A change of the world that the recording does not mention; each hook is optional."""
+    """A change of the world that recordings do not mention; each hook is optional."""
 
     name: str
     edit: Callable[[mujoco.MjSpec], None] | None = None
@@ -27,12 +27,12 @@ class HiddenEffect:
     command: Callable[[float, np.ndarray], np.ndarray] | None = None
     """Maps time [s] and the commanded control (nu,) to the control that acts."""
     measure: Callable[[str, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
-    """Maps channel name, times (T,) and values (T, dim) to what is written."""
+    """Maps channel name, times (T,) [s] and values (T, dim) to the recorded times and values."""
 
 
 @dataclass(frozen=True)
 class WorldCfg:
-    """Physics of the stand-in."""
+    """Physics of Reality."""
 
     timestep: float = 0.001
     """Step [s]."""
@@ -42,7 +42,7 @@ class WorldCfg:
     """Contact time constant [s] and damping ratio [-]."""
 
     def build(self, scene: Scene, effects: tuple[HiddenEffect, ...] = ()) -> mujoco.MjSpec:
-        """Return the world made from a scene's drawing, hidden effects included, ready to be compiled."""
+        """Return Reality for a nominal scene with hidden effects, ready to be compiled."""
         spec = scene.spec()
         spec.option.timestep = self.timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -61,7 +61,7 @@ class WorldCfg:
         return spec
 
     def chamfer_box(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
-        """Turn a box into the convex mesh of a box with chamfered edges; mass and inertia of the box are kept."""
+        """Replace a box by the convex mesh of a box with chamfered edges, with the mass and inertia of the box."""
         name = f"{geom.name}_chamfered"
         body = geom.parent
         compiled = spec.copy().compile()

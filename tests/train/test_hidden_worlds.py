@@ -8,7 +8,7 @@ import torch
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError
-from concent_warp.reality.hidden.in_task import MET, TaskWorld, pads, wanted
+from concent_warp.reality.hidden.in_task import APPLICABLE, TaskWorld, pads, wanted
 from concent_warp.reality.rigs.grasp import SCENE
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
@@ -69,7 +69,7 @@ def plain() -> np.ndarray:
     return moved([])
 
 
-@pytest.mark.parametrize("name", MET)
+@pytest.mark.parametrize("name", APPLICABLE)
 def test_hidden_effect_changes_what_happens(name, plain):
     found = moved([f"{name}={MAGNITUDES[name]}"])
     assert np.isfinite(found).all()

@@ -107,7 +107,7 @@ def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
     assert not all(same[0])
     assert all(same[1])
     wider = replace(still, cfg=replace(still.cfg, ppo=replace(hardly, hidden=(32,))))
-    with pytest.raises(TrainError, match="another network"):
+    with pytest.raises(TrainError, match="another architecture"):
         train_run(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
 
 
@@ -195,7 +195,7 @@ def test_commands_train_and_evaluate_a_chain(made, tmp_path, capsys):
     assert [p["stage"] for p in described["observation"]["slots"]["pairs"]].count("align") == 8
 
 
-def test_first_episodes_in_the_stand_in_world_are_filmed(made, tmp_path, capsys):
+def test_first_episodes_in_reality_are_filmed(made, tmp_path, capsys):
     import cv2
 
     episode = replace(made, cfg=replace(made.cfg, environment=replace(made.cfg.environment, episode=0.4)))

@@ -1,1 +1,1 @@
-"""What Reality looks like."""
+"""Appearance of Reality to its cameras: speckle patterns of objects, and table, room and lights."""

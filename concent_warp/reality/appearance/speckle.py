@@ -1,7 +1,7 @@
-"""What the stand-in's objects look like: a speckle pattern, as on a printed box, that a tracker can hold on to.
+"""Appearance of objects in Reality: a speckle pattern with texture for trackers.
 
-The pattern is drawn on copies of the geoms, for the camera alone; the physics never sees it. It is laid on along the
-axis of the body that a face looks along most, so that faces of neighbouring geoms in one plane show one pattern.
+The pattern covers copies of the geoms that only cameras see. It is projected along the axis of the body that is nearest
+to a face's normal, so that faces of neighbouring geoms in one plane show one pattern.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def _wrap(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, corners: np.ndarray, name: 
 def _unfold(triangles: np.ndarray) -> np.ndarray:
     """Return places on the pattern [m], shape (f, 3, 2), of triangles in the body frame [m], shape (f, 3, 3).
 
-    A face takes the two coordinates across the axis that it looks along most, moved by a step of its own for each of
-    the six directions.
+    A face takes the two coordinates perpendicular to the axis nearest to its normal, moved by a step of its own for
+    each of the six directions.
     """
     normal = _triangle_normals(triangles)
     axis = np.argmax(np.abs(normal), axis=1)

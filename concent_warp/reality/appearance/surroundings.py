@@ -1,4 +1,4 @@
-"""What the stand-in's laboratory looks like: wooden table, floor and walls, other lights and paint than the drawing.
+"""Appearance of the surroundings in Reality: wooden table, floor and walls, with other lights and colours than nominal.
 
 Like the pattern on the objects, all of it is for cameras alone; the physics never sees it.
 """
@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from concent_warp.reality.appearance.speckle import dress
 
 TABLE = "table"
-"""Geom of the drawing that is made of wood."""
+"""Name of the geom that gets a wooden texture."""
 ROOM = 1.6
 """Half width of the room [m]."""
 FLOOR = -0.75
@@ -20,19 +20,19 @@ FLOOR = -0.75
 TEXELS = 256
 """Pixels along an edge of a texture."""
 PAINT = np.array([1.0, 0.93, 0.82])
-"""Factor on the colours of the robot: it has yellowed."""
+"""Factor on the colours of the robot: a yellowish tint."""
 SUN = {"pos": [0.15, 0.75, 1.7], "dir": [0.12, -0.38, -1.0], "diffuse": [0.85, 0.78, 0.66], "castshadow": True}
 LAMP = {"pos": [1.3, -0.9, 1.2], "dir": [-0.7, 0.6, -0.8], "diffuse": [0.22, 0.25, 0.32], "castshadow": False}
-"""The lights, in place of those of the drawing."""
+"""Lights that replace the nominal ones."""
 
 
 def furnish(world: mujoco.MjSpec, bodies: tuple[str, ...], *, there: bool = True) -> mujoco.MjSpec:
-    """Return a copy of a world as it looks, its objects with their pattern.
+    """Return a copy of Reality with textures, lights and room, its objects with speckle patterns.
 
     Args:
-        world: The stand-in world.
+        world: Reality.
         bodies: Objects.
-        there: Whether the objects are in the room; where not, their shapes are left out.
+        there: Whether the objects are visible.
     """
     spec = dress(world, bodies if there else ())
     rng = np.random.default_rng(1)
@@ -53,7 +53,7 @@ def furnish(world: mujoco.MjSpec, bodies: tuple[str, ...], *, there: bool = True
 
 
 def light(spec: mujoco.MjSpec) -> None:
-    """Put the laboratory's lights in the place of a world's."""
+    """Replace a world's lights by `SUN` and `LAMP`."""
     for there in list(spec.lights):
         spec.delete(there)
     for lamp in (SUN, LAMP):

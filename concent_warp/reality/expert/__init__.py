@@ -1,1 +1,1 @@
-"""The scripted expert."""
+"""The scripted expert: path planning, inverse kinematics, and commands that exert forces."""

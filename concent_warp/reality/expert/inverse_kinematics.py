@@ -27,7 +27,7 @@ def solve_path(
         model: Compiled scene.
         site: Name of the site.
         joints: Ids of the hinge joints that may move.
-        qpos: Start configuration, shape (nq,); it is also what the redundant degrees of freedom are drawn towards.
+        qpos: Start configuration, shape (nq,); redundant degrees of freedom are regularised towards it.
         positions: Site positions [m], world frame, shape (T, 3).
         rotations: Site orientations as matrices, shape (T, 3, 3).
         tolerance: Largest position error accepted [m]; the orientation may be off by 20 times that in rad.

@@ -1,8 +1,8 @@
 """The scripted expert: pick the block, press it beside the hole, slide until it drops in, push it home, let go.
 
-It does what a careful human does in teleoperation: it touches the rim on purpose, leans on the box while it slides, and
-keeps leaning so that the far wall of the hole stops the block. The contact then decides where the block goes, not the
-arm alone. Forces are exerted through the stiffness of the position control: the command lies beyond the surface.
+It touches the rim on purpose, presses on the box while it slides, and keeps pressing until the far wall of the hole
+stops the block, so that contacts guide the block and not the arm alone. Forces are exerted through the stiffness of the
+position control: the command lies beyond the surface.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 @dataclass(frozen=True)
 class ExpertCfg:
-    """How the expert moves; offsets are drawn per demonstration."""
+    """How the expert moves; offsets are sampled per demonstration."""
 
     rate: float = 50.0
     """Rate of the commands [Hz]."""
@@ -63,7 +63,7 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
         cfg: The script.
         start: Tool centre point at time 0 [m], shape (3,).
         open_width: Control value of the open gripper [m].
-        rng: Source of the drawn offsets.
+        rng: Generator of the sampled offsets.
     """
     half = scene.block_size / 2
     block = np.array([*scene.block_position, half + cfg.grip_height])

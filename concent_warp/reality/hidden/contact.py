@@ -16,21 +16,22 @@ FADE = 0.05
 """Turning speed below which torsional and rolling friction fade [rad/s]."""
 
 
-def drawn_friction(rig: Rig) -> float:
-    """Return the coefficient of sliding that the drawing gives the surface [-]."""
+def nominal_friction(rig: Rig) -> float:
+    """Return the nominal coefficient of sliding friction of the surface [-]."""
     return float(rig.scene.model.geom(rig.surface).friction[0])
 
 
 def instead(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
     """Return the effect of other coefficients of sliding, which may depend on time and place.
 
-    Where the world rubs by a law of its own, only what is missing is added: friction is linear in the coefficients.
+    If Reality computes friction by its own formula, only the difference is added: friction is linear in the
+    coefficients.
     """
     if rig.physics.force is None:
         geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in own_geoms(rig)))
         edit = partial(frictionless, geoms=geoms)
         return HiddenEffect(name, edit=edit, force=rub(coefficients, rig.body, rig.surface))
-    mu = drawn_friction(rig)
+    mu = nominal_friction(rig)
     return HiddenEffect(name, force=rub(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
 
 
@@ -47,7 +48,7 @@ def sliding_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def anisotropic_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction along the surface's y is that along x times a ratio [-]."""
-    mu = drawn_friction(rig) * np.array([1.0, magnitude])
+    mu = nominal_friction(rig) * np.array([1.0, magnitude])
     effect = instead(rig, "anisotropic_friction", lambda _t, _p: mu)
     return HiddenEffectOfRig("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
 
@@ -55,11 +56,11 @@ def anisotropic_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffect:
     """Return a torque of `magnitude` [m] times the normal force against turning about the normal, or across it.
 
-    Friction against the other way of turning is as drawn. Both are laws of the world's own: MuJoCo's contacts, which
-    have one cone for sliding and turning and a least coefficient, take part in neither.
+    Friction against rotation about the other axes is nominal. Both torques are computed here, not by MuJoCo's contacts,
+    which have one cone for sliding and rotation and a smallest coefficient.
     """
-    drawn = rig.scene.model.geom(rig.surface).friction[1:]
-    about, across = (drawn[0], magnitude) if rolling else (magnitude, drawn[1])
+    nominal = rig.scene.model.geom(rig.surface).friction[1:]
+    about, across = (nominal[0], magnitude) if rolling else (magnitude, nominal[1])
 
     def edit(spec: mujoco.MjSpec) -> None:
         for geom in (spec.geom(rig.surface), *spec.body(rig.body).geoms):
@@ -91,8 +92,8 @@ def rolling_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def contact_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another damping ratio [-] of the contact, and a time constant that goes with its root."""
-    drawn = rig.scene.model.geom(rig.surface).solref
-    time_constant = float(drawn[0] * np.sqrt(magnitude / drawn[1]))
+    nominal = rig.scene.model.geom(rig.surface).solref
+    time_constant = float(nominal[0] * np.sqrt(magnitude / nominal[1]))
 
     def edit(spec: mujoco.MjSpec) -> None:
         for geom in (spec.geom(rig.surface), *spec.body(rig.body).geoms):
@@ -134,7 +135,7 @@ def grip_force(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def pad_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another coefficient of the pads on what they hold [-]."""
+    """Another friction coefficient of the pads on the grasped object [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name in rig.pads:

@@ -79,7 +79,7 @@ def actuator_lag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Every drive's force is that of the drawing times a factor [-]."""
+    """The force of every drive is the nominal one times a factor [-]."""
     found = drives(rig)
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -87,7 +87,7 @@ def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
             actuator = spec.actuator(d.actuator)
             actuator.gainprm = magnitude * np.array(actuator.gainprm)
             actuator.biasprm = magnitude * np.array(actuator.biasprm)
-            # What makes up for the drawing's step in damping goes with the damping.
+            # The armature that compensates the nominal time step is proportional to the damping.
             spec.joint(d.joint).armature += (magnitude - 1.0) * rig.physics.armature.get(d.joint, 0.0)
 
     truth = each("gain", names(found), np.full(len(found), magnitude))
@@ -104,7 +104,7 @@ def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
             spec.actuator(d.actuator).forcerange = [-limit, limit]
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        # At its limit a drive does not damp, so what makes up for the drawing's step in damping is taken back.
+        # At its limit a drive does not damp, so the armature that compensates the nominal time step is removed.
         for d in found:
             joint, command = model.joint(d.joint), data.ctrl[model.actuator(d.actuator).id]
             dof = joint.dofadr[0]

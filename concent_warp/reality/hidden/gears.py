@@ -1,9 +1,9 @@
-"""Hidden effects between motor and link: play and springs.
+"""Hidden effects between motor and link: backlash and compliance.
 
-The servo drives a rotor without mass, of angle r, that stands between it and the link of angle q, against T, which is
-what gets through to the link: K (r - q) through a spring; through play nothing until the rotor is at one of its ends,
-and from then on what the servo exerts, as long as it pushes that way. In the play the rotor goes to the command u by
-kp (u - r) = kv dr/dt. The simulator's own servo is switched off.
+The servo drives a massless rotor of angle r against the transmitted torque T on the link of angle q: K (r - q) through
+a spring; with backlash zero within the play, and at one of its ends the servo's torque, as long as it acts in that
+direction. Within the play the rotor moves to the command u by kp (u - r) = kv dr/dt. The simulator's own servo is
+switched off.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a hidden effect is, and what a rig offers to hide it in."""
+"""A hidden effect of a rig, and the drives and bodies of rigs that effects act on."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from concent_warp.reality.world import HiddenEffect
 
 @dataclass(frozen=True)
 class HiddenEffectOfRig:
-    """An effect hidden in a rig, and what it is."""
+    """A hidden effect of a rig with its true parameters."""
 
     name: str
-    """Canonical name of the effect; of one outside the library, what it is."""
+    """Canonical name of the effect."""
     effect: HiddenEffect
     truth: Mapping[str, float] = field(default_factory=dict)
-    """True values of its parameters, by name with the joint, drive or sensor in brackets where there are several."""
+    """True values of the parameters by name, with the joint, drive or sensor in brackets if there are several."""
     target: tuple[str, ...] = ()
-    """Joints, drives, bodies or sensors that it acts on; those of no effect here stay without it."""
+    """Joints, drives, bodies or sensors that it acts on; empty for an effect that the library lacks."""
 
 
 Builder = Callable[[Rig, float], HiddenEffectOfRig]

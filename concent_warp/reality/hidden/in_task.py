@@ -1,7 +1,7 @@
-"""Hidden effects in the world in which a policy is tried: the same as in the rigs, about a task's own scene.
+"""Hidden effects in Reality for a policy: those of the rigs, applied to a task's scene.
 
-Left out are those that the policy would not meet: of instruments, which it does not look through (wrong zeros of joints
-among them), of a table on which the object of a rig slides, of air about shapes that are drawn, and what adds bodies.
+Excluded are effects that do not act on a policy: of sensors, since it observes the exact state (wrong joint zeros among
+them), of the table under a sliding object, of air, and effects that add bodies.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
 
-MET: tuple[str, ...] = (
+APPLICABLE: tuple[str, ...] = (
     *JOINTS,
     *(name for name in DRIVES if name != "joint_offset"),
     *GEARS,
@@ -35,15 +35,15 @@ MET: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class TaskWorld:
-    """The stand-in world of a task's scene, with effects hidden in it."""
+    """Reality for a task's scene, with hidden effects."""
 
     scene: Scene
-    """The drawing."""
+    """The nominal scene."""
     physics: WorldCfg
     body: str
-    """The object that is handled, which effects on a body act on."""
+    """The manipulated object, on which effects on a body act."""
     grippers: tuple[str, ...] = ()
-    """Actuators that hold it."""
+    """Actuators that grasp it."""
     wanted: tuple[tuple[str, float], ...] = ()
     """Names of the hidden effects with their magnitudes, in the unit of their main parameter."""
 
@@ -55,7 +55,7 @@ class TaskWorld:
             )
 
     def rig(self) -> Rig:
-        """Return what the effects are made for."""
+        """Return the rig for which the effects are made."""
         m = self.scene.model
         return Rig(
             "task",
@@ -74,16 +74,16 @@ class TaskWorld:
 
     def spec(self) -> mujoco.MjSpec:
         """Return the world with the effects in it."""
-        drawing, rest = self.scene.spec(), []
+        nominal, rest = self.scene.spec(), []
         for one in self.hidden():
             # The world turns boxes into chamfered ones: what an object is has to be said before.
             if one.name in OBJECTS and one.effect.edit is not None:
-                one.effect.edit(drawing)
+                one.effect.edit(nominal)
             else:
                 rest.append(one.effect)
         scene = self.scene
         if len(rest) < len(self.wanted):
-            scene = Scene.from_spec(drawing, source=scene.source)
+            scene = Scene.from_spec(nominal, source=scene.source)
         return self.physics.build(scene, tuple(rest))
 
     def compile(self) -> mujoco.MjModel:
@@ -96,7 +96,7 @@ class TaskWorld:
             return self.spec().compile()
         except (ValueError, ZeroDivisionError, mujoco.FatalError) as error:
             found = f"{', '.join(f'{name}={value:g}' for name, value in self.wanted)}: {' '.join(str(error).split())}"
-            raise ConcentError("the stand-in world cannot be built", found=found) from None
+            raise ConcentError("Reality cannot be built with these hidden effects", found=found) from None
 
 
 def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
@@ -116,8 +116,8 @@ def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
             raise ConcentError(
                 "a hidden effect is not right", expected="name=value, as in joint_friction=1.2", found=repr(text)
             )
-        if name not in MET:
-            raise ConcentError(f"no effect {name!r} can be hidden", expected=f"one of {', '.join(MET)}")
+        if name not in APPLICABLE:
+            raise ConcentError(f"no effect {name!r} can be hidden", expected=f"one of {', '.join(APPLICABLE)}")
         if name in found:
             raise ConcentError("an effect is hidden twice", found=name)
         found[name] = value

@@ -101,34 +101,34 @@ def load_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Viscous friction beyond the drawing's [N m s/rad or N s/m] of the strongest drive."""
+    """Viscous friction beyond the nominal one [N m s/rad or N s/m] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
     joints = tuple(d.joint for d in found)
-    drawn = np.array([rig.scene.model.dof_damping[rig.scene.model.joint(j).dofadr[0]] for j in joints])
+    nominal = np.array([rig.scene.model.dof_damping[rig.scene.model.joint(j).dofadr[0]] for j in joints])
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         for joint, damping in zip(joints, added, strict=True):
             dof = model.joint(joint).dofadr[0]
             data.qfrc_applied[dof] -= damping * data.qvel[dof]
 
-    truth = each("damping", joints, drawn + added)
+    truth = each("damping", joints, nominal + added)
     return HiddenEffectOfRig("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
 
 
 def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Rotor inertia beyond the drawing's [kg m^2 or kg] of the strongest drive."""
+    """Rotor inertia beyond the nominal one [kg m^2 or kg] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
     joints = tuple(d.joint for d in found)
-    drawn = np.array([rig.scene.model.dof_armature[rig.scene.model.joint(j).dofadr[0]] for j in joints])
+    nominal = np.array([rig.scene.model.dof_armature[rig.scene.model.joint(j).dofadr[0]] for j in joints])
 
     def edit(spec: mujoco.MjSpec) -> None:
         for joint, inertia in zip(joints, added, strict=True):
             spec.joint(joint).armature += inertia
 
     return HiddenEffectOfRig(
-        "armature", HiddenEffect("armature", edit=edit), each("inertia", joints, drawn + added), joints
+        "armature", HiddenEffect("armature", edit=edit), each("inertia", joints, nominal + added), joints
     )
 
 

@@ -1,4 +1,4 @@
-"""Hidden effects of the instruments: what is written is not what there was to see."""
+"""Hidden effects of the sensors: recorded values differ from the true ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hidden effects of what an object is: weight, where it sits, inertia, size, shape."""
+"""Hidden effects of an object: mass, centre of mass, inertia, size, shape."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def center_of_mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Centre of mass off the drawing's by this much along x and half as much along -y [m], body frame."""
+    """Centre of mass displaced from the nominal one by this much along x and half as much along -y [m], body frame."""
     shift = magnitude * np.array([1.0, -0.5, 0.0])
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -56,7 +56,7 @@ def size(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def contact_geometry(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A box that is wider on one side [m], with worn edges; mass and inertia are those of the drawing."""
+    """A box that is wider on one side [m], with worn edges; mass and inertia are nominal."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)

@@ -1,11 +1,11 @@
-"""Hidden physics that no library has: cogging, a cable, a magnet, a rough patch, warming up, slosh, failures."""
+"""Hidden effects that the library lacks: cogging, a cable, a magnet, a rough patch, warming up, slosh, failures."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.contact import drawn_friction, instead
+from concent_warp.reality.hidden.contact import instead, nominal_friction
 from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, drives, fixed_inertia
 from concent_warp.reality.hidden.joints import Level, friction
 from concent_warp.reality.rigs.rig import Rig
@@ -53,7 +53,7 @@ def cable(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def data_at_rest(rig: Rig) -> mujoco.MjData:
-    """Return the drawing in its initial state."""
+    """Return data of the nominal model in its initial state."""
     model = rig.scene.model
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -66,7 +66,7 @@ def cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
 
 
 def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A magnet under the table that draws the body sideways [N] when it is near."""
+    """A magnet under the table that pulls the body sideways [N] when it is near."""
     reach = 0.05
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -79,7 +79,7 @@ def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A place on the table where friction is other by a coefficient [-]."""
-    mu, radius = drawn_friction(rig), 0.05
+    mu, radius = nominal_friction(rig), 0.05
 
     def coefficients(time: float, point: np.ndarray) -> np.ndarray:
         del time

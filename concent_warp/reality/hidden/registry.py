@@ -1,6 +1,7 @@
 """Every hidden effect by name.
 
-Each is made by means of its own, so that finding it is not reading the same code backwards.
+Each is implemented independently of the library's effect of that name, so that a diagnosis does not invert its own
+code.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from concent_warp.reality.hidden.surroundings import WORLD
 from concent_warp.reality.rigs.rig import Rig
 
 INSIDE: dict[str, Builder] = {**JOINTS, **DRIVES, **GEARS, **OBJECTS, **CONTACT, **WORLD, **MEASUREMENT}
-"""Effects that a library of effects has, by canonical name."""
+"""Effects that the library has, by canonical name."""
 EVERY: dict[str, Builder] = {**INSIDE, **OUTSIDE}
 
 
 def hidden(name: str, magnitude: float, rig: Rig) -> HiddenEffectOfRig:
-    """Return an effect to be hidden in a rig.
+    """Return a hidden effect of a rig.
 
     Args:
         name: Canonical name, or one of `OUTSIDE`.
         magnitude: Value of its main parameter, in the parameter's unit.
-        rig: Where.
+        rig: The rig.
 
     Raises:
-        KeyError: There is no such effect.
+        KeyError: The name is unknown.
     """
     return EVERY[name](rig, magnitude)

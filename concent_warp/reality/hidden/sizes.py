@@ -1,10 +1,10 @@
 """How large each hidden effect is on each rig: small, middle and large, as values of its main parameter.
 
-The middle size leaves a residual of about four standard deviations of the noise in the channels concerned when the
-drawing is replayed (two to three where the start of a throw, refitted, takes some of it), the large one two to three
-times that, the small one half. The limit of saturation is in units of `hidden_drives.strain` of the motion at hand, for
-what one motion never asks of a drive another does all the time. Where grip is lost there is nothing in between, so
-sizes lie closer together.
+With the middle size, a replay of the nominal model has residuals of about four standard deviations of the noise in the
+channels concerned (two to three for throws, whose refitted start absorbs a part), with the large size two to three
+times as much, with the small size half as much. The limit of saturation is in units of `drives.strain` of the motion,
+since motions differ in the forces that they require. Sizes of grip effects lie closer together, since a grasp is kept
+or lost.
 """
 
 from __future__ import annotations

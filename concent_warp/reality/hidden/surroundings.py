@@ -1,6 +1,6 @@
 """Hidden effects of the surroundings: a table that is not level, air.
 
-Air: quadratic drag 0.5 rho C A |v - w| (v - w) of the body's velocity against the wind, A the area of its shadow, and
+Air: quadratic drag 0.5 rho C A |v - w| (v - w) of the body's velocity against the wind, A its projected area, and
 the lift 0.5 rho V omega x v of a spinning body (the coefficient of Auton, J. Fluid Mech. 183, 1987).
 """
 

@@ -15,7 +15,7 @@ SWING = (0.7, 0.45, 0.6, 0.5, 0.8, 0.6, 0.9)
 """How far each joint sweeps [rad]."""
 
 
-def _drawing() -> Scene:
+def _nominal_scene() -> Scene:
     """Return the arm alone, with the pose of its hand tracked."""
     spec = panda()
     spec.modelname = "arm"
@@ -49,5 +49,5 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     return RigTrial(DURATION, action, qpos=qpos, settle=0.5)
 
 
-SCENE = _drawing()
+SCENE = _nominal_scene()
 ARM = Rig("arm", SCENE, _plan, of_coarser_step(SCENE), start="resting", body="link7", grippers=("gripper",))

@@ -73,7 +73,7 @@ XML = f"""
 </mujoco>
 """
 LOW = -0.008
-"""Height of the hand in the grasp, against the drawing's [m]."""
+"""Height of the hand in the grasp, relative to the nominal one [m]."""
 
 
 def _plan(rng: np.random.Generator, k: int) -> RigTrial:
@@ -90,8 +90,8 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     command = {"drive_x": np.concatenate(x), "drive_z": np.concatenate(z)}
     count = len(command["drive_x"])
     grip = [hold(OPEN, 0.3), glide(OPEN, CLOSED, 0.7)]
-    held = count - sum(map(len, grip)) - round(0.7 * RATE)
-    grip += [hold(CLOSED, held / RATE), glide(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
+    closed = count - sum(map(len, grip)) - round(0.7 * RATE)
+    grip += [hold(CLOSED, closed / RATE), glide(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
     command["gripper"] = np.concatenate(grip)
     time = np.arange(count) / RATE
     place = rng.uniform(-0.003, 0.003, 2)

@@ -1,4 +1,4 @@
-"""The shape sorter by the scripted expert as a rig: its recorder is that of `concent_warp.reality.record`."""
+"""The shape sorter as a rig, demonstrated by the scripted expert of `concent_warp.reality.record`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg
 TASK = ShapeSorterCfg(timestep=0.002)
 
 
-def _drawing() -> Scene:
-    """Return the scene with objects as hard as time steps allow."""
+def _nominal_scene() -> Scene:
+    """Return the scene with contacts as stiff as the time step allows."""
     spec = TASK.build().spec()
     for body in ("block", "box"):
         for geom in spec.body(body).geoms:
@@ -30,13 +30,13 @@ def _drawing() -> Scene:
 
 
 def _unplanned(rng: np.random.Generator, k: int) -> RigTrial:
-    """The expert plans for himself."""
+    """Raise: the scripted expert plans the motion."""
     del rng, k
     raise NotImplementedError("insertions are recorded by the scripted expert")
 
 
 def _record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed: int) -> Recording:
-    """Record the expert; one seed of his own for each demonstration."""
+    """Return a recording of the expert, with one seed for each demonstration."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for joint, armature in PHYSICS.armature.items():
@@ -50,20 +50,20 @@ def _record_insertion(effects: Sequence[HiddenEffect], demonstrations: int, seed
     )
     seeds = [1000 * seed + k for k in range(demonstrations)]
     recording, _ = record(cfg, seeds, effects=(HiddenEffect("finer step", edit=edit), *effects))
-    told = [
+    shifted = [
         replace(d, measured={name: _earlier(channel) for name, channel in d.measured.items()}, points={}, success=None)
         for d in recording.demonstrations
     ]
-    return Recording(SCENE.xml, tuple(told), source="reality rig insertion")
+    return Recording(SCENE.xml, tuple(shifted), source="reality rig insertion")
 
 
 def _earlier(channel: Channel) -> Channel:
-    """Return measurements as if commands had acted early by the lead of coarser steps; the first of them is lost."""
+    """Return measurements shifted by the lead of the nominal time step; readings before time 0 are removed."""
     time = channel.time - PHYSICS.lead
     return replace(channel, time=time[time >= 0], value=channel.value[time >= 0])
 
 
-SCENE = _drawing()
+SCENE = _nominal_scene()
 PHYSICS = of_coarser_step(SCENE)
 INSERTION = Rig(
     "insertion",

@@ -1,4 +1,4 @@
-"""A servo of Dynamixel's size swings a payload on a 0.1 m arm; it hangs at angle 0. Encoder and tracker look on."""
+"""A servo of Dynamixel's size swings a payload on a 0.1 m arm; it hangs at angle 0. Encoder and tracker measure it."""
 
 from __future__ import annotations
 

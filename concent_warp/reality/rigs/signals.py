@@ -1,4 +1,4 @@
-"""Commands that excite what a machine may hide: sweeps at constant speed, chirps, slow reversals, holds."""
+"""Command profiles that excite hidden effects: sweeps at constant speed, chirps, slow reversals, constants."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def _glossy(spec: mujoco.MjSpec) -> None:
 
 
 def _coulomb(time: float, point: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the drawing, everywhere and always."""
+    """Return the nominal coefficients, independent of time and position."""
     del time, point
     return np.array([FRICTION, FRICTION])
 

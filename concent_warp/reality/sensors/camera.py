@@ -1,4 +1,4 @@
-"""The stand-in's depth camera: frames from MuJoCo-Warp's ray tracer, with the noise of a real one."""
+"""Depth camera of Reality: frames of MuJoCo-Warp's ray tracer with sensor noise."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def film(
 
     Args:
         sensing: The camera.
-        world: The stand-in world.
+        world: Reality.
         bodies: Bodies that carry a pattern.
         time: Times of the frames [s], shape (T,).
         qpos: States of the world at these times, shape (T, nq).

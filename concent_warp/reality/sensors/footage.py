@@ -1,4 +1,4 @@
-"""What several cameras see of the stand-in's laboratory, fixed or on the robot's wrist."""
+"""Colour images of several cameras in Reality, fixed or on the robot's wrist."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VIGNETTE = 0.22
 
 @dataclass(frozen=True)
 class FootageCfg:
-    """Cameras that see the laboratory as it looks."""
+    """Settings of colour cameras in Reality."""
 
     cameras: tuple[str, ...] = ()
     """Cameras whose frames are recorded: base and wrist, or such as the scene has; none by default."""
@@ -31,7 +31,7 @@ class FootageCfg:
     rate: float = 10.0
     """Frames a second."""
     objects: bool = True
-    """Whether the objects are seen. Without them, the frames are for learning what robot and background look like."""
+    """Whether the objects are visible. Frames without them are for training the appearance of robot and background."""
     noise: float = 2.0
     """Noise of the colours, in steps of 1/255."""
     samples: int = 2
@@ -46,11 +46,11 @@ def footage(
     qpos: np.ndarray,
     rng: np.random.Generator,
 ) -> dict[str, ImageStream]:
-    """Return the frames that each camera takes of a motion; they hold no depth.
+    """Return the frames of each camera along a motion, without depth.
 
     Args:
         cfg: The cameras.
-        world: The stand-in world.
+        world: Reality.
         objects: Names of the objects' bodies.
         time: Times of the frames [s], shape (T,).
         qpos: States of the world at these times, shape (T, nq).

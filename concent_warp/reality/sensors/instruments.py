@@ -1,7 +1,7 @@
-"""What the instruments of the rigs read: encoders and a pose tracker, each channel by a clock of its own.
+"""Sensors of the rigs: encoders and a pose tracker, with a separate clock for each channel.
 
-The noise is white, with a small slow part besides: a tracker's bias wanders as the light and the view change, an
-encoder's with the angle. `noise_std` of a channel is the root mean square of both together.
+The noise is white with a small slow component: the bias of a tracker drifts with light and view, that of an encoder
+with the angle. `noise_std` of a channel is the root mean square of both.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Instruments:
-    """The instruments of a laboratory, by what they measure."""
+    """Instruments by measured quantity."""
 
     angle: Instrument = field(default_factory=lambda: Instrument(200.0, 7e-4, 1e-4))
     """Encoder of a hinge [rad]."""

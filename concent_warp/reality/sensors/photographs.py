@@ -1,4 +1,4 @@
-"""Photographs of one object of the stand-in world from all sides, as one takes them to make a model of its looks."""
+"""Photographs of one object of Reality from all sides, for Gaussian splats."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ class Photographs(NamedTuple):
 
 
 def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = None, *, seed: int = 0) -> Photographs:
-    """Photograph a body of the stand-in world, its pattern on it, all other bodies out of the way.
+    """Photograph a body of Reality with its speckle pattern, without other bodies.
 
     Args:
-        world: the stand-in world.
+        world: Reality.
         body: name of the object.
         cfg: how.
         seed: of the noise.

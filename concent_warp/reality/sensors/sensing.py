@@ -1,4 +1,4 @@
-"""What the stand-in's instruments see: encoders, a pose tracker, and surface points tracked by one camera."""
+"""Sensors of Reality: encoders, a pose tracker, and surface points tracked by a camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 
 SLACK = 2e-3
-"""How far before a point a surface may be and still count as the one the point is on [m]."""
+"""Distance of a surface in front of a point below which the point counts as visible [m]."""
 
 
 @dataclass(frozen=True)

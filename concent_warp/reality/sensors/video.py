@@ -1,4 +1,4 @@
-"""Videos of what happened in the stand-in world, by the ray tracer of its camera: neither display nor OpenGL needed."""
+"""Videos of Reality by the ray tracer of its camera; they need neither display nor OpenGL."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from concent_warp.reality.sensors.sensing import SensingCfg
 SIZE = (240, 320)
 """Height and width of a frame [pixels]."""
 ASIDE = (0.57, -0.43, 0.63)
-"""Where the camera stands, seen from what it looks at [m]."""
+"""Position of the camera relative to its target [m]."""
 FOVY = 22.0
 """Vertical field of view [degrees]."""
 LAMP = (0.2, -0.4, 1.5)
@@ -28,8 +28,8 @@ def filmed(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray, peri
     """Return frames of a motion, uint8, shape (T, H, W, 3).
 
     Args:
-        world: The stand-in world.
-        bodies: Objects; the camera looks at the middle of where they are at first.
+        world: Reality.
+        bodies: Objects; the camera is aimed at the mean of their initial positions.
         qpos: States, shape (T, nq).
         period: Time between them [s].
     """
