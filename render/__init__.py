@@ -1,1 +1,1 @@
-"""Images of rollouts. Empty in this version."""
+"""Images of rollouts: simulated, painted by networks, composed with Gaussian splats; data sets of them."""

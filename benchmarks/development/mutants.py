@@ -75,7 +75,8 @@ def operators() -> dict[str, Any]:
     from cosmic_ray.operators.provider import OperatorProvider
 
     provider = OperatorProvider()
-    return {name: provider[name]() for name in provider if _is_used(name)}
+    kinds: dict[str, Any] = {name: provider[name] for name in provider if _is_used(name)}
+    return {name: kind() for name, kind in kinds.items()}
 
 
 def _is_used(name: str) -> bool:
@@ -154,7 +155,8 @@ def mutated(code: str, mutant: Mutant) -> str:
                 self.count += 1
             return node
 
-    return Change().walk(_tree(code)).get_code()
+    changed: Any = Change().walk(_tree(code))
+    return changed.get_code()
 
 
 def changed_lines(code: str, other: str) -> tuple[str, str]:

@@ -39,7 +39,7 @@ class Calls:
         self._root = str(root) + "/"
         self.found: set[str] = set()
         self._names: dict[CodeType, str | None] = {}
-        if hasattr(sys, "monitoring"):
+        if sys.version_info >= (3, 12):
             monitoring = sys.monitoring
             monitoring.use_tool_id(monitoring.COVERAGE_ID, "mutation")
             monitoring.register_callback(monitoring.COVERAGE_ID, monitoring.events.PY_START, self._on_start)
@@ -63,13 +63,13 @@ class Calls:
 
     def _restart(self) -> None:
         """Note functions again that were noted before."""
-        if hasattr(sys, "monitoring"):
+        if sys.version_info >= (3, 12):
             sys.monitoring.restart_events()
 
     def _on_start(self, code: CodeType, _offset: int) -> Any:
         """Note the start of a function once."""
         self._note(code)
-        return sys.monitoring.DISABLE
+        return sys.monitoring.DISABLE if sys.version_info >= (3, 12) else None
 
     def _on_profile(self, frame: Any, event: str, _arg: Any) -> None:
         """Note a call."""

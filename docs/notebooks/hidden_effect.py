@@ -58,6 +58,7 @@ for channel in comparison.channels:
 diagnosis = cw.diagnose(nominal, recording)
 print(diagnosis.headline)
 print(*diagnosis.sentences(), sep="\n")
+diagnosis
 
 # %%
 first = [finding for finding in diagnosis.effects if finding.step == 0][:6]
@@ -90,6 +91,7 @@ comparison = cw.compare({"nominal": nominal, "with friction": fitted.model}, rec
 for channel in comparison.channels:
     before, after = (comparison.summarise(model, channel).ratio for model in comparison.models)
     print(f"{channel}: {before:.1f} -> {after:.1f} x noise, {comparison.difference(channel).verdict}")
+comparison  # Jupyter shows it as a table
 
 # %%
 figure, axes = plt.subplots(figsize=(7, 2.6), layout="constrained")
