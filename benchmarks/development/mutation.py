@@ -243,7 +243,7 @@ def tried(worker: Worker, mutant: Mutant, selection: Selection, args: Args) -> d
     row |= {"tests": len(tests)}
     if not tests:
         return {**row, "outcome": "survived", "seconds": 0.0}
-    reply = worker.ask(file=mutant.file, code=other, tests=tests, timeout=30 + 4 * seconds, each=int(30 + 4 * seconds))
+    reply = worker.ask(file=mutant.file, code=other, tests=tests, timeout=60 + 8 * seconds, each=int(60 + 8 * seconds))
     outcome = {"passed": "survived", "failed": "killed"}.get(reply["outcome"], reply["outcome"])
     return {**row, "outcome": outcome, "by": reply.get("failed"), "seconds": reply["seconds"]}
 
