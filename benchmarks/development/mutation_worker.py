@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import compileall
 import importlib
+import importlib.util
 import json
 import os
 import signal
@@ -193,9 +194,19 @@ def forked(request: dict[str, Any], root: Path, folder: Path) -> dict[str, Any]:
     return json.loads(answer.read_text()) | {"seconds": seconds}
 
 
+def check_origin(root: Path) -> None:
+    """End with a sentence where the library would be imported from elsewhere than the copy."""
+    for name in ("concent_warp", *(f"concent_warp.{folder}" for folder in LINKED)):
+        spec = importlib.util.find_spec(name)
+        if spec is None or not str(spec.origin).startswith(f"{root}/"):
+            found = None if spec is None else spec.origin
+            raise SystemExit(f"{name} is imported from {found}, not from {root}: remove import hooks that redirect it")
+
+
 def main() -> None:
     """Answer requests until standard input ends; the working folder is the copy."""
     root, folder = Path.cwd(), Path(sys.argv[1])
+    check_origin(root)
     for name in TOP:
         compileall.compile_dir(root / name, quiet=2)
     for name in LARGE:

@@ -166,3 +166,14 @@ def test_the_true_geometry_scores_best(drop, swollen):
     objective = Objective(MujocoEngine(swollen), segments, held_out=0.0, block=0.2)
     losses = objective(Candidates(np.stack([corner_spheres(h).position for h in halves])))
     assert losses.fit[1] < 0.2 * min(losses.fit[0], losses.fit[2])
+
+
+def test_a_fit_that_is_not_resumed_begins_anew_beside_a_checkpoint(drop, swollen, tmp_path):
+    cfg = replace(CFG, generations=1)
+    for _ in range(2):
+        found = fit_geometry(swollen, drop, cfg, engine="mujoco", out=tmp_path)
+        assert len(found.history) == 1
+    seconds = found.history[0]["seconds"]
+    again = fit_geometry(swollen, drop, cfg, engine="mujoco", out=tmp_path)
+    assert again.history[0]["seconds"] != seconds
+    assert fit_geometry(swollen, drop, cfg, engine="mujoco", out=tmp_path, resume=True).history == again.history
