@@ -1,4 +1,4 @@
-"""Cameras by their calibration: those of a recording, of the scene that renders for it, and beside trained networks."""
+"""Calibrated cameras: of a recording, of a scene, and of trained networks."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from concent_warp.recording.recording import ImageStream
 from concent_warp.scene.scene import Scene
 
 CENTRED = 0.02
-"""How far the principal point may be from the middle, as a share of the image."""
+"""Largest accepted offset of the principal point from the centre, as a share of the image."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera without distortion, its principal point in the middle."""
+    """A camera without distortion and with a centred principal point."""
 
     name: str
     body: str | None
-    """Body that carries it; None where it is fixed in the world."""
+    """Body that carries it; None if it is fixed in the world."""
     position: tuple[float, float, float]
-    """Place [m] in the body's frame or the world's."""
+    """Position [m] in the frame of the body or the world, shape (3,)."""
     quaternion: tuple[float, float, float, float]
-    """Orientation wxyz there, looking along -z with y up, as MuJoCo has it."""
+    """Orientation wxyz in that frame; the camera looks along -z with y up, as in MuJoCo."""
     fovy: float
     """Vertical field of view [degrees]."""
 
@@ -82,7 +82,7 @@ class Camera:
 
 
 def place_cameras(spec: mujoco.MjSpec, cameras: Sequence[Camera]) -> None:
-    """Put cameras into a spec, in place of those of their names.
+    """Add cameras to a spec; they replace those of the same names.
 
     Raises:
         RenderError: A camera's body is not there.

@@ -1,4 +1,4 @@
-"""Episodes of many worlds on their way to a data set: rendered frame by frame, kept or dropped when they end."""
+"""Rendering of the episodes of many worlds to a data set, frame by frame; each is kept or dropped at its end."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from concent_warp.render.figure import FrameSelection
 from concent_warp.render.networks.pairs import to_bytes
 
 FILMS = "films"
-"""Folder of the videos to look at, in that of the data set."""
+"""Folder of the MP4 videos, in that of the data set."""
 
 
 class DatasetFilming:
-    """What W worlds do, as images in a data set."""
+    """Renders the episodes of W worlds to a data set."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class DatasetFilming:
         first_films: int = 0,
         rate: int = 20,
     ) -> None:
-        """Take up filming.
+        """Prepare cameras and writers.
 
         Args:
             camera: Renders the worlds.
@@ -51,7 +51,7 @@ class DatasetFilming:
         self.kept = self.dropped = 0
 
     def begin(self, keys: Sequence[int | None]) -> None:
-        """Begin an episode in each of the W worlds, by its number in the data set; None for a world that idles."""
+        """Begin an episode in each of the W worlds, by its number in the data set; None for an idle world."""
         self.camera.begin()
         for world, key in enumerate(keys):
             if key is None:
@@ -87,7 +87,7 @@ class DatasetFilming:
             film.add(np.concatenate(list(images.values()), axis=1))
 
     def end(self, world: int, *, keep: bool, success: bool = True) -> None:
-        """End the episode of a world, and keep it or not; `success` tells whether the task was done."""
+        """End the episode of a world, and keep it or not; `success` is whether the task succeeded."""
         key, episode, film = self._open.pop(world)
         if film is not None and self._films is not None:
             film.close()
@@ -100,7 +100,7 @@ class DatasetFilming:
             self.dropped += 1
 
     def leave(self) -> None:
-        """Forget the episodes that have not ended."""
+        """Discard the episodes that have not ended."""
         for key, episode, film in self._open.values():
             episode.discard()
             if film is not None:
@@ -109,6 +109,6 @@ class DatasetFilming:
         self._open.clear()
 
     def _unfinished(self, key: int) -> Path:
-        """Return the file of a video that is being made."""
+        """Return the temporary file of a video."""
         assert self._films is not None
         return self._films / f".partial-{key:06d}.mp4"

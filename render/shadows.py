@@ -60,7 +60,7 @@ class Shadows:
         self.draw()
 
     def draw(self, which: torch.Tensor | None = None) -> None:
-        """Draw new lights, for all worlds or for those of a mask (W,), say where an episode begins."""
+        """Sample new lights for all worlds or those of a mask (W,), as at the start of an episode."""
         shape = self.strengths.shape
         first, second, third = torch.rand(3, *shape, generator=self._generator)
         low, high = (math.radians(angle) for angle in self.cfg.elevation)

@@ -1,1 +1,5 @@
-"""Data sets of rendered episodes, for policies that act on images."""
+"""Data sets of rendered episodes for image policies.
+
+`layout` defines episodes and the data set that grows by them; `lerobot` and `robomimic` write the two formats; `video`
+encodes frames, `statistics` summarises channels.
+"""

@@ -1,4 +1,4 @@
-"""What episodes consist of, and the folder in which a data set grows: whole episodes wait there until they are packed.
+"""Layout of episodes, and the staging folder of a data set: complete episodes stay there until they are packed.
 
 A data set that is killed while it grows loses nothing that was saved: an episode is staged in one piece, packed files
 count only once the table of episodes names them, and staged episodes go only when it does.
@@ -19,16 +19,16 @@ import numpy as np
 from concent_warp.errors import RenderError
 
 STAGING = ".staging"
-"""Folder of the episodes that are not packed yet."""
+"""Folder of the episodes that are not packed."""
 PARTIAL = ".partial"
 
 
 @dataclass(frozen=True)
 class EpisodeLayout:
-    """What every frame of a data set holds."""
+    """Contents of every frame of a data set."""
 
     rate: int
-    """Frames a second."""
+    """Frame rate [Hz]."""
     cameras: tuple[str, ...]
     size: tuple[int, int]
     """Height and width of images [px]."""

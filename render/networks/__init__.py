@@ -1,1 +1,5 @@
-"""Flow matching and super-resolution networks."""
+"""Networks that paint robot and background: flow matching and super-resolution.
+
+`train` trains them on the image pairs of `pairs`, `painter` applies them; `flow` and `flow_network` are the flow and
+its U-Net, `super_resolution` enlarges; `cfg` has the settings.
+"""

@@ -1,4 +1,4 @@
-"""Everything that can be set about the networks that paint robot and background, and their training."""
+"""Settings of the networks that paint robot and background, and of their training."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ class NetworkTrainCfg:
 
 @dataclass(frozen=True)
 class AugmentCfg:
-    """What is done to the conditions, so that errors of what was drawn before do not grow (paper: autoregressive)."""
+    """Augmentation of the conditions, so that errors of generated images do not accumulate (paper: autoregressive)."""
 
     back: int = 5
     """How many frames older than it is the previous image may be, at most; 1 for the very frame before. A network that
     has seen such ones looks at the simulation for where the robot is."""
     blank: float = 0.3
-    """Share of the previous images that are replaced by the mean image, with which drawing begins."""
+    """Share of the previous images replaced by the mean image, the initial condition of an episode."""
     noise: float = 0.06
     """Largest deviation of noise on the previous image, of colours in -1..1."""
     colour: float = 0.1
@@ -71,7 +71,7 @@ class RenderTrainCfg:
     """Training of all networks."""
 
     seed: int = 0
-    """Seed of everything drawn at random."""
+    """Seed of all random numbers."""
     flow: NetworkTrainCfg = field(default_factory=NetworkTrainCfg)
     enlarge: NetworkTrainCfg = field(default_factory=lambda: NetworkTrainCfg(batch=16))
     """Training of the super-resolution."""
@@ -84,4 +84,4 @@ class RenderTrainCfg:
     checkpoint: float = 60.0
     """Time between checkpoints [s]."""
     half: bool = False
-    """Multiply in bfloat16, which is quicker."""
+    """Multiply in bfloat16, which is faster."""

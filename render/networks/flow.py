@@ -1,4 +1,4 @@
-"""Flow matching (Lipman et al. 2023) on straight lines from noise to image: what is learnt, and how an image is drawn.
+"""Flow matching (Lipman et al. 2023) on straight lines from noise to image: loss and sampling.
 
 Between noise x_0 and image x_1 lies x_t = (1 - t) x_0 + t x_1, whose velocity is x_1 - x_0 = (x_1 - x_t) / (1 - t). The
 network predicts x_1 (paper, appendix E: "the output is the denoised image").

@@ -1,4 +1,4 @@
-"""Robot and background as the real camera sees them: the trained networks at work, frame after frame."""
+"""Robot and background as a real camera sees them, painted frame by frame by the trained networks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Painter:
         seed: int = 0,
         half: bool = False,
     ) -> None:
-        """Take networks into use.
+        """Create the painter.
 
         Args:
             networks: Flow by camera.
@@ -49,7 +49,7 @@ class Painter:
 
     @staticmethod
     def load(folder: Path, *, device: str = "cpu", steps: int = 4, seed: int = 0, half: bool = False) -> Painter:
-        """Read what `concent render-train` wrote to a folder, the running means of the weights.
+        """Return the painter of a run folder of `concent render-train`, with the running means of the weights.
 
         Raises:
             RenderError: There is nothing of the kind.
@@ -102,7 +102,7 @@ class Painter:
         frames = []
         for c, name in enumerate(cameras):
             seen = reduced(simulated[:, c].permute(0, 3, 1, 2).to(self.device), self.size)
-            # Rounded as the images are that were learnt from.
+            # Rounded to 8 bits like the training images.
             seen = (255 * seen).round() / 127.5 - 1
             network = self.networks[name]
             pose = poses[c].to(self.device) if network.cfg.posed else None

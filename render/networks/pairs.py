@@ -1,4 +1,4 @@
-"""Pairs of images to learn from: what a real camera saw, and what the simulation shows of the same moment.
+"""Training pairs of real camera images and simulated images at the same times.
 
 The recording is of the robot alone, no objects on the table: objects are rendered by other means (paper, appendix E).
 """
@@ -22,7 +22,7 @@ from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 BATCH = 16
-"""States that are rendered at a time."""
+"""States rendered per batch."""
 
 
 @dataclass(frozen=True)

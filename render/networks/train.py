@@ -26,20 +26,20 @@ from concent_warp.render.networks.super_resolution import FACTOR, SuperResolutio
 CHECKPOINT = "checkpoint.pt"
 """File of the state of a training."""
 Report = Callable[[str, float], None]
-"""Takes a network's name and its loss, now and then."""
+"""Called with a network's name and its loss."""
 
 
 class NetworkTraining:
-    """One network on its way: weights, running mean, optimiser, steps done."""
+    """A network in training: weights, running mean, optimiser and number of steps."""
 
     def __init__(self, network: torch.nn.Module, cfg: NetworkTrainCfg) -> None:
-        """Start anew."""
+        """Create optimiser and running mean."""
         self.network, self.cfg, self.done = network, cfg, 0
         self.mean = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(cfg.ema), use_buffers=True)
         self.optimiser = torch.optim.Adam(network.parameters(), lr=cfg.learning_rate)
 
     def step(self, loss: torch.Tensor) -> None:
-        """Take a step down a loss."""
+        """Take an optimiser step on a loss."""
         self.optimiser.param_groups[0]["lr"] = self.cfg.learning_rate * self.rate()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -56,7 +56,7 @@ class NetworkTraining:
         return 0.1 + 0.45 * (1 + math.cos(math.pi * min(share, 1.0)))
 
     def state(self) -> dict[str, Any]:
-        """Return all that goes on depends on."""
+        """Return the state for a checkpoint."""
         return {
             "network": self.network.state_dict(),
             "mean": self.mean.state_dict(),
@@ -65,7 +65,7 @@ class NetworkTraining:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Bring back what `state` returned."""
+        """Set the state that `state` returned."""
         self.network.load_state_dict(state["network"])
         self.mean.load_state_dict(state["mean"])
         self.optimiser.load_state_dict(state["optimiser"])
@@ -154,7 +154,7 @@ class RenderTraining:
         return flow_loss(self.trainings[name].network, image, simulated, previous, pose, self.generator)
 
     def augmented(self, previous: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
-        """Return previous images in -1..1, shape (N, 3, S, S), some of them spoilt as drawn ones may be."""
+        """Return previous images in -1..1, shape (N, 3, S, S), some of them degraded like generated ones."""
         import kornia.augmentation as augmentation
 
         cfg = self.cfg.augment
@@ -182,7 +182,7 @@ class RenderTraining:
             v, u, edge = FACTOR * v, FACTOR * u, FACTOR * crop
             large.append(one.real[row, :, v : v + edge, u : u + edge])
         given = to_signed(torch.stack(small))
-        # What the flow draws is not as clean as what was made small.
+        # Images of the flow are noisier than downscaled ones.
         given = given + 0.02 * torch.randn(given.shape, generator=self.generator, device=self.device)
         return torch.nn.functional.l1_loss(self.trainings[ENLARGE].network(given), to_signed(torch.stack(large)))
 
@@ -191,7 +191,7 @@ class RenderTraining:
         return int(torch.randint(count, (), generator=self.generator, device=self.device))
 
     def save(self) -> None:
-        """Write a checkpoint, in one piece or not at all."""
+        """Write a checkpoint atomically."""
         if self.folder is None:
             return
         state = {
@@ -209,7 +209,7 @@ class RenderTraining:
         partial.replace(self.folder / CHECKPOINT)
 
     def resume(self) -> None:
-        """Go on from the folder's checkpoint.
+        """Restore the folder's checkpoint.
 
         Raises:
             RenderError: It was begun with other settings, or of other cameras.
@@ -237,7 +237,7 @@ class RenderTraining:
 ENLARGE = "super-resolution"
 """Name of the network that no camera has."""
 FREE = ("checkpoint",)
-"""Settings that do not decide the result."""
+"""Settings that do not affect the result."""
 
 
 def network_of(cfg: FlowNetworkCfg, camera: Camera) -> FlowNetworkCfg:

@@ -1,1 +1,5 @@
-"""Gaussian splats: rasterisation and fit."""
+"""Gaussian splats of objects.
+
+`splats` holds and stores them, `rasterise` renders them, `fit` optimises them from the images of `views` and the
+initial points of `initial`; `cfg` has the settings.
+"""

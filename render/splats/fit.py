@@ -42,7 +42,7 @@ STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Score:
-    """How close the splats come to one image."""
+    """Errors of the splats on one image."""
 
     view: int
     psnr: float
@@ -52,7 +52,7 @@ class Score:
 
 
 class SplatFit:
-    """A fit that is going on.
+    """A fit in progress.
 
     Args:
         views: posed images.
@@ -87,7 +87,7 @@ class SplatFit:
         self._begin(dict(zip(NAMES, values, strict=True)), {})
 
     def _begin(self, values: dict[str, torch.Tensor], moments: dict[str, torch.Tensor]) -> None:
-        """Take parameters, and Adam's moments of them, as the present state."""
+        """Set parameters and their Adam moments."""
         rates = self.cfg.rates
         rate = {"quats": rates.quats, "scales": rates.scales, "opacities": rates.opacities, "constant": rates.colour}
         rate |= {"means": 0.0, "rest": rates.colour / 10}  # that of the means falls, see `step`
@@ -113,13 +113,13 @@ class SplatFit:
         return len(self.parameters["means"])
 
     def splats(self) -> Splats:
-        """Return the splats as they are, differentiable."""
+        """Return the present splats, differentiable."""
         p = self.parameters
         harmonics = torch.cat([p["constant"], p["rest"]], dim=1)
         return Splats(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), harmonics)
 
     def learn(self, report: Report | None = None, checkpoint: Path | None = None) -> Splats:
-        """Go on to the end, writing a checkpoint now and then, and return the splats."""
+        """Run the remaining steps with periodic checkpoints, and return the splats."""
         saved = time.monotonic()
         while self.iteration < self.cfg.iterations:
             loss = self.step()
@@ -165,7 +165,7 @@ class SplatFit:
         return loss
 
     def _which(self) -> torch.Tensor:
-        """Return the images of this step: all in turn, in an order that changes from round to round."""
+        """Return the images of this step: all in turn, in a new random order for each pass."""
         taken = np.arange(self.cfg.views) + self.iteration * self.cfg.views
         count = len(self.fitted)
         orders = {r: np.random.default_rng([self.cfg.seed, r]).permutation(count) for r in np.unique(taken // count)}
@@ -179,7 +179,7 @@ class SplatFit:
 
     @torch.no_grad()
     def reshape(self) -> None:
-        """Split the Gaussians that pull hardest in two, and take out the faint and the overgrown."""
+        """Split the Gaussians with the largest gradients, and remove transparent and oversized ones."""
         p = self.parameters
         longest, axis = p["scales"].max(dim=1)
         kept = (p["opacities"].sigmoid() > self.cfg.faint) & (longest.exp() < 0.5 * self._extent)
@@ -236,12 +236,12 @@ class SplatFit:
         return (255 * seen.clamp(0, 1)).round().byte().cpu().numpy()
 
     def signature(self) -> int:
-        """Return a number that tells the images apart from others."""
+        """Return a checksum of the images."""
         parts = (self.views.rgba, self.views.poses, self.views.intrinsics)
         return zlib.crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
 
     def save(self, path: Path) -> None:
-        """Write all that is needed to go on, in one piece or not at all."""
+        """Write a checkpoint atomically."""
         content: dict[str, Any] = {"iteration": self.iteration, "room": self._room, "signature": self.signature()}
         content |= {name: value.detach().cpu().numpy() for name, value in self.parameters.items()}
         for name, value in self.parameters.items():
@@ -254,7 +254,7 @@ class SplatFit:
         partial.replace(path)
 
     def resume(self, path: Path) -> None:
-        """Go on from what `save` wrote.
+        """Return the fit of a checkpoint that `save` wrote.
 
         Raises:
             RenderError: the file is broken, or belongs to a fit of other images.

@@ -1,4 +1,4 @@
-"""Where a fit of splats begins: points of a mesh or a cloud, or of the hull that the masks of the images agree on."""
+"""Initial splats of a fit: points of a mesh or a point cloud, or of the visual hull of the image masks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CELLS = 72
 SURE = 128
 """Least alpha of a pixel that shows the object."""
 OPACITY = 0.3
-"""Opacity at first."""
+"""Initial opacity."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -40,7 +40,7 @@ def read_start(path: Path, count: int, scale: float, rng: np.random.Generator) -
 
 
 def _thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return at most `count` of the points, drawn at random."""
+    """Return at most `count` randomly sampled points."""
     return points if len(points) <= count else points[rng.choice(len(points), count, replace=False)]
 
 
@@ -59,7 +59,7 @@ def _within(views: SplatViews, pixels: np.ndarray, depth: np.ndarray) -> np.ndar
 
 
 def visual_hull(views: SplatViews, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return points on the surface of what all masks agree on [m], at most `count`, shape (n, 3).
+    """Return points on the surface of the visual hull of all masks [m], at most `count`, shape (n, 3).
 
     Raises:
         RenderError: there are no masks, or they have no volume in common.

@@ -39,7 +39,7 @@ class SplatViews:
     intrinsics: np.ndarray
     """Pinhole matrices [px], (0, 0) the centre of the first pixel, shape (V, 3, 3)."""
     masked: bool
-    """Whether alpha tells the object from its background."""
+    """Whether alpha separates the object from the background."""
 
     def __len__(self) -> int:
         return len(self.rgba)
