@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.estimation.object_tracks import BodyTarget, Segment, measured_pose, observed_poses, whole
+from concent_warp.estimation.object_tracks import (
+    BodyTarget,
+    Segment,
+    measured_pose,
+    observed_poses,
+    whole_demonstration,
+)
 from concent_warp.estimation.state_estimator import StateEstimator
-from concent_warp.estimation.windows import windows
+from concent_warp.estimation.windows import cut_windows
 from concent_warp.model import Model
 from concent_warp.recording.formats.contactnets import EDGE
 from concent_warp.recording.recording import Recording
@@ -90,8 +96,8 @@ class Judge:
     def __init__(self, recording: Recording, window: float) -> None:
         """Cut all tosses into windows of a length [s]."""
         self.scene = scene_of(recording, EDGE)
-        self.windows = {d.name: windows(self.scene, d, (BODY,), window) for d in recording.demonstrations}
-        self.whole = {d.name: whole(self.scene, d, (BODY,)) for d in recording.demonstrations}
+        self.windows = {d.name: cut_windows(self.scene, d, (BODY,), window) for d in recording.demonstrations}
+        self.whole = {d.name: whole_demonstration(self.scene, d, (BODY,)) for d in recording.demonstrations}
 
     def __call__(self, geometries: Sequence[ContactGeometry], names: Sequence[str]) -> Judgement:
         """Return the errors of geometries on some tosses."""

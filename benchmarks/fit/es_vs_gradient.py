@@ -24,7 +24,7 @@ import tyro
 from benchmarks.fit.gradient_scenes import SCENES, SceneName, record, starting_model
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.fit_geometry import FitCfg, cut, warm_start
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.geometry.objective import Objective
@@ -72,7 +72,7 @@ def judge(model: Model, recording: Recording) -> list[float]:
     engine, result = MujocoEngine(model, threads=1), []
     assert model.geometry is not None
     for demonstration in recording.demonstrations:
-        segment = whole(model.scene, demonstration, model.geometry.bodies)
+        segment = whole_demonstration(model.scene, demonstration, model.geometry.bodies)
         objective = Objective(engine, [segment], held_out=0.0, block=0.2)
         rollout = engine.run(variants_of(segment), objective.ctrl, record=objective.record, bodies=objective.bodies)
         target = segment.targets[0]

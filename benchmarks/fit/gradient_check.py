@@ -18,7 +18,7 @@ import tyro
 
 from benchmarks.fit.gradient_scenes import SCENES, SceneName, record, starting_model
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_data, write_page
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.geometry.offset import offset_directions
 from concent_warp.fit.geometry.perturbation import Perturbation
 from concent_warp.fit.newton.horizon import shortened
@@ -52,7 +52,7 @@ def check(scene: SceneName, seed: int, horizon: float, device: str) -> dict[str,
     recording = record(scene, seed)
     model = starting_model(scene, recording, seed)
     assert model.geometry is not None
-    segment = whole(model.scene, recording["demo_0"], model.geometry.bodies)
+    segment = whole_demonstration(model.scene, recording["demo_0"], model.geometry.bodies)
     m = model.scene.model
     if horizon > len(segment.ctrl) * m.opt.timestep + 0.02:
         return None

@@ -26,7 +26,7 @@ import tyro
 from benchmarks.fit.gradient_scenes import record, starting_model
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.newton.horizon import shortened
 from concent_warp.fit.newton.loss import NewtonLoss
 from concent_warp.fit.newton.scene import newton_scene
@@ -58,7 +58,7 @@ def measure(worlds: int, device: str, repeats: int) -> dict[str, Any]:
     recording = record("settle", 0)
     model = starting_model("settle", recording, 0)
     assert model.geometry is not None
-    segment = whole(model.scene, recording["demo_0"], model.geometry.bodies)
+    segment = whole_demonstration(model.scene, recording["demo_0"], model.geometry.bodies)
     scene = newton_scene(model, [shortened(model.scene.model, segment, 0.2)])
     gc.collect()
     before = taken(device)

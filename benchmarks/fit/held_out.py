@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from concent_warp.estimation.windows import calm_starts
+from concent_warp.estimation.windows import window_starts
 from concent_warp.fit.effects.least_squares import Solver
 from concent_warp.fit.effects.observation import ObservedRecording, Window
 from concent_warp.fit.effects.observe import channel_noises, observe
@@ -53,7 +53,7 @@ def cut_spans(model: Model, recording: Recording, length: float | None, head: fl
         clock = np.unique(np.concatenate([d.measured[c].time for c in source.noise if c in d.measured]))
         if measured is None:
             raise ValueError(f"{d.name}: the state was not measured")
-        starts = [0.0] if length is None else calm_starts(clock, measured.scatter(clock), length, length)
+        starts = [0.0] if length is None else window_starts(clock, measured.scatter(clock), length, length)
         for start in starts:
             full = source.window(number, float(start), clock[-1] if length is None else float(start) + length)
             first = source.window(number, float(start), float(start) + head)

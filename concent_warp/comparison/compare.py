@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from concent_warp.comparison.contact_names import ContactPartners
-from concent_warp.comparison.phases import Phase, StageLike, phases_by_body, stage_phases, tell_a_task
+from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, phases_by_body, stage_phases, tell_a_task
 from concent_warp.comparison.residuals import instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
@@ -43,6 +43,8 @@ class CompareCfg:
     """Demonstrations to compare on; all where empty."""
     seed: int = 0
     """Seed of the bootstrap."""
+    motion_phases: MotionPhaseCfg = field(default_factory=MotionPhaseCfg)
+    """Settings of the phases of motion."""
     worst_spans: WorstSpanCfg = field(default_factory=WorstSpanCfg)
     """Settings of the search for spans of large error."""
 
@@ -105,6 +107,7 @@ def compare(
         engine,
         phases=None if moving else stages,
         seed=cfg.seed,
+        motion_cfg=cfg.motion_phases,
         span_cfg=cfg.worst_spans,
         progress=progress,
     )
@@ -122,6 +125,7 @@ def compare_replays(
     phases: Mapping[str, Sequence[StageLike]] | None = None,
     demonstrations: Sequence[str] | None = None,
     seed: int = 0,
+    motion_cfg: MotionPhaseCfg | None = None,
     span_cfg: WorstSpanCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
@@ -138,6 +142,7 @@ def compare_replays(
             of the last model instead (`phases_by_body`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
+        motion_cfg: Settings of the phases of motion.
         span_cfg: Settings of the search for spans of large error.
         progress: Called with the share done, 0..1.
 
@@ -165,7 +170,7 @@ def compare_replays(
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])
             if name == last:
                 partners[d.name] = ContactPartners.of_replay(model, compiled, rollout)
-                moving[d.name] = phases_by_body(model, compiled, rollout)
+                moving[d.name] = phases_by_body(model, compiled, rollout, motion_cfg)
             if progress is not None:
                 progress(len(found) / (len(models) * len(chosen)))
     if not any(found.values()):

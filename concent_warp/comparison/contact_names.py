@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -15,16 +15,22 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.simulate.engine import Rollout
 
-MOST = 2
-"""Things named at a time."""
-SHARE = 0.1
-"""What carries less than this share of the forces on a body is not named, unless it is another object: what holds a
-body presses harder than what it is brought against."""
-LASTING = 0.15
-"""What a body touches for less than this share of a span is not named."""
-SIDE = 0.85
-"""From this share of the half extent of a body on, a point is on its side."""
 ORDER = {"object": 0, "robot": 1, "world": 2}
+
+
+@dataclass(frozen=True)
+class ContactNameCfg:
+    """Settings of the naming of contacts."""
+
+    max_names: int = 2
+    """Most partners named at a time."""
+    min_force_share: float = 0.1
+    """Share of the forces on a body below which a partner is not named, unless it is another object [-]: a gripper
+    presses harder than what the object is brought against."""
+    min_time_share: float = 0.15
+    """Share of a span below which a contact is not named [-]."""
+    side_share: float = 0.85
+    """Share of the half extent of a body beyond which a point lies on its side [-]."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class ContactPartners:
     touches: ReplayContacts
     spheres: frozenset[str]
     """Names of the geoms that are spheres of a contact geometry: a place on the body says more than their numbers."""
+    cfg: ContactNameCfg = field(default_factory=ContactNameCfg)
+    """Settings."""
 
     @staticmethod
     def of_replay(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> ContactPartners | None:
@@ -76,7 +84,7 @@ class ContactPartners:
         chosen = np.asarray((mine.sum(axis=1) == 1) & (step >= start) & (step <= end))
         rows, side = self.touches[chosen], mine[chosen].argmin(axis=1)
         touched = len(np.unique(rows.step)) * self.motion.timestep
-        if not len(rows.step) or touched < LASTING * (end - start):
+        if not len(rows.step) or touched < self.cfg.min_time_share * (end - start):
             return None
         entity = np.take_along_axis(rows.entity, side[:, None], axis=1)[:, 0]
         other = np.take_along_axis(rows.body, side[:, None], axis=1)[:, 0]
@@ -90,12 +98,12 @@ class ContactPartners:
         strong = [
             name
             for name, mask in found.items()
-            if force[mask].sum() >= SHARE * force.sum()
-            or (role[name] == "object" and lasting[name] >= LASTING * (end - start))
+            if force[mask].sum() >= self.cfg.min_force_share * force.sum()
+            or (role[name] == "object" and lasting[name] >= self.cfg.min_time_share * (end - start))
         ]
         strong.sort(key=lambda name: (ORDER[role[name]], -force[found[name]].sum()))
         names = []
-        for name in strong[:MOST]:
+        for name in strong[: self.cfg.max_names]:
             mask = found[name]
             spot = self.spot(int(other[mask][0]), rows[mask], force[mask])
             names.append(f"{name} ({spot})" if spot else name)
@@ -124,7 +132,7 @@ class ContactPartners:
             return ""
         local = self.motion.into(body, rows.step, rows.point)
         place = (np.average(local, axis=0, weights=force) - (low + high) / 2) / half
-        sides = [f"{'+' if place[k] > 0 else '-'}{'xyz'[k]}" for k in range(3) if abs(place[k]) >= SIDE]
+        sides = [f"{'+' if place[k] > 0 else '-'}{'xyz'[k]}" for k in range(3) if abs(place[k]) >= self.cfg.side_share]
         return f"{' '.join(sides)} {('side', 'edge', 'corner')[len(sides) - 1]}" if sides else ""
 
 

@@ -38,24 +38,37 @@ if TYPE_CHECKING:
 IMPACT, SLIDE, GRASPED, FREE, STICK, REST = "impact", "slide", "grasped", "free", "stick", "rest"
 MOTIONS: tuple[str, ...] = (IMPACT, SLIDE, GRASPED, FREE, STICK, REST)
 """What a body may do. With several bodies, a demonstration does what comes first here of what any of them does."""
-SLIDING = 0.005
-"""A contact slips above this speed [m/s]."""
-RESTING = 0.004
-"""A body rests while its fastest point is slower than this [m/s]."""
-JOLT = 25.0
-"""Mean acceleration over `JOLT_WINDOW` of the fastest point of a body that tells an impact [m/s^2]."""
-JOLT_WINDOW = 0.01
-"""[s]"""
-AFTERMATH = 0.02
-"""An impact lasts this much longer than the jolt [s], so that measurements fall within it."""
-HOLD = 0.03
-"""Each instant but impacts takes what prevails over windows of this length [s]."""
-LASTING = 0.1
-"""Rest lasts at least this long [s]; what is shorter is a reversal."""
-GRASP_WINDOW = 0.1
-"""Length of the windows over which pressing from opposite sides is judged [s]."""
-SQUEEZE = 0.5
-"""Forces that add up to less than this share of their magnitudes press from opposite sides."""
+
+
+@dataclass(frozen=True)
+class MotionPhaseCfg:
+    """Settings of the division of a replay by how bodies move.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.CompareCfg().motion_phases.slide_speed
+        0.005
+    """
+
+    slide_speed: float = 0.005
+    """Tangential speed above which a contact slips [m/s]."""
+    rest_speed: float = 0.004
+    """A body rests while its fastest point is slower than this [m/s]."""
+    min_rest: float = 0.1
+    """Shortest rest [s]; a shorter one is a reversal of the motion."""
+    impact_acceleration: float = 25.0
+    """Mean acceleration over `impact_window` of the fastest point of a body in contact that is an impact [m/s^2]; more
+    than drives reach."""
+    impact_window: float = 0.01
+    """Length of the windows over which that acceleration is averaged [s]."""
+    impact_extension: float = 0.02
+    """Time by which an impact lasts longer than the acceleration [s], so that measurements fall within it."""
+    majority_window: float = 0.03
+    """Length of the windows whose most frequent phase each instant takes, impacts excepted [s]."""
+    grasp_window: float = 0.1
+    """Length of the windows over which forces of the robot on an object are added [s]."""
+    grasp_share: float = 0.5
+    """Forces of the robot that add up to less than this share of their magnitudes grasp an object [-]."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +125,9 @@ def _motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> 
     return phases_by_body(model, compiled, rollout)[None]
 
 
-def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> dict[str | None, tuple[Phase, ...]]:
+def phases_by_body(
+    model: Model, compiled: mujoco.MjModel, rollout: Rollout, cfg: MotionPhaseCfg | None = None
+) -> dict[str | None, tuple[Phase, ...]]:
     """Return the ways of moving over a replay, without gaps: of each object, or of each moving body where there is no
     object, and under None of all of them together.
 
@@ -120,7 +135,9 @@ def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> 
         model: The model.
         compiled: The same as the engine compiled it.
         rollout: One variant, NumPy, all steps and bodies recorded, contacts "all".
+        cfg: Settings.
     """
+    cfg = cfg or MotionPhaseCfg()
     steps = len(rollout.step) - 1
     if rollout.diverged[0] or rollout.contacts is None or steps < 1:
         return {None: (Phase(FREE, -np.inf, np.inf),)}
@@ -130,7 +147,7 @@ def phases_by_body(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> 
     movable = np.flatnonzero(compiled.body_weldid != 0)
     watched = [b for b in roles.ids("object") if b in movable] or movable.tolist()
     speeds = Speeds.of(motion, compiled)
-    states = {roles.bodies[b]: _body_state(b, touches, motion, speeds, roles) for b in watched}
+    states = {roles.bodies[b]: _body_state(b, touches, motion, speeds, roles, cfg) for b in watched}
     together = np.min([*states.values(), np.full(motion.steps, len(MOTIONS) - 1)], axis=0)
     return {None: _spans(together, motion.timestep), **{b: _spans(s, motion.timestep) for b, s in states.items()}}
 
@@ -195,31 +212,33 @@ def _reaches(compiled: mujoco.MjModel) -> np.ndarray:
     return reach
 
 
-def _body_state(body: int, touches: ReplayContacts, motion: BodyPoses, speeds: Speeds, roles: Roles) -> np.ndarray:
+def _body_state(
+    body: int, touches: ReplayContacts, motion: BodyPoses, speeds: Speeds, roles: Roles, cfg: MotionPhaseCfg
+) -> np.ndarray:
     """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
     dt, steps = motion.timestep, motion.steps
     rows = touches[np.asarray((touches.body == body).any(axis=1))]
-    touching = windowed(rows.frames(steps).astype(float), steps_of(HOLD / 2, dt)) > 0
+    touching = windowed(rows.frames(steps).astype(float), steps_of(cfg.majority_window / 2, dt)) > 0
     state = np.full(steps, MOTIONS.index(FREE))
     state[touching] = MOTIONS.index(STICK)
-    state[touching & (_slip(rows, motion, speeds) > SLIDING)] = MOTIONS.index(SLIDE)
-    still = drop_blips(speeds.fastest(body) < RESTING, steps_of(LASTING, dt))
+    state[touching & (_slip(rows, motion, speeds, cfg.majority_window) > cfg.slide_speed)] = MOTIONS.index(SLIDE)
+    still = drop_blips(speeds.fastest(body) < cfg.rest_speed, steps_of(cfg.min_rest, dt))
     state[still] = MOTIONS.index(REST)
     hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
     if len(hands.step) and roles.body_role[body] != "robot":
-        held = hands.frames(steps) & opposed(hands, steps, steps_of(GRASP_WINDOW, dt), SQUEEZE)
+        held = hands.frames(steps) & opposed(hands, steps, steps_of(cfg.grasp_window, dt), cfg.grasp_share)
         state[held] = MOTIONS.index(GRASPED)
-    state = _prevailing(state, steps_of(HOLD, dt))
-    width = steps_of(JOLT_WINDOW, dt)
-    jolted = touching & (speeds.jolt(body, width) > JOLT * width * dt)
-    lasting = steps_of(AFTERMATH, dt)
+    state = _prevailing(state, steps_of(cfg.majority_window, dt))
+    width = steps_of(cfg.impact_window, dt)
+    jolted = touching & (speeds.jolt(body, width) > cfg.impact_acceleration * width * dt)
+    lasting = steps_of(cfg.impact_extension, dt)
     for start, end in runs(jolted):
         state[max(start - width, 0) : end + lasting] = MOTIONS.index(IMPACT)
     return state
 
 
-def _slip(rows: ReplayContacts, motion: BodyPoses, speeds: Speeds) -> np.ndarray:
-    """Return the mean tangential speed of contacts [m/s], weighted by force, over windows of `HOLD`, shape (K,)."""
+def _slip(rows: ReplayContacts, motion: BodyPoses, speeds: Speeds, window: float) -> np.ndarray:
+    """Return the mean tangential speed of contacts [m/s], weighted by force, over `window` [s], shape (K,)."""
     total = np.zeros((motion.steps, 2))
     if len(rows.step):
         a, b = rows.body.T
@@ -228,7 +247,7 @@ def _slip(rows: ReplayContacts, motion: BodyPoses, speeds: Speeds) -> np.ndarray
         tangential = relative - np.einsum("ci,ci->c", relative, rows.normal)[:, None] * rows.normal
         weight = rows.force + 1e-9
         np.add.at(total, rows.step, np.stack([weight * np.linalg.norm(tangential, axis=1), weight], axis=1))
-    total = windowed(total, steps_of(HOLD, motion.timestep))
+    total = windowed(total, steps_of(window, motion.timestep))
     return total[:, 0] / np.maximum(total[:, 1], 1e-12)
 
 

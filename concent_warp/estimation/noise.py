@@ -25,16 +25,6 @@ Source = Literal["stated", "rest", "differences", "resolution", "points", "unkno
 """Where a noise figure is from."""
 UNDERESTIMATE = 1.8
 """By how much differences underestimate strongly autocorrelated noise."""
-REST_LENGTH = 20
-"""Samples of the windows that are searched for rest."""
-REST_WINDOWS = 3
-"""Windows in a row that make a stretch of rest."""
-REST_SCATTER = 2.5
-"""Scatter of a window at rest over the noise seen in differences."""
-FEWEST = 8
-"""Readings that tell anything of the noise."""
-ROUNDING = 1e-9
-"""Scatter below this share of the readings is rounding, as of simulated readings without noise."""
 WORDS: dict[Source, str] = {
     "stated": "stated in the recording",
     "rest": "estimated where nothing moves",
@@ -44,6 +34,22 @@ WORDS: dict[Source, str] = {
     "unknown": "not known",
 }
 """The sources in words."""
+
+
+@dataclass(frozen=True)
+class NoiseCfg:
+    """Settings of the estimation of noise."""
+
+    rest_length: int = 20
+    """Readings of a window that is tested for rest."""
+    rest_windows: int = 3
+    """Fewest consecutive windows of a stretch of rest."""
+    rest_scatter: float = 2.5
+    """Largest scatter of a window at rest, and difference of its halves, over the noise seen in differences [-]."""
+    min_readings: int = 8
+    """Fewest readings from which noise is estimated."""
+    rounding: float = 1e-9
+    """Scatter below this share of the largest reading is rounding, as of simulated readings without noise [-]."""
 
 
 @dataclass(frozen=True)
@@ -62,33 +68,41 @@ class Noise:
         return WORDS[self.source]
 
 
-def channel_noise(channel: Channel, kind: Kind) -> Noise:
+def channel_noise(channel: Channel, kind: Kind, cfg: NoiseCfg | None = None) -> Noise:
     """Return the noise of a channel.
 
     Args:
         channel: Values (T, dim); of an orientation quaternions wxyz (T, 4).
         kind: What it measures.
+        cfg: Settings.
     """
-    return pooled_noise((channel,), kind)
+    return pooled_noise((channel,), kind, cfg)
 
 
-def pooled_noise(channels: Sequence[Channel], kind: Kind) -> Noise:
-    """Return the noise of one instrument from its channels in several demonstrations; rest in any of them counts."""
+def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None = None) -> Noise:
+    """Return the noise of one instrument from its channels in several demonstrations; rest in any of them counts.
+
+    Args:
+        channels: Values (T, dim) each.
+        kind: What they measure.
+        cfg: Settings.
+    """
+    cfg = cfg or NoiseCfg()
     stated = [c.noise_std for c in channels if c.noise_std]
     if stated:
         return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
     pieces = [piece for c in channels for piece in _finite_pieces(c.value)]
-    if sum(len(piece) for piece in pieces) < FEWEST:
+    if sum(len(piece) for piece in pieces) < cfg.min_readings:
         return Noise(np.nan, "unknown")
     fast = _difference_std(pieces, kind)
     floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
     found = Noise(fast, "differences")
-    if (rest := _rest_std(pieces, kind, max(fast, floor))) is not None:
+    if (rest := _rest_std(pieces, kind, max(fast, floor), cfg)) is not None:
         found = Noise(max(rest, fast), "rest")
     if found.std < floor:
         return Noise(floor, "resolution")
     size = max(float(np.abs(piece).max()) for piece in pieces)
-    return found if found.std > ROUNDING * size else Noise(np.nan, "unknown")
+    return found if found.std > cfg.rounding * size else Noise(np.nan, "unknown")
 
 
 def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:
@@ -117,28 +131,27 @@ def _difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     return float(np.sqrt(np.mean(spread**2) / 20))
 
 
-def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float) -> float | None:
+def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseCfg) -> float | None:
     """Return the scatter about the mean of stretches of rest, None where there is none.
 
-    A window is at rest if it scatters, and its two halves differ, by no more than `REST_SCATTER` times `fast`.
+    A window is at rest if it scatters, and its two halves differ, by no more than `cfg.rest_scatter` times `fast`.
     """
     square, freedom = 0.0, 0
     for piece in pieces:
-        count = len(piece) // REST_LENGTH
-        windows = [piece[i * REST_LENGTH : (i + 1) * REST_LENGTH] for i in range(count)]
-        still = np.array([_is_still(_centred(window, kind), fast) for window in windows], dtype=bool)
+        count = len(piece) // cfg.rest_length
+        windows = [piece[i * cfg.rest_length : (i + 1) * cfg.rest_length] for i in range(count)]
+        still = np.array([_is_still(_centred(window, kind), cfg.rest_scatter * fast) for window in windows], dtype=bool)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
         for start, end in edges.reshape(-1, 2):
-            stretch = _centred(piece[start * REST_LENGTH : end * REST_LENGTH], kind)
-            if end - start >= REST_WINDOWS and _is_still(stretch, fast):
+            stretch = _centred(piece[start * cfg.rest_length : end * cfg.rest_length], kind)
+            if end - start >= cfg.rest_windows and _is_still(stretch, cfg.rest_scatter * fast):
                 square += float((stretch**2).sum())
                 freedom += stretch.size - stretch.shape[1]
     return float(np.sqrt(square / freedom)) if freedom else None
 
 
-def _is_still(window: np.ndarray, fast: float) -> bool:
-    """Return whether readings about their mean, shape (n, dim), scatter and drift by no more than noise does."""
-    limit = REST_SCATTER * fast
+def _is_still(window: np.ndarray, limit: float) -> bool:
+    """Return whether readings about their mean, shape (n, dim), scatter and drift by no more than `limit`."""
     half = len(window) // 2
     drift = np.abs(window[:half].mean(axis=0) - window[half:].mean(axis=0)).max()
     return bool(np.sqrt((window**2).mean(axis=0)).max() <= limit and drift <= limit)

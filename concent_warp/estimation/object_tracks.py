@@ -64,7 +64,7 @@ class Segment:
     """Whether the whole segment is kept from the fit; None keeps blocks of its frames."""
 
 
-def whole(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
+def whole_demonstration(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
     """Return a demonstration as one segment, with the bodies of `bodies` that move and were observed as targets."""
     model = scene.model
     steps = step_count(demonstration, model.opt.timestep)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.object_tracks import Segment, whole
-from concent_warp.estimation.windows import hold_out, windows
+from concent_warp.estimation.object_tracks import Segment, whole_demonstration
+from concent_warp.estimation.windows import cut_windows, mark_held_out
 from concent_warp.files import write_json
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.search import FitResult, Progress, Search, SearchCfg
@@ -132,13 +132,13 @@ def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> l
     assert model.geometry is not None
     bodies = model.geometry.bodies
     if cfg.window is None:
-        return [whole(model.scene, d, bodies) for d in demonstrations]
-    groups = [windows(model.scene, d, bodies, cfg.window, cfg.window_stride) for d in demonstrations]
+        return [whole_demonstration(model.scene, d, bodies) for d in demonstrations]
+    groups = [cut_windows(model.scene, d, bodies, cfg.window, cfg.window_stride) for d in demonstrations]
     if not any(groups):
         raise RecordingError(
             "no window shows contact", expected=f"contact within {cfg.window:g} s", fix="fit longer windows, or without"
         )
-    return hold_out(groups, cfg.held_out)
+    return mark_held_out(groups, cfg.held_out)
 
 
 def warm_start(

@@ -7,13 +7,22 @@ ACM 24(6), 1981).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-REFITS = 2
-"""Rounds of refitting to the points that agree."""
-TYPICAL = 3.0
-"""How many times the median distance of the agreeing points one may be off and still agree; of distances with the same
-normal noise along all axes, all but one in ten thousand are nearer."""
+
+@dataclass(frozen=True)
+class ConsensusCfg:
+    """Settings of the random sample consensus."""
+
+    samples: int = 200
+    """Triples of points that are tried."""
+    refits: int = 2
+    """Rounds of refitting to the points that agree."""
+    max_over_median: float = 3.0
+    """Largest distance of an agreeing point over the median of all agreeing points [-]. With the same normal noise
+    along all axes, all but one in ten thousand are nearer."""
 
 
 def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -50,43 +59,44 @@ def inverse(transform: np.ndarray) -> np.ndarray:
 
 
 def consensus(
-    source: np.ndarray, target: np.ndarray, tolerance: float, rng: np.random.Generator, *, rounds: int = 200
+    source: np.ndarray, target: np.ndarray, tolerance: float, rng: np.random.Generator, cfg: ConsensusCfg | None = None
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the rigid transform (4, 4) that most points agree with, and which do, shape (n,) bool.
 
-    Every round fits three points and adds up the distances of all, each at most `tolerance` [m]; distances, not their
-    squares, lest a motion between two groups of points beat that of the larger group. The winner is refitted to the
-    points that agree with it, where agreement is narrowed to `TYPICAL` of the distances found, so that a wide tolerance
-    costs no accuracy where the noise is small. None where there are fewer than three points, or none agree beyond the
-    three drawn.
+    Each sample fits three points; its cost is the sum of the distances of all points, each at most `tolerance` [m].
+    Squared distances would favour a motion between those of two groups of points over that of the larger group. The
+    best sample is refitted to the points that agree with it: those within `cfg.max_over_median` times the median
+    distance, so that a wide tolerance costs no accuracy where the noise is small. None with fewer than three points, or
+    if fewer than four agree.
 
     Args:
         source: Points [m], shape (n, 3).
         target: The same points elsewhere [m], some of them wrong, shape (n, 3).
         tolerance: Distance within which a point agrees [m].
         rng: Source of the draws.
-        rounds: Triples tried.
+        cfg: Settings.
     """
+    cfg = cfg or ConsensusCfg()
     count = len(source)
     if count < 3:
         return None
-    triples = np.argsort(rng.random((rounds, count)), axis=1)[:, :3]
+    triples = np.argsort(rng.random((cfg.samples, count)), axis=1)[:, :3]
     candidates = kabsch(source[triples], target[triples])
     distances = np.linalg.norm(moved(candidates, source[None]) - target, axis=2)
     winner = np.minimum(distances, tolerance).sum(axis=1).argmin()
     distance, transform = distances[winner], candidates[winner]
-    for _ in range(REFITS):
-        agrees = _narrowed(distance, tolerance)
+    for _ in range(cfg.refits):
+        agrees = _narrowed(distance, tolerance, cfg.max_over_median)
         if agrees.sum() < min(count, 4):
             return None
         transform = kabsch(source[agrees], target[agrees])
         distance = np.linalg.norm(moved(transform, source) - target, axis=1)
-    return transform, _narrowed(distance, tolerance)
+    return transform, _narrowed(distance, tolerance, cfg.max_over_median)
 
 
-def _narrowed(distance: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return which points agree, shape (n,) bool: within `tolerance` and not unlike the others that are, [m]."""
+def _narrowed(distance: np.ndarray, tolerance: float, limit: float) -> np.ndarray:
+    """Return which points agree, shape (n,) bool: within `tolerance` [m] and `limit` times the median of those."""
     agrees = distance < tolerance
     if not agrees.any():
         return agrees
-    return agrees & (distance <= TYPICAL * np.median(distance[agrees]))
+    return agrees & (distance <= limit * np.median(distance[agrees]))

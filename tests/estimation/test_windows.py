@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.local_polynomial import LocalPolynomial, LocalPolynomialCfg, LocalPolynomialOrientation
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.estimation.state_estimator import StateEstimator
-from concent_warp.estimation.windows import hold_out, windows
+from concent_warp.estimation.windows import cut_windows, mark_held_out
 from concent_warp.fit.fit_geometry import FitCfg, cut, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.model import Model
@@ -46,7 +46,7 @@ def test_windows_start_in_the_state_that_was_measured(scene, recording):
     for demonstration in recording.demonstrations:
         states = truth(scene, demonstration)
         known = np.array(list(states))
-        for window in windows(scene, demonstration, ("cube",), LENGTH, only_contact=False):
+        for window in cut_windows(scene, demonstration, ("cube",), LENGTH, only_contact=False):
             start = float(window.name.split("@")[1])
             near = states[known[np.abs(known - start).argmin()]]
             place.append(np.abs(window.qpos[:3] - near[:3]).max())
@@ -61,8 +61,8 @@ def test_windows_start_in_the_state_that_was_measured(scene, recording):
 
 def test_windows_lie_within_the_demonstration_and_keep_its_observations(scene, recording):
     demonstration = recording.demonstrations[0]
-    full = whole(scene, demonstration, ("cube",)).targets[0]
-    found = windows(scene, demonstration, ("cube",), LENGTH, only_contact=False)
+    full = whole_demonstration(scene, demonstration, ("cube",)).targets[0]
+    found = cut_windows(scene, demonstration, ("cube",), LENGTH, only_contact=False)
     starts = np.array([float(w.name.split("@")[1]) for w in found])
     assert len(found) >= 4
     assert np.all(np.abs(np.diff(starts) - LENGTH) <= LENGTH / 2 + 1e-9)
@@ -85,8 +85,8 @@ def test_windows_of_free_flight_are_left_out(scene):
             "orientation": Channel(t, Rotation.from_rotvec(t[:, None] * [2, 1, 0]).as_quat(scalar_first=True)),
         },
     )
-    assert windows(scene, flight, ("cube",), LENGTH) == []
-    assert len(windows(scene, flight, ("cube",), LENGTH, only_contact=False)) == 4
+    assert cut_windows(scene, flight, ("cube",), LENGTH) == []
+    assert len(cut_windows(scene, flight, ("cube",), LENGTH, only_contact=False)) == 4
     model = Model(scene, ContactGeometryCfg(count=30).build(scene))
     with pytest.raises(RecordingError, match="no window shows contact"):
         cut(model, [flight], FitCfg(window=LENGTH))
@@ -103,7 +103,7 @@ def test_a_bounce_between_two_flights_counts_as_contact(scene):
             "orientation": Channel(time + 0.2, np.tile([1.0, 0, 0, 0], (60, 1))),
         },
     )
-    found = [float(w.name.split("@")[1]) for w in windows(scene, bounce, ("cube",), LENGTH)]
+    found = [float(w.name.split("@")[1]) for w in cut_windows(scene, bounce, ("cube",), LENGTH)]
     assert any(start < 0.2 < start + LENGTH for start in found)
     assert len(found) <= 2  # the other two are free flight
 
@@ -118,7 +118,7 @@ def test_a_body_at_rest_counts_as_in_contact(scene):
             "orientation": Channel(time, np.tile([1.0, 0, 0, 0], (60, 1))),
         },
     )
-    assert len(windows(scene, rest, ("cube",), LENGTH)) == 4
+    assert len(cut_windows(scene, rest, ("cube",), LENGTH)) == 4
 
 
 def _polynomials(scene: Scene, demonstration: Demonstration) -> tuple[LocalPolynomial, LocalPolynomialOrientation]:
@@ -146,7 +146,7 @@ def test_the_more_precise_of_velocity_sensor_and_positions_is_used(scene, record
 
 def test_tracked_points_serve_as_well_as_poses(scene, recording):
     demonstration = recording.demonstrations[0]
-    target = whole(scene, demonstration, ("cube",)).targets[0]
+    target = whole_demonstration(scene, demonstration, ("cube",)).targets[0]
     visible = np.ones(target.points.shape[:2], dtype=bool)
     visible[::3, :20] = False
     track = PointTrack(target.time, np.where(visible[:, :, None], target.points, np.nan), visible)
@@ -155,7 +155,9 @@ def test_tracked_points_serve_as_well_as_poses(scene, recording):
         "demo_0", qpos=demonstration.qpos, qvel=demonstration.qvel, measured=kept, points={"cube": track}
     )
     for posed, tracked in zip(
-        windows(scene, demonstration, ("cube",), LENGTH), windows(scene, pointed, ("cube",), LENGTH), strict=True
+        cut_windows(scene, demonstration, ("cube",), LENGTH),
+        cut_windows(scene, pointed, ("cube",), LENGTH),
+        strict=True,
     ):
         np.testing.assert_allclose(tracked.qpos[:3], posed.qpos[:3], atol=1.5e-3)
 
@@ -193,19 +195,19 @@ def test_a_local_fit_gives_rate_and_curvature_of_a_parabola_at_either_end():
 
 
 def test_windows_are_held_out_by_demonstration_where_there_are_enough(scene, recording):
-    groups = [windows(scene, d, ("cube",), LENGTH) for d in recording.demonstrations[:6]]
-    marked = hold_out(groups, 0.2)
+    groups = [cut_windows(scene, d, ("cube",), LENGTH) for d in recording.demonstrations[:6]]
+    marked = mark_held_out(groups, 0.2)
     held = {s.name.split("@")[0] for s in marked if s.held_out}
     used = {s.name.split("@")[0] for s in marked if not s.held_out}
     assert held == {"demo_4"}
     assert not held & used
-    alone = hold_out(groups[:1], 0.5)
+    alone = mark_held_out(groups[:1], 0.5)
     assert [s.held_out for s in alone] == [i % 2 == 1 for i in range(len(alone))]
 
 
 def test_a_length_that_is_no_time_is_refused(scene, recording):
     with pytest.raises(RecordingError, match="must be times"):
-        windows(scene, recording.demonstrations[0], ("cube",), 0.0)
+        cut_windows(scene, recording.demonstrations[0], ("cube",), 0.0)
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])

@@ -157,12 +157,12 @@ def test_spheres_are_laid_on_the_objects_of_a_model_without_any(drop, swollen):
 
 
 def test_the_true_geometry_scores_best(drop, swollen):
-    from concent_warp.estimation.object_tracks import whole
+    from concent_warp.estimation.object_tracks import whole_demonstration
     from concent_warp.fit.geometry.objective import Candidates, Objective
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 
     halves = HALF + np.array([-0.002, 0.0, 0.002])
-    segments = [whole(swollen.scene, drop[0], ("block",))]
+    segments = [whole_demonstration(swollen.scene, drop[0], ("block",))]
     objective = Objective(MujocoEngine(swollen), segments, held_out=0.0, block=0.2)
     losses = objective(Candidates(np.stack([corner_spheres(h).position for h in halves])))
     assert losses.fit[1] < 0.2 * min(losses.fit[0], losses.fit[2])

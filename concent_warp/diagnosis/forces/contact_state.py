@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.comparison.phases import FREE, GRASPED, IMPACT, REST, SLIDE, SLIDING, STICK
+from concent_warp.comparison.phases import FREE, GRASPED, IMPACT, REST, SLIDE, STICK, MotionPhaseCfg
 from concent_warp.diagnosis.forces.cfg import ContactStateCfg
 from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
 
@@ -118,7 +118,7 @@ def body_windows(motion: StateEstimator, windows: Windows, body: MeasuredBody, c
         elif movers:
             phase[k] = GRASPED if len(movers) > 1 else PUSHED
         else:
-            limit = max(SLIDING, cfg.motion_standard_errors * float(speed_std[k]))
+            limit = max(MotionPhaseCfg.slide_speed, cfg.motion_standard_errors * float(speed_std[k]))
             speeds = windows.edge_qvel[:, k, body.dof : body.dof + 6]
             ends = [_speed_at(velocity[k], spin[k], centre, up, size)]
             ends += [_speed_at(v[:3], matrix @ v[3:], centre, up, size) for v in speeds]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.object_tracks import BodyTarget, Segment, observed_poses
-from concent_warp.estimation.windows import windows
+from concent_warp.estimation.windows import cut_windows
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration
 
@@ -94,7 +94,7 @@ def _windows_of(model: Model, demonstration: Demonstration, length: float, whole
     """
     assert model.geometry is not None
     try:
-        found = windows(model.scene, demonstration, model.geometry.bodies, length)
+        found = cut_windows(model.scene, demonstration, model.geometry.bodies, length)
     except RecordingError:
         return []
     unseen = {t.body: t.time[~np.isfinite(t.points).any(axis=(1, 2))] for t in whole.targets}

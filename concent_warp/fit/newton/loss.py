@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.errors import EngineError
-from concent_warp.estimation.object_tracks import Segment, whole
+from concent_warp.estimation.object_tracks import Segment, whole_demonstration
 from concent_warp.fit.geometry.objective import Objective
 from concent_warp.fit.newton.physics import NewtonCfg
 from concent_warp.fit.newton.scene import NewtonScene, newton_scene
@@ -159,7 +159,7 @@ def recording_gradient(
     if segments is None:
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
         bodies = () if model.geometry is None else model.geometry.bodies
-        segments = [whole(model.scene, recording[name], bodies) for name in names]
+        segments = [whole_demonstration(model.scene, recording[name], bodies) for name in names]
     scene = newton_scene(model, segments, cfg)
     loss = NewtonLoss(scene, 1, squared=squared, device=device)
     geometry = model.geometry

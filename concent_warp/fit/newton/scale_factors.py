@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from concent_warp.errors import EngineError, ModelError, RecordingError
-from concent_warp.estimation.object_tracks import Segment, whole
+from concent_warp.estimation.object_tracks import Segment, whole_demonstration
 from concent_warp.fit.newton.horizon import HorizonCfg, gradient_segments
 from concent_warp.fit.newton.loss import NewtonLoss, mujoco_loss
 from concent_warp.fit.newton.physics import NewtonCfg
@@ -188,7 +188,7 @@ def _stretches(model: Model, recording: Recording, cfg: HorizonCfg) -> list[Segm
     shown, segments, why = [], [], None
     for demonstration in recording.demonstrations:
         try:
-            segments.append(whole(model.scene, demonstration, model.geometry.bodies))
+            segments.append(whole_demonstration(model.scene, demonstration, model.geometry.bodies))
         except RecordingError as error:
             why = error
             continue

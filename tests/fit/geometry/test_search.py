@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.fit_geometry import FitCfg
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.geometry.objective import Candidates, Objective
@@ -62,7 +62,7 @@ def beside_finger() -> tuple[Model, Recording]:
 
 def estimate_after(model: Model, recording: Recording, cfg: FitCfg = CFG) -> np.ndarray:
     """Return the estimate of a fit after two generations, not the best one."""
-    search = Search(model, [whole(model.scene, recording[0], ("block",))], cfg, "mujoco")
+    search = Search(model, [whole_demonstration(model.scene, recording[0], ("block",))], cfg, "mujoco")
     for _ in range(2):
         search.step()
     return search.evolution.mean
@@ -85,7 +85,7 @@ def test_grasped_spheres_stay_where_they_are(beside_finger):
 
 def shifted(recording: Recording, model: Model, held_out: bool) -> Recording:
     """Return a recording whose points are 3 mm higher in the held-out frames, or in the others."""
-    target = whole(model.scene, recording[0], ("block",)).targets[0]
+    target = whole_demonstration(model.scene, recording[0], ("block",)).targets[0]
     out = target.held_out(CFG.held_out, CFG.block)
     assert 3 <= out.sum() <= len(out) - 3
     track = recording[0].points["block"]
@@ -97,7 +97,7 @@ def shifted(recording: Recording, model: Model, held_out: bool) -> Recording:
 
 def losses_of(model: Model, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return the losses over fitted and held-out frames of two candidates."""
-    segments = [whole(model.scene, recording[0], ("block",))]
+    segments = [whole_demonstration(model.scene, recording[0], ("block",))]
     objective = Objective(MujocoEngine(model), segments, held_out=CFG.held_out, block=CFG.block)
     found = objective(Candidates(np.stack([corner_spheres(h).position for h in (HALF, HALF + 0.002)])))
     return found.fit, found.held_out
@@ -121,7 +121,7 @@ def test_held_out_frames_do_not_move_the_estimate(drop, swollen):
 
 
 def test_held_out_segments_are_simulated_and_never_drawn(drop, swollen):
-    segment = whole(swollen.scene, drop[0], ("block",))
+    segment = whole_demonstration(swollen.scene, drop[0], ("block",))
     segments = [replace(segment, held_out=False), replace(segment, held_out=True), replace(segment, held_out=False)]
     search = Search(swollen, segments, CFG, "mujoco")
     assert search.draw() == [segments[0], segments[2]]
@@ -133,7 +133,7 @@ def test_held_out_segments_are_simulated_and_never_drawn(drop, swollen):
 
 
 def test_the_estimate_with_the_lowest_held_out_loss_is_kept(drop, swollen):
-    search = Search(swollen, [whole(swollen.scene, drop[0], ("block",))], CFG, "mujoco")
+    search = Search(swollen, [whole_demonstration(swollen.scene, drop[0], ("block",))], CFG, "mujoco")
     every = np.ones(len(swollen.geometry), dtype=bool)
 
     def note(number: float, loss: float, held_out: float) -> None:

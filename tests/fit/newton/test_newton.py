@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import EngineError, ModelError
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.newton.descent import GradientCfg
@@ -161,11 +161,11 @@ def test_a_mesh_that_comes_near_is_refused(swollen, drop):
 def test_a_fixture_alone_has_nothing_to_differentiate(drop):
     fixed = Model(Scene(DROP.replace("<freejoint/>", "")), corner_spheres(HALF))
     with pytest.raises(ModelError, match="free joint"):
-        newton_scene(fixed, [whole(Scene(DROP), drop[0], ("block",))])
+        newton_scene(fixed, [whole_demonstration(Scene(DROP), drop[0], ("block",))])
 
 
 def test_tumbling_is_cut_into_windows_and_pushing_is_not(pushed, thick):
-    calm = [whole(thick.scene, pushed[0], ("block",))]
+    calm = [whole_demonstration(thick.scene, pushed[0], ("block",))]
     assert _tilt(calm[0].targets[0]) < 0.05
     (kept,) = gradient_segments(thick, calm, [pushed[0]], HorizonCfg())
     assert kept.name == calm[0].name
@@ -173,7 +173,7 @@ def test_tumbling_is_cut_into_windows_and_pushing_is_not(pushed, thick):
     thrown = tosses(1)
     scene = Scene(toss_scene(0.06))
     spheres = ContactGeometry(("cube",), np.zeros(1, int), np.zeros((1, 3)), *(np.full(1, v) for v in (0.03, 0.2, 0.3)))
-    segment = whole(scene, thrown[0], ("cube",))
+    segment = whole_demonstration(scene, thrown[0], ("cube",))
     assert _tilt(segment.targets[0]) > 0.35
     cut = gradient_segments(Model(scene, spheres), [segment], [thrown[0]], HorizonCfg(), held_out=0.2)
     length = max(float(t.time[-1]) for s in cut for t in s.targets)
