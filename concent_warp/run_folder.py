@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from concent_warp.errors import ConcentError
+from concent_warp.errors import ConcentError, TrainError
 from concent_warp.files import write_text
 from concent_warp.version import __version__
 
@@ -42,6 +42,16 @@ def claim_file(path: Path, *, overwrite: bool) -> None:
         raise ConcentError("this is a folder", where=path, expected="the name of a file to write")
     if path.exists() and not overwrite:
         raise ConcentError("the file exists", where=path, fix="choose another name or pass --overwrite")
+
+
+def check_training(path: Path) -> None:
+    """Check that a training is there, without importing what reads it.
+
+    Raises:
+        TrainError: There is neither a run folder nor a checkpoint file.
+    """
+    if not path.exists():
+        raise TrainError("no such training", where=path, expected="its run folder, or a checkpoint file in one")
 
 
 @contextmanager

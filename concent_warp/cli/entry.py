@@ -2,36 +2,73 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
+from threading import Timer
 
+from concent_warp.cli.terminal import SPOKEN
 from concent_warp.errors import ConcentError
 from concent_warp.run_folder import processes
 from concent_warp.version import __version__
 
-COMMANDS = {
-    "demo": "the main job in Reality, a simulated world, from recording to report",
-    "record": "record demonstrations in Reality",
-    "geometry": "lay contact spheres on the objects of a scene; export a model as MJCF",
-    "fit": "fit the contact geometry to a recording; contact events and a report come with it",
-    "replay": "replay a recording in a model and save what the model predicts",
-    "events": "extract the contact event sequence of a recording",
-    "compare": "compare a model, or two, with a recording",
-    "locate": "find where a model lacks forces: by joint, and on which place of which object",
-    "diagnose": "find which physical effect a model lacks, with the evidence, or why none can be named",
-    "train": "train a policy to bring about the contact events of a demonstration",
-    "evaluate": "count how often a trained policy succeeds, in simulation and in Reality",
-    "play": "show a trained policy at work, live in the browser",
-    "export": "write a trained policy as ONNX or TorchScript",
-    "splat-fit": "fit Gaussian splats, the looks of an object, to posed images",
-    "render": "render episodes of a policy, or a recording, as photorealistic images in a data set",
-    "render-train": "train networks that paint robot and background as a real camera sees them",
-    "add": "add a physical effect to a model, and fit it to a recording",
+GROUPS = {
+    "start": {
+        "demo": "record in Reality, a simulated world, then fit, compare and report",
+        "record": "record demonstrations in Reality",
+    },
+    "from a recording to a model": {
+        "geometry": "place contact spheres on the objects of a scene; export MJCF",
+        "fit": "fit the contact geometry; extract contact events; report",
+        "replay": "replay a recording in a model and save the prediction",
+        "events": "extract the contact event sequence of a recording",
+    },
+    "which effect is missing": {
+        "compare": "compare one model or two with a recording",
+        "diagnose": "name the physical effect that a model lacks, or say why not",
+        "locate": "find which joints and objects lack forces, and where",
+        "add": "add a physical effect to a model and fit it to a recording",
+    },
+    "from a model to a policy": {
+        "train": "train a policy under the contact events of a demonstration",
+        "evaluate": "count how often a policy succeeds, in simulation and Reality",
+        "play": "show a policy live in the browser",
+        "export": "write a policy as ONNX or TorchScript",
+    },
+    "images": {
+        "splat-fit": "fit Gaussian splats to posed images of an object",
+        "render-train": "train the networks that paint robot and background",
+        "render": "render episodes or a recording as a data set of images",
+    },
 }
-"""Names of the commands, each a module of this package, "-" as "_", with what they do."""
+"""Commands by the step of the pipeline, each a module of this package, "-" as "_", with what it does."""
+COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
+EXAMPLES = {
+    "demo": "concent demo --out runs/demo",
+    "record": "concent record --seeds 0 1 -o demo.h5",
+    "geometry": "concent geometry scene.xml -o model.toml",
+    "fit": "concent fit demo.h5 -o runs/demo",
+    "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",
+    "events": "concent events demo.h5 --model model.toml -o events",
+    "compare": "concent compare demo.h5 --model model.toml --baseline scene.xml",
+    "diagnose": "concent diagnose demo.h5 --model scene.xml --html report.html",
+    "locate": "concent locate demo.h5 --model scene.xml --png forces.png",
+    "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
+    "train": "concent train demo.h5 --model model.toml -o runs/insert",
+    "evaluate": "concent evaluate --checkpoint runs/insert --episodes 200",
+    "play": "concent play --checkpoint runs/insert",
+    "export": "concent export --checkpoint runs/insert -o policy.onnx",
+    "splat-fit": "concent splat-fit photographs -o runs/splats",
+    "render-train": "concent render-train robot.h5 -o runs/render",
+    "render": "concent render --checkpoint runs/insert -o dataset",
+}
+"""One example of each command, shown by its help."""
+LOADING_AFTER = 1.5
+"""Time after which a command that has not yet printed anything says that it is loading [s]."""
 ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 PATIENCE = 10.0
 """How long other processes wait for the first one to say what is wrong [s]."""
@@ -39,17 +76,17 @@ PATIENCE = 10.0
 
 def _usage() -> str:
     """Return the text of ``concent --help``."""
-    lines = [f"  {name:<13}{text}" for name, text in COMMANDS.items()]
+    lines = []
+    for title, commands in GROUPS.items():
+        lines += [f"{title}:", *(f"  {name:<13}{text}" for name, text in commands.items()), ""]
     return "\n".join(
         [
             "usage: concent [-h] [--version] COMMAND ...",
             "",
             "From one measured demonstration to a grounded simulation.",
             "",
-            "commands:",
             *lines,
-            "",
-            "concent COMMAND --help lists the options of a command; concent demo is the place to start.",
+            "concent COMMAND --help lists the options of a command.",
         ]
     )
 
@@ -94,15 +131,17 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         from concent_warp.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
-        module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
-        settings = tyro.cli(
-            module.Arguments,
-            args=arguments,
-            prog=f"concent {command}",
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
-            console_outputs=processes()[0] == 0,
-        )
-        module.run(settings)
+        with _loading(command, help_only=bool({"-h", "--help"} & set(arguments))):
+            module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
+            settings = tyro.cli(
+                module.Arguments,
+                args=arguments,
+                prog=f"concent {command}",
+                description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
+                config=(tyro.conf.HelptextFromCommentsOff,),
+                console_outputs=processes()[0] == 0,
+            )
+            module.run(settings)
     except ConcentError as error:
         _complain(f"concent {command}: {error}")
         return ERROR
@@ -120,6 +159,26 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         _wait_for_rank_zero()
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0
+
+
+def _summary(arguments: type) -> str:
+    """Return the description of a command: its docstring, each paragraph on one line."""
+    paragraphs = (inspect.getdoc(arguments) or "").split("\n\n")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+@contextmanager
+def _loading(command: str, *, help_only: bool) -> Iterator[None]:
+    """Print on standard error that a command is loading, unless it has printed something or ended before."""
+    timer = Timer(LOADING_AFTER, lambda: SPOKEN.is_set() or print(f"concent {command}: loading ...", file=sys.stderr))
+    timer.daemon = True
+    SPOKEN.clear()
+    if processes()[0] == 0 and not help_only:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _complain(sentence: str) -> None:

@@ -43,8 +43,8 @@ def say_fitted(fitted: FittedEffects) -> None:
     from rich.table import Table
 
     table = Table(header_style="bold")
-    for name in ("effect", "parameter", "value", "95 % interval", "unit", "none at"):
-        table.add_column(name, justify="right" if name in ("value", "95 % interval", "none at") else "left")
+    for name in ("effect", "parameter", "value", "95 % interval", "unit", "null"):
+        table.add_column(name, justify="right" if name in ("value", "95 % interval", "null") else "left")
     for added, group in zip(fitted.model.effects, fitted.parameters, strict=True):
         for k, p in enumerate(group):
             interval = f"{_number(p.low)} to {_number(p.high)}"

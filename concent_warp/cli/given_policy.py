@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.constructors import PrimitiveConstructorSpec
 
 from concent_warp.errors import TrainError
+from concent_warp.run_folder import check_training
 
 if TYPE_CHECKING:
     from concent_warp.train.policy.load import Policy
@@ -46,13 +47,15 @@ def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
     Raises:
         TrainError: Neither or both are given, or there is no such policy, folder or file.
     """
-    from concent_warp.train.policy.load import Policy
-    from concent_warp.train.policy.pretrained import pretrained_checkpoint
-
     if (checkpoint is None) == (pretrained is None):
         raise TrainError(
             "one policy is to be run",
             expected="either --checkpoint with a run folder or --pretrained",
             found="neither" if checkpoint is None else "both",
         )
+    if checkpoint is not None:
+        check_training(checkpoint)  # before torch is imported
+    from concent_warp.train.policy.load import Policy
+    from concent_warp.train.policy.pretrained import pretrained_checkpoint
+
     return Policy.load(pretrained_checkpoint(pretrained) if pretrained is not None else checkpoint or Path())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING
 
 from concent_warp.run_folder import processes
@@ -15,31 +17,49 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
 
+SPOKEN = Event()
+"""Set once a command has printed something."""
+WIDTH = 80
+"""Columns of a table where there is no terminal and COLUMNS is not set."""
+
+
 def _console(*, stderr: bool = False) -> Console:
     """Return the console for results, or for progress and remarks, which go to standard error."""
     from rich.console import Console
 
-    width = None if sys.stdout.isatty() else 160
+    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH
     return Console(stderr=stderr, highlight=False, width=width, quiet=processes()[0] > 0)
+
+
+def table_width() -> int:
+    """Return the columns that a table may have."""
+    return _console().width
 
 
 def say(message: RenderableType) -> None:
     """Write a remark or a table to standard output; text may carry rich's markup."""
-    _console().print(message)
+    SPOKEN.set()
+    out = _console()
+    out.print(message, soft_wrap=isinstance(message, str) and not out.is_terminal)
 
 
 def say_written(*paths: Path) -> None:
     """Write which files are new."""
     from rich.text import Text
 
-    say(Text("wrote ") + Text(", ".join(map(str, paths)), style="bold"))
+    SPOKEN.set()
+    out = _console()
+    out.print(Text("wrote ") + Text(", ".join(map(str, paths)), style="bold"), soft_wrap=not out.is_terminal)
 
 
 def quiet_warp() -> None:
-    """Keep Warp from writing about the modules that it loads."""
+    """Keep Warp from printing the modules that it loads; say so where it has to compile them first."""
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
+    cache = Path(warp.config.kernel_cache_dir or Path.home() / ".cache" / "warp" / warp.__version__)
+    if not (cache.is_dir() and any(cache.iterdir())):
+        _console(stderr=True).print("compiling kernels: once for this version of Warp, kept for later runs")
 
 
 @contextmanager
@@ -66,12 +86,14 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
             spent = time.monotonic() - begun
             if share > 0 and spent - last >= PLAIN_PERIOD:
                 last = spent
+                SPOKEN.set()
                 out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{_time_left(share, spent, left)}")
 
         yield plain
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    SPOKEN.set()
     columns = (TextColumn(title), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
     with Progress(*columns, console=out, transient=True) as bar:
         task = bar.add_task(title, total=1.0, text="")

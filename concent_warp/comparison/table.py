@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+DISPENSABLE = ("samples", "p95", "max", "RMS", "noise")
+"""Columns that a narrow terminal does without, the first ones first; --markdown and --json have all."""
+
+
 def mean_and_interval(summary: Summary) -> str:
     """Return a mean with its interval, such as ``1.20 [1.05, 1.38]``."""
     mean = shown(summary.mean, summary.unit)
@@ -64,17 +68,50 @@ def _change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str
     return f"{text} [{low}, {high}]"
 
 
-def rich_table(comparison: Comparison, *, every_phase: bool = False) -> Table:
-    """Return the table for a terminal."""
+def rich_table(comparison: Comparison, *, every_phase: bool = False, width: int | None = None) -> Table:
+    """Return the table for a terminal.
+
+    Args:
+        comparison: The comparison.
+        every_phase: Whether channels that are not about bodies have a row for each phase too.
+        width: Columns of the terminal; figures that do not fit are left out, the least telling first. None keeps all.
+    """
     from rich.table import Table
 
     header, rows = _cells(comparison, every_phase=every_phase)
+    if width is not None:
+        header, rows = _narrowed(header, rows, width)
     table = Table(header_style="bold")
     for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i < 3 else "right", no_wrap=i == 0)
+        table.add_column(name, justify="left" if name in ("channel", "phase", "unit") else "right", no_wrap=i == 0)
     for i, row in enumerate(rows):
-        table.add_row(*row, end_section=i + 1 == len(rows) or bool(rows[i + 1][0]))
+        last = i + 1 == len(rows) or (not rows[i + 1][0].startswith(" ") and bool(rows[i + 1][0]))
+        table.add_row(*row, end_section=last)
     return table
+
+
+def _narrowed(header: list[str], rows: list[list[str]], width: int) -> tuple[list[str], list[list[str]]]:
+    """Return a table that fits: without some columns, then without all intervals but the last model's, then with the
+    phases below the channel.
+    """
+
+    def fits() -> bool:
+        longest = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+        return sum(longest) + 3 * len(longest) + 1 <= width
+
+    for name in DISPENSABLE:
+        if not fits() and name in header:
+            at = header.index(name)
+            header = [*header[:at], *header[at + 1 :]]
+            rows = [[*row[:at], *row[at + 1 :]] for row in rows]
+    means = [i for i, name in enumerate(header) if name.startswith("mean ")]
+    for at in (*means[:-1], *(i for i, name in enumerate(header) if name == "change")):
+        if not fits():
+            rows = [[*row[:at], row[at].partition(" [")[0], *row[at + 1 :]] for row in rows]
+    if not fits():
+        header = [name.removeprefix("mean ") for name in (header[0], *header[2:])]
+        rows = [[channel or f"  {phase}", *rest] for channel, phase, *rest in rows]
+    return header, rows
 
 
 def markdown_table(comparison: Comparison, *, every_phase: bool = False) -> str:

@@ -1,11 +1,14 @@
 import subprocess
 import sys
 import time
+from dataclasses import fields
+from importlib import import_module
 
 import pytest
+import tyro
 
 from concent_warp.cli import main
-from concent_warp.cli.entry import COMMANDS
+from concent_warp.cli.entry import COMMANDS, EXAMPLES
 
 HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "open3d", "trimesh", "scipy")
 
@@ -102,3 +105,31 @@ def test_a_place_that_cannot_be_written_is_said_in_one_sentence(bench, capsys):
     error = capsys.readouterr().err
     assert "/proc/nowhere" in error
     assert error.count("\n") == 1
+
+
+def test_a_command_that_takes_long_to_start_says_that_it_is_loading():
+    slow = "import time, concent_warp.cli.entry as e; e.LOADING_AFTER = 0.05; e.import_module = lambda _: time.sleep(1)"
+    done = python("-c", f"{slow}\ntry: e.main(['fit', 'demo.h5'])\nexcept AttributeError: pass")
+    assert done.stderr.startswith("concent fit: loading ...\n")
+
+
+def test_the_help_names_an_example_of_the_command(capsys):
+    assert main(["compare", "--help"]) == 0
+    assert "Example: concent compare demo.h5" in capsys.readouterr().out
+
+
+def test_every_example_of_a_command_is_parsed():
+    for command, line in EXAMPLES.items():
+        _, name, *arguments = line.split()
+        assert name == command
+        module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
+        tyro.cli(module.Arguments, args=arguments)
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("play", "evaluate")])
+def test_what_is_written_is_named_by_out_or_its_short_form(command):
+    module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
+    writes = "out" in {field.name for field in fields(module.Arguments)}
+    assert writes or {"html", "png"} & {field.name for field in fields(module.Arguments)}
+    if writes:
+        assert "-o" in tyro.extras.get_parser(module.Arguments).format_help()

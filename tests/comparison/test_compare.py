@@ -1,9 +1,11 @@
 import json
 from dataclasses import replace
 from html import escape
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import Phase
@@ -161,6 +163,18 @@ def test_tables_show_lengths_in_mm_with_the_interval(comparison):
     assert text.count("\n") == 2 + 1 + 4
     assert rich_table(comparison).row_count == 1 + 4
     assert rich_table(comparison, every_phase=True).row_count == 2 * 4
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_the_table_fits_a_narrow_terminal_and_keeps_what_matters(comparison, width):
+    table = rich_table(comparison, every_phase=True, width=width)
+    out = StringIO()
+    Console(file=out, width=200).print(table)
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= max(width, 76)
+    header = lines[1]
+    assert all(name in header for name in ("channel", "change", "x noise"))
+    assert all(word in out.getvalue() for word in ("pick", "push"))
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import TrainError
+from concent_warp.run_folder import check_training
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
 from concent_warp.train.policy.episodes import PolicyFunction
@@ -49,8 +50,7 @@ class Policy:
                 expected = f"a run folder, a checkpoint file, or one of {names()}"
                 raise TrainError("no such policy", expected=expected, found=source)
             path = pretrained_checkpoint(source)
-        if not path.exists():
-            raise TrainError("no such training", where=path, expected="its run folder, or a checkpoint file in one")
+        check_training(path)
         checkpoint = path / CHECKPOINT if path.is_dir() else path
         weights = load_checkpoint(checkpoint)
         return Policy(TrainingRun.load(checkpoint.parent), weights, checkpoint.parent)

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
+from concent_warp.cli.options import EngineOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ConcentError
 from concent_warp.model import Model
 from concent_warp.run_folder import claim_file, make_folder
-from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
     from concent_warp.effects.effect import Parameter
@@ -45,9 +45,8 @@ class Arguments:
     """Demonstrations of it; all by default."""
     window: float | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
-    engine: EngineName = "mujoco"
-    """Engine of the fit."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    engine: EngineOption = "mujoco"
+    out: OptionalOutPath = None
     """Model file (.toml) to write."""
     overwrite: bool = False
     """Replace it if it is there."""

@@ -11,8 +11,9 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption
 from concent_warp.cli.summary import say_diverged
-from concent_warp.cli.terminal import say, say_written
+from concent_warp.cli.terminal import say, say_written, table_width
 from concent_warp.comparison.compare import CompareCfg, compare
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import markdown_table, rich_table
@@ -20,7 +21,6 @@ from concent_warp.comparison.worst_spans import span_kind
 from concent_warp.estimation.noise import WORDS
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,13 @@ class Arguments:
     """Model to compare it with."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
-    engine: EngineName = "mujoco"
-    """Engine."""
+    engine: EngineOption = "mujoco"
     json: bool = False
     """Print one JSON object with all figures in SI units instead of the table."""
     markdown: bool = False
     """Print the table as Markdown."""
     every_phase: bool = False
-    """Tell phases apart for joints and other sensors too, not only for bodies."""
+    """Show phases for joints and other sensors too, not only for bodies."""
     html: Path | None = None
     """Write a report with charts, replay and 3D views to this file."""
     phases: Literal["auto", "motion", "none"] = "auto"
@@ -72,7 +71,7 @@ def run(arguments: Arguments) -> Comparison:
         print(markdown_table(found, every_phase=arguments.every_phase), end="")
         print("".join(f"\n{i + 1}. {text}" for i, text in enumerate(_place_lines(found, arguments.places))))
     else:
-        say(rich_table(found, every_phase=arguments.every_phase))
+        say(rich_table(found, every_phase=arguments.every_phase, width=table_width()))
         _say_noise(found)
         _say_places(found, arguments.places)
         say_diverged(found)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.cli.options import EngineOption, OutPath
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.cli.terminal import progress_bar, say
 from concent_warp.fit.fit_geometry import FitCfg
@@ -16,7 +17,6 @@ from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.run_folder import run_folder, write_settings
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,13 @@ class Arguments:
     events, compare, and write a report. The fit starts from the paper's geometry: spheres centred on the surface.
     """
 
-    out: Path = Path("runs/demo")
+    out: OutPath = Path("runs/demo")
     """Run folder."""
     seeds: tuple[int, ...] = (0,)
     """Demonstrations to fit, by the seed that draws them."""
     unseen_seeds: tuple[int, ...] = (1, 2)
     """Further demonstrations, which the fit never sees, to judge it by."""
-    engine: EngineName = "auto"
-    """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
+    engine: EngineOption = "auto"
     resume: bool = False
     """Go on with an interrupted run, to the same result."""
     overwrite: bool = False

@@ -6,13 +6,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from rich.markup import escape
 
 from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.diagnosis.cfg import DiagnoseCfg
@@ -25,7 +25,6 @@ from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
-from concent_warp.simulate.select import EngineName
 
 MOST_PLACES = 3
 """Places that are named below the verdict."""
@@ -50,7 +49,7 @@ class Arguments:
     html: Path | None = None
     """Write a report with the diagnosis, charts, replay and 3D views to this file."""
     apply: Path | None = None
-    """Save the model with all accepted effects, fitted together, to this file (.toml)."""
+    """Save the model with all accepted effects, fitted together with intervals, to this file (.toml)."""
     window: float | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     additions: int = 3
@@ -58,13 +57,12 @@ class Arguments:
     gradient: bool = False
     """Let fits of friction, mass and contact stiffness start from where gradients through Newton lead, where that is
     better; needs contact geometry and observed objects."""
-    engine: EngineName = "mujoco"
-    """Engine."""
+    engine: EngineOption = "mujoco"
     jobs: int = -1
     """Processes at a time; -1: one a CPU."""
     seed: int = 0
     """Seed of all that is drawn."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOutPath = None
     """Folder for finished parts, from which the same command continues after an interruption, and for the motion of the
     suggested experiment."""
     overwrite: bool = False
@@ -173,21 +171,21 @@ def _say_effects(effects: Sequence[Finding]) -> None:
     from rich.table import Table
 
     table = Table(header_style="bold")
-    for name in ("addition", "effect", "held-out gain [95 %]", "p", "parameters [95 %]", "verdict"):
-        table.add_column(name, justify="right" if name in ("held-out gain [95 %]", "p") else "left")
+    for name in ("", "effect and its parameters [95 %]", "held-out gain", "p"):
+        table.add_column(name, justify="right" if name in ("held-out gain", "p") else "left")
     ranked = sorted(effects, key=lambda f: (f.step, not f.accepted, -f.gain))
     for k, f in enumerate(ranked):
         last = k + 1 == len(ranked) or ranked[k + 1].step != f.step
         first = k == 0 or ranked[k - 1].step != f.step
-        shown = ", ".join(map(value_and_interval, f.parameters[:2]))
-        more = f", {len(f.parameters) - 2} more" if len(f.parameters) > 2 else ""
+        verdict = "accepted" if f.accepted else f.reason
+        lines = [f"{f.name}: {verdict}", *(f"  {value_and_interval(p)}" for p in f.parameters[:2])]
+        if len(f.parameters) > 2:
+            lines.append(f"  {len(f.parameters) - 2} more")
         cells = [
             str(f.step + 1) if first else "",
-            f.name,
-            f"{100 * f.gain:.1f} % [{100 * f.low:.1f}, {100 * f.high:.1f}]",
+            "\n".join(lines),
+            f"{100 * f.gain:.0f} % [{100 * f.low:.0f}, {100 * f.high:.0f}]",
             f.p_text.removeprefix("p ").removeprefix("= "),
-            shown + more,
-            "accepted" if f.accepted else f.reason,
         ]
         table.add_row(*map(escape, cells), end_section=last, style="bold" if f.accepted else None)
     say(table)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
 from concent_warp.reality.hidden.in_task import wanted
@@ -35,14 +36,13 @@ class Arguments:
     """Initial states, of which each is run once in each world."""
     seed: int = 0
     """Seed of the initial states."""
-    out: Path | None = None
+    out: OptionalOutPath = None
     """Folder for the videos; by default the folder videos in the run folder, of a pretrained policy here."""
     overwrite: bool = False
     """Replace videos that are there."""
     json: bool = False
     """Print one JSON object with the outcome of every episode instead of sentences."""
-    device: str | None = None
-    """Warp's name of the device for the simulation; the first CUDA device by default where there is one."""
+    device: DeviceOption = None
     cfg: Annotated[EvaluateCfg, tyro.conf.arg(name="")] = field(default_factory=EvaluateCfg)
 
 

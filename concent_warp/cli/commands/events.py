@@ -8,6 +8,7 @@ from pathlib import Path
 import tyro
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption, OutPath
 from concent_warp.cli.summary import say_events
 from concent_warp.cli.terminal import say_written
 from concent_warp.events.cfg import StagingCfg
@@ -15,7 +16,6 @@ from concent_warp.events.extract_events import event_paths, extract_events, save
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, make_folder
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,11 @@ class Arguments:
     """Recording."""
     model: Path
     """Model (.toml) or MJCF (.xml)."""
-    out: Path = Path()
+    out: OutPath = Path()
     """Folder to write to."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default. Of several, the files are called events_<demonstration>.json and so on."""
-    engine: EngineName = "mujoco"
-    """Engine."""
+    engine: EngineOption = "mujoco"
     overwrite: bool = False
     """Replace files that are there."""
     staging: StagingCfg = field(default_factory=StagingCfg)

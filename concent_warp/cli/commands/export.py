@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written
 from concent_warp.run_folder import claim_file, make_folder
 
@@ -25,7 +24,7 @@ class Arguments:
     """Run folder of a training, or its checkpoint file."""
     pretrained: Pretrained = None
     """Export a policy that comes with the package, shape_sorter where no name is given."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: OptionalOutPath = None
     """File to write: .onnx for ONNX, .pt for TorchScript; policy.onnx by default. With --as-pretrained a folder."""
     as_pretrained: bool = False
     """Write a folder as they are for --pretrained."""

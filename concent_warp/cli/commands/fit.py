@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption, OptionalOutPath
 from concent_warp.cli.summary import fit_progress, say_grounded
 from concent_warp.fit.fit_geometry import FitCfg, Method
 from concent_warp.ground import GroundCfg, Grounded, ground
@@ -18,7 +19,6 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import run_folder, write_settings
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Arguments:
 
     recording: tyro.conf.Positional[Path]
     """Recording: an HDF5 file, a folder of CSV files, or ContactNets tosses."""
-    out: Path | None = None
+    out: OptionalOutPath = None
     """Run folder; by default runs/<name of the recording>."""
     model: Path | None = None
     """Model to start from (.toml); by default spheres are laid on the objects of the recording's scene."""
@@ -41,8 +41,7 @@ class Arguments:
     method: Method = "es"
     """"es", the evolution strategy; "gradient", descent by gradients through Newton; "gradient+es", the latter as a
     start for the former. Where gradients do not help, "es" is taken and said so."""
-    engine: EngineName = "auto"
-    """Engine of the search; "auto" takes MuJoCo-Warp where there is a CUDA device, else C MuJoCo."""
+    engine: EngineOption = "auto"
     resume: bool = False
     """Go on with an interrupted run, to the same result."""
     overwrite: bool = False

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
 from concent_warp.model import Model
@@ -25,7 +26,7 @@ class Arguments:
 
     scene: tyro.conf.Positional[Path]
     """MJCF scene (.xml), recording (.h5), or model.toml whose geometry is kept."""
-    out: Path | None = None
+    out: OptionalOutPath = None
     """Model file to write (.toml); the scene and the spheres go beside it."""
     export: Path | None = None
     """MJCF to write (.xml), with the spheres, for plain MuJoCo."""

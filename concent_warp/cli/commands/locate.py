@@ -10,6 +10,7 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
@@ -17,7 +18,6 @@ from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,7 @@ class Arguments:
     """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
-    engine: EngineName = "mujoco"
-    """Engine."""
+    engine: EngineOption = "mujoco"
     window: float | None = None
     """Time over which forces are averaged [s]; 0.1 s for joints, 0.12 s with objects, more where readings are rare, by
     default."""

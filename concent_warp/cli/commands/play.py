@@ -32,7 +32,7 @@ class Arguments:
     seed: int = 0
     """Seed of the initial states."""
     device: str = "cpu"
-    """Warp's name of the device; one world is fastest on the CPU."""
+    """Where networks and the world are computed: "cpu", which is fastest for one world, or "cuda:0"."""
     cfg: Annotated[PlayCfg, tyro.conf.arg(name="")] = field(default_factory=PlayCfg)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -20,7 +21,7 @@ from concent_warp.scene.robot import RobotCfg
 class Arguments:
     """Record demonstrations of the shape sorter, shown by a scripted expert in Reality."""
 
-    out: Path = Path("demo.h5")
+    out: OutPath = Path("demo.h5")
     """Recording file to write."""
     seeds: tuple[int, ...] = (0,)
     """One demonstration for each seed: it places the block and draws the expert's offsets."""

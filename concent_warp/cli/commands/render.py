@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.cfg import Format, RenderCfg
 from concent_warp.errors import RenderError
@@ -34,12 +35,11 @@ class Arguments:
     """Render a policy that comes with the package, shape_sorter where no name is given."""
     recording: Path | None = None
     """Render the measured motion of a recording instead of a policy."""
-    out: Path = Path("runs/dataset")
+    out: OutPath = Path("runs/dataset")
     """Folder of the data set."""
     format: Format = "lerobot"
     """LeRobotDataset v3.0, or one HDF5 file in robomimic's layout."""
-    device: str | None = None
-    """Warp's name of the device; the first CUDA device by default where there is one."""
+    device: DeviceOption = None
     resume: bool = False
     """Continue an interrupted data set, or one with fewer episodes."""
     overwrite: bool = False

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
 from concent_warp.render.networks.cfg import RenderTrainCfg
@@ -27,14 +28,13 @@ class Arguments:
 
     recording: tyro.conf.Positional[Path]
     """Recording with images and measured joints, no objects on the table."""
-    out: Path = Path("runs/render")
+    out: OutPath = Path("runs/render")
     """Run folder."""
     cameras: tuple[str, ...] = ()
     """Cameras to learn; all of the recording by default."""
     steps: int | None = None
     """Steps of each network; short for --flow.steps and --enlarge.steps."""
-    device: str | None = None
-    """Warp's name of the device; the first CUDA device by default where there is one."""
+    device: DeviceOption = None
     resume: bool = False
     """Go on with an interrupted training, as if it had not stopped."""
     overwrite: bool = False

@@ -8,11 +8,11 @@ from pathlib import Path
 import tyro
 
 from concent_warp.cli.given_model import given_model
+from concent_warp.cli.options import EngineOption, OutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.simulate.replay_recording import replay, rollout_path
-from concent_warp.simulate.select import EngineName
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,11 @@ class Arguments:
     """Recording."""
     model: Path
     """Model (.toml) or MJCF (.xml)."""
-    out: Path = Path("rollout.npz")
+    out: OutPath = Path("rollout.npz")
     """File to write; of several demonstrations, rollout_<demonstration>.npz."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to replay; all by default."""
-    engine: EngineName = "mujoco"
-    """Engine."""
+    engine: EngineOption = "mujoco"
     overwrite: bool = False
     """Replace files that are there."""
 

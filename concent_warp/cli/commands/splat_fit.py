@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
 from concent_warp.files import write_text
@@ -37,7 +38,7 @@ class Arguments:
 
     images: tyro.conf.Positional[Path]
     """Folder with a transforms.json, or such a file: images with an alpha channel, and where their cameras were."""
-    out: Path | None = None
+    out: OptionalOutPath = None
     """Run folder; by default runs/splats_<name of the folder>."""
     points: Path | None = None
     """Mesh or point cloud to start from, in the frame of the object; by default the hull that the masks agree on."""
@@ -45,8 +46,7 @@ class Arguments:
     """Factor from the unit of the points to metres."""
     longest: int = 800
     """Larger images are made smaller, so that their longer edge has so many pixels."""
-    device: str | None = None
-    """Where to compute, "cpu" or "cuda:0"; the first CUDA device by default where there is one."""
+    device: DeviceOption = None
     resume: bool = False
     """Go on with an interrupted fit, to the same result."""
     overwrite: bool = False

@@ -10,9 +10,10 @@ import tyro
 
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.given_policy import given_policy
+from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import resuming_command
+from concent_warp.run_folder import check_training, resuming_command
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
@@ -32,31 +33,29 @@ class Arguments:
     """Recording of the demonstration."""
     model: Path
     """Model (.toml), as concent fit writes it."""
-    out: Path | None = None
+    out: OptionalOutPath = None
     """Run folder; by default runs/train_<name of the recording>."""
     demonstration: str | None = None
     """Demonstration to train from; the first by default."""
     events: Path | None = None
     """Its contact events (.json); extracted where they are not given."""
     begin_with: Path | None = None
-    """Policy to begin with, a run folder of a training or its checkpoint file, to train it on with other settings; by
-    default weights are drawn at random."""
-    device: str | None = None
-    """Warp's name of the device; the first CUDA device by default where there is one."""
+    """Policy to start from: a run folder of a training or its checkpoint file. By default weights are random."""
+    device: DeviceOption = None
     resume: bool = False
-    """Go on with an interrupted training, as if it had not stopped."""
+    """Continue an interrupted training, as if it had not stopped."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     stage: str | None = None
     """Stage to train, or all for the chain of all stages; short for --environment.stage."""
     worlds: int | None = None
-    """Environments side by side; short for --environment.worlds."""
+    """Parallel environments; short for --environment.worlds."""
     reward: Literal["contact", "engineered"] | None = None
     """Reward; short for --environment.reward.kind."""
     collision: Literal["vcp", "full"] | None = None
     """Spheres in the physics; short for --environment.collision."""
     iterations: int | None = None
-    """Rounds of training; short for --ppo.iterations."""
+    """Iterations of PPO; short for --ppo.iterations."""
     train: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
 
     def cfg(self) -> TrainCfg:
@@ -72,19 +71,19 @@ class Arguments:
 
 def run(arguments: Arguments) -> Policy:
     """Train and write the run folder, one of several processes where torchrun started them."""
+    if arguments.begin_with is not None:
+        check_training(arguments.begin_with)
+    recording = load_recording(arguments.recording)
+    model = given_model(arguments.model, recording)
     quiet_warp()
     from concent_warp.events.sequence import ContactEventSequence
     from concent_warp.train.learning.distributed import DistributedProcess
     from concent_warp.train.learning.ppo import CHECKPOINT
     from concent_warp.train.train import train
 
-    DistributedProcess.from_environment().device(
-        arguments.device
-    )  # more processes than GPUs: refused before anything is read
+    DistributedProcess.from_environment().device(arguments.device)  # more processes than GPUs are refused here
     begin_with = None if arguments.begin_with is None else given_policy(arguments.begin_with, None)
     folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
-    recording = load_recording(arguments.recording)
-    model = given_model(arguments.model, recording)
     events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     cfg = arguments.cfg()
     last: Iteration | None = None
