@@ -86,7 +86,7 @@ def _usage() -> str:
             "From one measured demonstration to a grounded simulation.",
             "",
             *lines,
-            "concent COMMAND --help lists the options of a command.",
+            "concent COMMAND --help lists the options of a command; concent demo is the place to start.",
         ]
     )
 
