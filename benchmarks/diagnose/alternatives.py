@@ -94,7 +94,7 @@ WAYS: dict[str, Callable[[Model, Recording], Fitted]] = {}
 
 
 def way(name: str) -> Callable[[Callable[[Model, Recording], Fitted]], Callable[[Model, Recording], Fitted]]:
-    """Enter a way to mend a model."""
+    """Register a method to correct a model."""
 
     def enter(function: Callable[[Model, Recording], Fitted]) -> Callable[[Model, Recording], Fitted]:
         WAYS[name] = function
@@ -215,11 +215,11 @@ def tried(
     """Return for each method: error on held-out data, blamed effects, time."""
     ways = {}
     for name in chosen or WAYS:
-        mend = WAYS[name]
+        correct = WAYS[name]
         begin = time.perf_counter()
-        mended, blamed = mend(model, recording)
+        corrected, blamed = correct(model, recording)
         spent = time.perf_counter() - begin
-        row: dict[str, Any] = {"error": error(mended), "seconds": spent, "blamed": sorted({b.name for b in blamed})}
+        row: dict[str, Any] = {"error": error(corrected), "seconds": spent, "blamed": sorted({b.name for b in blamed})}
         if hidden is not None:
             row["right"] = sorted({h for h in hidden for b in blamed if h in b.group})
             row["wrong"] = sorted({b.name for b in blamed if not set(b.group) & set(hidden)})

@@ -1,7 +1,7 @@
 """How far a recording is from a model: residuals over noise, starts refitted.
 
-A start is told only roughly, so it is fitted first (Gauss-Newton with a prior wider than the error with which it is
-told): what is left then is what no start can explain.
+An initial state is measured only roughly, so it is fitted first (Gauss-Newton with a prior wider than its measurement
+error): the residual is then what no initial state can explain.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from concent_warp.simulate.replay import commands, initial_state, interpolate, s
 
 FREE = mujoco.mjtJoint.mjJNT_FREE
 PRIOR = {"free": (3e-4, 3e-3, 5e-3, 3e-2), "joint": (3e-3, 3e-3)}
-"""Spread of starts about what is told: position [m], orientation [rad], velocity, turning; joint and its speed."""
+"""Spread of initial states: position [m], orientation [rad], velocity, turning; joint and its speed."""
 STEPS = (0.2, 0.2, 0.1, 0.05, 0.02)
 """Of the finite differences, as shares of the prior's spread: wide first, for impacts jump from step to step."""
 Residuals = dict[str, np.ndarray]

@@ -63,7 +63,7 @@ class Args:
 
 def true_starts(cfg: RealityCfg, scene: Scene, truth: Truth) -> dict[str, float]:
     """Return when the stages truly began [s]: the first contact of a finger and the block, of block and box, and of
-    the block with a wall of the hole, told by the normal of the contact in the exact geometry.
+    the block with a wall of the hole, identified by the normal of the contact in the exact geometry.
     """
     fingers = [
         touching for pair, touching in truth.contacts.items() if "block" in pair and any("finger" in b for b in pair)

@@ -1,4 +1,4 @@
-"""Real data: does a fit to measured tosses of a cube mend a sphere cube whose size is wrong by 5 %?
+"""Fits of a sphere cube, 5 % too small or too large, to measured tosses of a cube.
 
 The data are the ContactNets cube tosses (Pfrommer, Halm, Posa, CoRL 2020; 275 of them). For each of several random
 splits the fit sees 40 tosses and starts from a cube of spheres that is 5 % too small, then from one 5 % too large; all

@@ -34,8 +34,8 @@ def main() -> None:
             brightness[camera] += float(frame[camera].mean()) / len(data)
     assert all(frames == list(range(len(frames))) for frames in episodes.values())
     batch = next(iter(torch.utils.data.DataLoader(data, batch_size=8, shuffle=True)))
-    told = {camera: float(data.meta.stats[camera]["mean"].mean()) for camera in cameras}
-    assert all(abs(brightness[camera] - told[camera]) < 0.01 for camera in cameras)
+    stated = {camera: float(data.meta.stats[camera]["mean"].mean()) for camera in cameras}
+    assert all(abs(brightness[camera] - stated[camera]) < 0.01 for camera in cameras)
     print(
         json.dumps(
             {
@@ -46,7 +46,7 @@ def main() -> None:
                 "fps": data.fps,
                 "features": {name: list(value.shape[1:]) for name, value in batch.items() if torch.is_tensor(value)},
                 "mean of images": brightness,
-                "mean told by stats.json": told,
+                "mean in stats.json": stated,
                 "open": opened,
                 "read all": time.perf_counter() - begun - opened,
             }

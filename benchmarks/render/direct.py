@@ -5,7 +5,7 @@
 
 Both ways learn from the same frames of one camera for the same time, with U-Nets of the same channels, and then paint
 the held-out trajectories one frame after the other, with few and more steps of the flow. Objects are not painted: the
-pixels where the simulation sees them do not count. Times are of images painted side by side, without reading anything
+pixels where the simulation sees them do not count. Times are of images painted together, without reading anything
 back. A line of JSON for each way and number of steps is appended to --out; each way's follow its training.
 """
 
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--train-seconds", type=float, default=240.0, help="time of training of each way [s]")
     parser.add_argument("--width", type=int, default=64, help="channels of the flow's first level")
     parser.add_argument("--batch", type=int, default=16, help="images of a step at 256 x 256, half of those at 64")
-    parser.add_argument("--images", type=int, default=64, help="images that are painted side by side for the times")
+    parser.add_argument("--images", type=int, default=64, help="images that are painted together for the times")
     parser.add_argument("--features", type=Path, help="weights for the distance of features (feature_distance.py)")
     parser.add_argument("--seconds", type=float, help="time after which no measurement is begun [s]")
     arguments = parser.parse_args()

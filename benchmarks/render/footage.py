@@ -3,8 +3,8 @@
     python -m benchmarks.render.footage --folder runs/render_gap                       record, on a CPU
     python -m benchmarks.render.footage --folder runs/render_gap --pack runs/packed    and pack
 
-The footage is of the laboratory without objects, to train networks from, and with them on trajectories of other seeds,
-to judge by; of each object there are photographs under the laboratory's lights. A packed folder holds the frames as
+The footage is of Reality without objects, for training networks, and with them on trajectories of other seeds,
+to judge by; of each object there are photographs under Reality's lights. A packed folder holds the frames as
 H.264 of full colour: 10 MB in the place of 230. How much that changes them is printed; where images are judged by
 them, it is to be told.
 """
@@ -46,7 +46,7 @@ def footage(folder: Path, name: str, demonstrations: int = 8) -> Recording:
 
 
 def photographed(folder: Path, body: str, cfg: PhotographsCfg) -> Path:
-    """Return a folder of photographs of an object under the laboratory's lights, made if they are not there."""
+    """Return a folder of photographs of an object under Reality's lights, made if they are not there."""
     path = folder / f"photos_{body}"
     if not (path / FILE).exists():
         reality = RealityCfg()

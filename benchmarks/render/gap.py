@@ -3,9 +3,9 @@
     python -m benchmarks.render.gap --out render_gap.jsonl                     # small networks, on a CPU
     python -m benchmarks.render.gap --full --device cuda:0 --train-seconds 540 --out render_gap.jsonl
 
-Reality's laboratory plays the real one: other textures, lights, shadows and noise than the simulation's image. It
+Reality's cameras take the place of real ones: other textures, lights, shadows and noise than the simulation's image. It
 is filmed without objects to train the networks, and with them on trajectories that training never saw; the objects are
-photographed under the laboratory's lights to fit their splats. What is made is kept in --folder and not made again; a
+photographed under Reality's lights to fit their splats. What is made is kept in --folder and not made again; a
 training that was cut short goes on. The folder may be a packed one (render_footage.py). A line of JSON for each way of
 rendering is appended to --out, those without networks before these are trained.
 """
@@ -56,7 +56,7 @@ VARIANTS: dict[str, dict[str, bool]] = {
 
 
 def fitted_splats(folder: Path, body: str, arguments: argparse.Namespace) -> Path:
-    """Return the splats of an object, fitted to photographs under the laboratory's lights."""
+    """Return the splats of an object, fitted to photographs under Reality's lights."""
     path = folder / f"splats_{body}" / "splats.ply"
     if not path.exists():
         photos = photographed(folder, body, PhotographsCfg(size=arguments.photo))

@@ -33,7 +33,7 @@ from concent_warp.train.learning.metrics import read_curve
 
 NAME = "train_gpus"
 MARKS = (0.25, 0.5, 0.9)
-"""Shares of successful episodes, while exploring, whose first time is told."""
+"""Shares of successful episodes, while exploring, whose first time is reported."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Trainings of several cases and seeds, one after the other or side by side on several GPUs, and how they learn.
+"""Trainings of several cases and seeds, sequential or in parallel on several GPUs, and their learning curves.
 
     python -m benchmarks.train.cases --out runs/table1
     python -m benchmarks.train.learning --out runs/table1 --cases ours engineered --seconds 60

@@ -233,9 +233,9 @@ class PadFriction(Effect):
     name = "pad_friction"
     family = "contact"
     kind = "body"
-    summary = "Sliding friction between the fingers and what they hold."
+    summary = "Sliding friction between the fingers and the grasped object."
     source = f"Coulomb friction in MuJoCo's contacts, the pads' coefficient by priority ({MUJOCO})"
-    signature = "what is held slips or does not"
+    signature = "the grasped object slips or does not"
     confusions = ("grip_force", "mass")
     threshold = True
     wants = "bodies with geoms that collide"

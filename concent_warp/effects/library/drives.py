@@ -28,7 +28,7 @@ FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""
 
 GRIPS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
-"""Factors of a grip's force that are worth a trial: what is held slips in a narrow range only."""
+"""Factors of a grip's force that are worth a trial: the object slips in a narrow range only."""
 
 
 class DriveEffect(Effect):
@@ -98,7 +98,7 @@ class GripForce(ActuatorGain):
     family = "contact"
     summary = "The gripper's force is the model's times a factor."
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
-    signature = "what is held slips or does not; fingers close slower or faster"
+    signature = "the grasped object slips or does not; fingers close slower or faster"
     confusions = ("pad_friction", "mass")
     threshold = True
 

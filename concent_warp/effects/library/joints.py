@@ -137,10 +137,10 @@ class Armature(JointEffect):
 
 
 class JointOffset(JointEffect):
-    """Zero of encoder and drive that is not where the drawing has it."""
+    """Zero of encoder and drive that differs from the nominal model's."""
 
     name = "joint_offset"
-    summary = "Encoder and drive count from a zero that lies off the drawing's by an angle."
+    summary = "Encoder and drive count from a zero that is off the nominal model's by an angle."
     source = "kinematic calibration: Hollerbach, Khalil, Gautier, in Springer Handbook of Robotics, 2016"
     signature = "gravity load of the wrong phase; constant pose error of what the robot carries, none in its encoders"
     confusions = ("sensor_bias", "gravity_tilt", "frame_offset")
