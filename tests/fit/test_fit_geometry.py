@@ -115,7 +115,7 @@ def test_settings_survive_the_checkpoint_as_json():
 def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
     cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), patience=2)
     result = fit_geometry(swollen, drop, cfg, engine="mujoco")
-    assert result.stopped == "error fell by less than 0.05 of itself in 2 generations"
+    assert result.stopped == "error fell by less than 0.02 of itself in 2 generations"
     assert len(result.history) == 3
 
 

@@ -36,11 +36,11 @@ class SearchCfg:
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
     generations: int = 70
     """Generations at most."""
-    patience: int = 15
+    patience: int = 20
     """Generations without progress after which the search ends: neither the lowest distance over the frames of the fit
     nor the one over the held-out frames has fallen by `least_gain`. Chosen on seeds of the shape sorter that no page
     reports: shorter ones stop on the flat stretch after the first generations."""
-    least_gain: float = 0.05
+    least_gain: float = 0.02
     """Relative fall of the distance that counts as progress [-], measured from its value at the last progress."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
