@@ -12,7 +12,7 @@ from concent_warp.estimation.object_tracks import Segment, whole_demonstration
 from concent_warp.estimation.windows import cut_windows, mark_held_out
 from concent_warp.files import write_json
 from concent_warp.fit.geometry.checkpoint import Checkpoint
-from concent_warp.fit.geometry.search import FitResult, Progress, Search, SearchCfg
+from concent_warp.fit.geometry.search import FitResult, GeometrySearchCfg, Progress, Search
 from concent_warp.fit.newton.descent import GradientCfg
 from concent_warp.fit.newton.warm_start import GradientWarmStart
 from concent_warp.model import Model
@@ -26,7 +26,7 @@ Method = Literal["es", "gradient", "gradient+es"]
 
 
 @dataclass(frozen=True)
-class FitCfg(SearchCfg):
+class FitCfg(GeometrySearchCfg):
     """Settings of a fit of contact geometry.
 
     Example:

@@ -30,7 +30,7 @@ TURN = np.radians(1.0) / 1e-3
 
 
 @dataclass(frozen=True)
-class SearchCfg:
+class GeometrySearchCfg:
     """Settings of the evolution strategy's search."""
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
@@ -142,7 +142,7 @@ class Survey:
 class Search:
     """The state of a fit between generations."""
 
-    def __init__(self, model: Model, segments: list[Segment], cfg: SearchCfg, engine: EngineName) -> None:
+    def __init__(self, model: Model, segments: list[Segment], cfg: GeometrySearchCfg, engine: EngineName) -> None:
         """Prepare the first generation."""
         assert model.geometry is not None
         self.model, self.segments, self.cfg = model, segments, cfg
