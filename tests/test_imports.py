@@ -14,7 +14,7 @@ import concent_warp
 
 HEAVY = {
     *("torch", "warp", "mujoco_warp", "newton", "rsl_rl"),
-    *("open3d", "trimesh", "kornia", "cv2", "matplotlib"),
+    *("trimesh", "kornia", "cv2", "matplotlib"),
 }
 """Packages that are slow to import or that a host may lack."""
 ABOUT_WARP = (

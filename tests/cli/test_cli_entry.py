@@ -10,7 +10,7 @@ import tyro
 from concent_warp.cli import main
 from concent_warp.cli.entry import COMMANDS, EXAMPLES
 
-HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "open3d", "trimesh", "scipy")
+HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "trimesh", "scipy")
 
 
 def python(*arguments):
