@@ -27,8 +27,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "reward": (
         "train/environment/reward.py",
         "train/environment/environment.py",
-        "train/environment/rotation.py",
-        "train/environment/vcp.py",
+        "train/environment/quaternions.py",
+        "train/environment/virtual_collision.py",
         "train/task/stages.py",
         "train/task/slots.py",
     ),

@@ -65,7 +65,7 @@ def mutation_page(rows: Sequence[Row], args: dict[str, Any], facts: dict[str, An
         "How many small changes of the library do the tests notice?",
         "    pip install cosmic-ray\n"
         f"    python -m benchmarks.development.mutation --sample {args['sample']} --seed {args['seed']} "
-        f"--jobs {args['jobs']}",
+        f"--jobs {args['jobs']} --budget {args['budget']:g}",
         machine_line(facts),
         "A mutant is one small change by an operator of cosmic-ray: another arithmetic operator or comparison, a "
         "number larger or smaller by one, a condition negated, a loop without turns, a decorator removed. "
@@ -75,6 +75,8 @@ def mutation_page(rows: Sequence[Row], args: dict[str, Any], facts: dict[str, An
         table(head, lines),
         "“noticed” counts killed and timed out, out of all; its interval is Wilson's. “equivalent” are survivors that "
         "change nothing that anyone can observe, judged by hand and listed below; the last column leaves them out.",
+        "The aim is 85 %. Where a mutant survives here, slower tests, or tests that take longer than the budget, may still "
+        "notice it.",
         "Left out: bodies of Warp kernels, annotations, what needs CUDA, and replacements that fail on any "
         "floating-point number (`a << b` for `a + b`). The rooms are "
         + "; ".join(f"{room}: {', '.join(f'`{p}`' for p in places)}" for room, places in ROOMS.items())
