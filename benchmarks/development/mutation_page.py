@@ -75,8 +75,7 @@ def mutation_page(rows: Sequence[Row], args: dict[str, Any], facts: dict[str, An
         table(head, lines),
         "“noticed” counts killed and timed out, out of all; its interval is Wilson's. “equivalent” are survivors that "
         "change nothing that anyone can observe, judged by hand and listed below; the last column leaves them out.",
-        "The aim is 85 %. Where a mutant survives here, slower tests, or tests that take longer than the budget, may still "
-        "notice it.",
+        "The aim is 85 %. Where a mutant survives here, slower tests, or tests beyond the budget, may still notice it.",
         "Left out: bodies of Warp kernels, annotations, what needs CUDA, and replacements that fail on any "
         "floating-point number (`a << b` for `a + b`). The rooms are "
         + "; ".join(f"{room}: {', '.join(f'`{p}`' for p in places)}" for room, places in ROOMS.items())
