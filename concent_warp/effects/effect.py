@@ -5,7 +5,7 @@ An effect acts in up to five places, and says nothing where it does not act:
 - `prepare` edits the MJCF once, whatever the parameters' values (it switches something on);
 - `edit` edits the MJCF by value, where a compiled model cannot be changed (sizes);
 - `write` sets fields of a compiled model;
-- `law` is a force recomputed before each step;
+- `force_model` is a force recomputed before each step;
 - `command` and `measure` change what is commanded and what the instruments read.
 
 None of them changes the number of positions, velocities, actuators or sensors that a recording refers to.
@@ -137,7 +137,7 @@ class Effect:
         """Return the names of the fields of `mujoco.MjModel` that `write` sets; ``opt.<name>`` for options."""
         return ()
 
-    def law(self, m: mujoco.MjModel) -> ForceModel | None:  # noqa: ARG002
+    def force_model(self, m: mujoco.MjModel) -> ForceModel | None:  # noqa: ARG002
         """Return the force that is recomputed before each step; its parameters are those of the effect."""
         return None
 

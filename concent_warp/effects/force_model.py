@@ -1,8 +1,8 @@
 """Forces that MuJoCo has no field for: recomputed from the state before each step, on both engines.
 
-A law writes to what the engine clears or restores before each step (`qfrc_applied`, `xfrc_applied`) or overwrites
-(`dof_frictionloss`). It sees positions and velocities of this step; what MuJoCo derives from them (forces, contacts)
-is still that of the step before.
+A force model writes to what the engine clears or restores before each step (`qfrc_applied`, `xfrc_applied`) or
+overwrites (`dof_frictionloss`). It sees positions and velocities of this step; what MuJoCo derives from them (forces,
+contacts) is still that of the step before.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class ForceModel:
-    """A force law with P parameters; what it acts on is fixed when it is made.
+    """A force model with P parameters; what it acts on is fixed when it is made.
 
-    Two laws are equal where they are of one class and act on the same, so that what was captured for one serves both.
+    Two force models are equal if they are of one class and act on the same elements; equal ones share a captured graph.
     """
 
     edits: ClassVar[tuple[str, ...]] = ()
@@ -49,7 +49,7 @@ class ForceModel:
         raise NotImplementedError
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """Return `apply` for the steps of one simulation; laws that are called often look up here what stays."""
+        """Return `apply` for the steps of one simulation; override it to look up constants once."""
         return lambda: self.apply(m, d, values)
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
@@ -61,7 +61,7 @@ class ForceModel:
             values: Parameters, shape (N, P), float32.
 
         Raises:
-            EngineError: The law runs in C MuJoCo only.
+            EngineError: The force model runs in C MuJoCo only.
         """
         from concent_warp.errors import EngineError
 

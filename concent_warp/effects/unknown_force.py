@@ -142,15 +142,15 @@ class UnknownForce(Effect):
     signature = "anything that depends on place or speed"
     engines = ("mujoco",)
 
-    def __init__(self, words: str, law: UnknownJointForce | UnknownBodyForce) -> None:
-        """Make it from a law that says what it depends on, and that in words."""
+    def __init__(self, words: str, force_model: UnknownJointForce | UnknownBodyForce) -> None:
+        """Make it from a force model and a description of what this depends on."""
         super().__init__()
-        self.words, self._law = words, law
+        self.words, self._force_model = words, force_model
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """The sizes of the bumps."""
-        return tuple(Parameter(f"size[{k}]", "-", 0.0, -100.0, 100.0, 1.0) for k in range(self._law.count))
+        return tuple(Parameter(f"size[{k}]", "-", 0.0, -100.0, 100.0, 1.0) for k in range(self._force_model.count))
 
-    def law(self, m: mujoco.MjModel) -> UnknownJointForce | UnknownBodyForce:  # noqa: ARG002
+    def force_model(self, m: mujoco.MjModel) -> UnknownJointForce | UnknownBodyForce:  # noqa: ARG002
         """The force."""
-        return self._law
+        return self._force_model

@@ -40,9 +40,9 @@ class Variants:
     """Initial generalised positions, shape (N, nq)."""
     qvel: Any = None
     """Initial generalised velocities, shape (N, nv)."""
-    laws: Sequence[tuple[ForceModel, Any]] | None = None
-    """Force laws that act, each with its parameters, shape (N, P); None: those of the model's effects, as it has
-    them."""
+    force_models: Sequence[tuple[ForceModel, Any]] | None = None
+    """Force models that act, each with its parameters, shape (N, P); None: those of the model's effects with the
+    model's values."""
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,8 @@ def _check_variants(compiled: mujoco.MjModel, sphere_count: int, variants: Varia
             raise EngineError(
                 "friction is given twice", found="variants.sphere_friction and fields['geom_friction']", fix="give one"
             )
-    for law, values in variants.laws or ():
-        _check_array(f"parameters of {type(law).__name__}", values, (n, *np.shape(values)[1:]))
+    for force_model, values in variants.force_models or ():
+        _check_array(f"parameters of {type(force_model).__name__}", values, (n, *np.shape(values)[1:]))
     for name, value in variants.fields.items():
         _check_array(f"variants.fields[{name!r}]", value, (n, *np.shape(_model_field(compiled, name))))
 
@@ -208,18 +208,19 @@ def host_variants(variants: Variants) -> Variants:
         for name in (*SPHERE_FIELDS, "qpos", "qvel")
     }
     fields: Mapping[str, np.ndarray] = {k: np.asarray(host(v), dtype=float) for k, v in variants.fields.items()}
-    laws = None
-    if variants.laws is not None:
-        laws = tuple((law, np.asarray(host(values), dtype=float)) for law, values in variants.laws)
-    return Variants(variants.count, fields=fields, laws=laws, **arrays)
+    force_models = None
+    if variants.force_models is not None:
+        given = variants.force_models
+        force_models = tuple((force_model, np.asarray(host(values), dtype=float)) for force_model, values in given)
+    return Variants(variants.count, fields=fields, force_models=force_models, **arrays)
 
 
-def with_laws(model: Model, compiled: mujoco.MjModel, variants: Variants) -> Variants:
-    """Return the variants with the laws of the model's effects where they name none themselves."""
-    if variants.laws is not None:
+def with_force_models(model: Model, compiled: mujoco.MjModel, variants: Variants) -> Variants:
+    """Return the variants, with the force models of the model's effects if they name none themselves."""
+    if variants.force_models is not None:
         return variants
-    laws = []
+    force_models = []
     for added in model.effects:
-        if (law := added.effect.law(compiled)) is not None:
-            laws.append((law, np.tile(added.array, (variants.count, 1))))
-    return replace(variants, laws=tuple(laws))
+        if (force_model := added.effect.force_model(compiled)) is not None:
+            force_models.append((force_model, np.tile(added.array, (variants.count, 1))))
+    return replace(variants, force_models=tuple(force_models))

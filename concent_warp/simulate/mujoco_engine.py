@@ -23,7 +23,7 @@ from concent_warp.simulate.inputs import (
     check_run,
     compile_model,
     host_variants,
-    with_laws,
+    with_force_models,
 )
 from concent_warp.simulate.processes import FEWEST, WORTH, in_processes
 from concent_warp.simulate.threads import simulations_at_a_time
@@ -106,7 +106,7 @@ class MujocoEngine:
         A variant that MuJoCo finds unstable is `diverged`, and its records are NaN from then on.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
-        variants = with_laws(self.model, self._compiled, host_variants(variants))
+        variants = with_force_models(self.model, self._compiled, host_variants(variants))
         run = SimulationRun(**{**vars(run), "variants": variants})
         results: list[VariantResult | None] = [None] * variants.count
         pending = list(range(variants.count))
@@ -144,10 +144,10 @@ class MujocoEngine:
     def _simulated(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants, as many at a time as may be."""
         count = min(self.threads, len(rows))
-        if run.variants.laws and count >= FEWEST and len(rows) * run.steps >= WORTH:
+        if run.variants.force_models and count >= FEWEST and len(rows) * run.steps >= WORTH:
             return in_processes(self._in_turn, run, rows, self.threads)
-        # Laws are written in Python, of which one thread runs at a time: several would only get in each other's way.
-        with ThreadPoolExecutor(1 if run.variants.laws else count) as pool:
+        # Force models are Python code, which runs in one thread at a time: more threads would only slow it down.
+        with ThreadPoolExecutor(1 if run.variants.force_models else count) as pool:
             return list(pool.map(lambda n: self._simulate(run, n), rows))
 
     def _in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
@@ -158,8 +158,8 @@ class MujocoEngine:
     def _simulate(self, run: SimulationRun, n: int) -> VariantResult | None:
         """Simulate variant n; None if its contacts or constraints did not fit the arena."""
         m = self._variant_model(run.variants, n)
-        laws = [(law, values[n]) for law, values in run.variants.laws or ()]
-        if any(law.edits for law, _ in laws):
+        force_models = [(force_model, values[n]) for force_model, values in run.variants.force_models or ()]
+        if any(force_model.edits for force_model, _ in force_models):
             m = copy.copy(m)
         d = mujoco.MjData(m)
         if run.variants.qpos is not None:
@@ -167,9 +167,9 @@ class MujocoEngine:
         if run.variants.qvel is not None:
             d.qvel[:] = run.variants.qvel[n]
         result = VariantResult.empty(m, run)
-        step = _simulate if not _unwatched(m, run) else _in_one_loop if laws else _in_one_call
+        step = _simulate if not _unwatched(m, run) else _in_one_loop if force_models else _in_one_call
         try:
-            result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, laws)
+            result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, force_models)
         except mujoco.FatalError as error:
             if "stack" in str(error) or "arena" in str(error):
                 return None
@@ -302,7 +302,7 @@ def _simulate(
     run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[ForceModel, np.ndarray]],
+    force_models: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
     """Step through the commands `ctrl`, shape (K, nu), filling `result`; returns whether the state stayed sane.
 
@@ -313,13 +313,13 @@ def _simulate(
     watch = run.contacts != "none"
     overwritten = m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     number = d.warning.number
-    base = {name: getattr(m, name).copy() for law, _ in laws for name in law.edits}
+    base = {name: getattr(m, name).copy() for force_model, _ in force_models for name in force_model.edits}
     k = 0
-    for stop in range(1, run.steps + 1) if laws else _stops(ctrl, run):
+    for stop in range(1, run.steps + 1) if force_models else _stops(ctrl, run):
         if m.nu:
             d.ctrl[:] = ctrl[k]
-        if laws:
-            _apply_laws(m, d, laws, base)
+        if force_models:
+            _apply_force_models(m, d, force_models, base)
         row = row_of.get(k)
         if row is None and not watch:
             mujoco.mj_step(m, d, nstep=stop - k)
@@ -338,8 +338,8 @@ def _simulate(
         k = stop
     mujoco.mj_checkPos(m, d)
     mujoco.mj_checkVel(m, d)
-    if laws:
-        _apply_laws(m, d, laws, base)
+    if force_models:
+        _apply_force_models(m, d, force_models, base)
     if run.steps in row_of and not number[DIVERGED].any():
         mujoco.mj_forward(m, d)
         result.put(row_of[run.steps], d, run.body_ids, d.qpos, d.qvel)
@@ -358,12 +358,12 @@ def _in_one_call(
     run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[ForceModel, np.ndarray]],
+    force_models: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
     """Do what `_simulate` does where nothing is watched, in MuJoCo's own loop, which lets other threads run."""
     from mujoco import rollout
 
-    del laws
+    del force_models
     number = d.warning.number
     start = np.concatenate([[0.0], d.qpos, d.qvel])
     # Sensors are those of the state before each step, so one more step gives those of the last state.
@@ -391,13 +391,15 @@ def _in_one_loop(
     run: SimulationRun,
     ctrl: np.ndarray,
     result: VariantResult,
-    laws: Sequence[tuple[ForceModel, np.ndarray]],
+    force_models: Sequence[tuple[ForceModel, np.ndarray]],
 ) -> bool:
-    """Do what `_simulate` does where nothing but laws asks for a pause; what goes wrong is left to `_simulate`."""
+    """Simulate as `_simulate` where only force models interrupt the steps; errors are left to `_simulate`."""
     number = d.warning.number
     start = d.qpos.copy(), d.qvel.copy(), d.userdata.copy()
-    base = [(getattr(m, name), getattr(m, name).copy()) for law, _ in laws for name in law.edits]
-    acting = [law.bound(m, d, values) for law, values in laws]
+    base = [
+        (getattr(m, name), getattr(m, name).copy()) for force_model, _ in force_models for name in force_model.edits
+    ]
+    acting = [force_model.bound(m, d, values) for force_model, values in force_models]
     row_of = np.full(run.steps + 1, -1)
     row_of[run.record] = np.arange(len(run.record))
     rows, held = row_of.tolist(), d.ctrl
@@ -422,20 +424,23 @@ def _in_one_loop(
         for field, value in base:
             field[:] = value
         d.qpos[:], d.qvel[:], d.userdata[:] = start
-        return _simulate(m, d, run, ctrl, result, laws)
+        return _simulate(m, d, run, ctrl, result, force_models)
     return True
 
 
-def _apply_laws(
-    m: mujoco.MjModel, d: mujoco.MjData, laws: Sequence[tuple[ForceModel, np.ndarray]], base: Mapping[str, np.ndarray]
+def _apply_force_models(
+    m: mujoco.MjModel,
+    d: mujoco.MjData,
+    force_models: Sequence[tuple[ForceModel, np.ndarray]],
+    base: Mapping[str, np.ndarray],
 ) -> None:
-    """Let force laws act on the coming step, from fields as they are in `base` and no applied force."""
+    """Let force models act on the coming step, from fields as they are in `base` and no applied force."""
     d.qfrc_applied[:] = 0
     d.xfrc_applied[:] = 0
     for name, value in base.items():
         getattr(m, name)[:] = value
-    for law, values in laws:
-        law.apply(m, d, values)
+    for force_model, values in force_models:
+        force_model.apply(m, d, values)
 
 
 def _stops(ctrl: np.ndarray, run: SimulationRun) -> Iterator[int]:

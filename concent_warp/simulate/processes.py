@@ -40,11 +40,15 @@ def _part_of(run: SimulationRun, rows: np.ndarray) -> SimulationRun:
 
 def _some(variants: Variants, rows: np.ndarray) -> Variants:
     """Return some of the variants."""
-    arrays = {f.name: getattr(variants, f.name) for f in fields(variants) if f.name not in ("count", "fields", "laws")}
+    arrays = {
+        f.name: getattr(variants, f.name) for f in fields(variants) if f.name not in ("count", "fields", "force_models")
+    }
     return replace(
         variants,
         count=len(rows),
         fields={name: value[rows] for name, value in variants.fields.items()},
-        laws=None if variants.laws is None else tuple((law, values[rows]) for law, values in variants.laws),
+        force_models=None
+        if variants.force_models is None
+        else tuple((force_model, values[rows]) for force_model, values in variants.force_models),
         **{name: None if value is None else value[rows] for name, value in arrays.items()},
     )

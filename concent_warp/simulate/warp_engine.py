@@ -16,7 +16,7 @@ import warp as wp
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
-from concent_warp.simulate.inputs import SPHERE_FIELDS, SimulationRun, check_run, compile_model, with_laws
+from concent_warp.simulate.inputs import SPHERE_FIELDS, SimulationRun, check_run, compile_model, with_force_models
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.simulate.warp_model import batchable, check_drag, is_switch
 from concent_warp.simulate.warp_program import Buffers, Demand, Plan, Program, world_bytes
@@ -132,7 +132,7 @@ class WarpEngine:
         velocity or acceleration is not finite or beyond 1e10 is `diverged`, and its records are NaN from then on.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
-        variants = _with_edited_fields(self._compiled, with_laws(self.model, self._compiled, variants))
+        variants = _with_edited_fields(self._compiled, with_force_models(self.model, self._compiled, variants))
         run = replace(run, variants=variants)
         for name in variants.fields:
             if not batchable(name):
@@ -160,10 +160,10 @@ class WarpEngine:
         program = self._program(run, len(rows))
         spheres = {name: _pick(getattr(run.variants, name), rows) for name in program.plan.spheres}
         fields = {name: _pick(value, rows) for name, value in run.variants.fields.items()}
-        laws = [_pick(values, rows) for _, values in run.variants.laws or ()]
+        force_models = [_pick(values, rows) for _, values in run.variants.force_models or ()]
         ctrl = run.ctrl[rows[: program.plan.commands] % len(run.ctrl)]
         qpos, qvel = _pick(run.variants.qpos, rows), _pick(run.variants.qvel, rows)
-        program.load(spheres, fields, laws, qpos, qvel, ctrl, run.record)
+        program.load(spheres, fields, force_models, qpos, qvel, ctrl, run.record)
         demand = program.run()
         if (grown := self._grown(self._buffers, demand, program)) is not None:
             self._buffers = grown
@@ -186,7 +186,7 @@ class WarpEngine:
     def _program(self, run: SimulationRun, worlds: int) -> Program:
         """Return a program for a run, a kept one if there is one."""
         assert self._buffers is not None
-        fields, laws = run.variants.fields, run.variants.laws or ()
+        fields, force_models = run.variants.fields, run.variants.force_models or ()
         edited = _edited_fields(run.variants)
         plan = Plan(
             worlds=worlds,
@@ -200,7 +200,7 @@ class WarpEngine:
                 (name, is_switch(name) and (name in edited or bool((fields[name] != 0).any())))
                 for name in sorted(fields)
             ),
-            laws=tuple((law, np.shape(values)[1]) for law, values in laws),
+            force_models=tuple((force_model, np.shape(values)[1]) for force_model, values in force_models),
         )
         if plan in self._programs:
             self._programs.move_to_end(plan)
@@ -326,12 +326,12 @@ def _probe(compiled: mujoco.MjModel, run: SimulationRun) -> tuple[int, int, int]
 
 
 def _edited_fields(variants: Variants) -> set[str]:
-    """Return the names of the model fields that force laws edit."""
-    return {name for law, _ in variants.laws or () for name in law.edits}
+    """Return the names of the model fields that force models edit."""
+    return {name for force_model, _ in variants.force_models or () for name in force_model.edits}
 
 
 def _with_edited_fields(compiled: mujoco.MjModel, variants: Variants) -> Variants:
-    """Return the variants with a row a world of each field that force laws edit."""
+    """Return the variants with a row a world of each field that force models edit."""
     shared = {name: getattr(compiled, name) for name in _edited_fields(variants) - set(variants.fields)}
     rows = {name: np.tile(value, (variants.count, *[1] * value.ndim)) for name, value in shared.items()}
     return replace(variants, fields={**variants.fields, **rows})

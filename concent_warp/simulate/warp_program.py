@@ -52,9 +52,9 @@ class Plan:
     spheres: tuple[str, ...]
     """Properties of the spheres that vary, `sphere_position` and so on."""
     fields: tuple[tuple[str, bool], ...]
-    """Model fields that vary, each with whether any value is not zero; those that laws edit are among them."""
-    laws: tuple[tuple[ForceModel, int], ...] = ()
-    """Force laws, each with how many parameters it has."""
+    """Model fields that vary, each with whether any value is not zero; those that force models edit are among them."""
+    force_models: tuple[tuple[ForceModel, int], ...] = ()
+    """Force models, each with how many parameters it has."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,11 @@ class Program:
                     njmax_nnz=buffers.nonzeros,
                 )
                 self._make_records()
-                self._laws = [(law, wp.zeros((plan.worlds, count), dtype=float)) for law, count in plan.laws]
-                edited = sorted({name for law, _ in plan.laws for name in law.edits})
+                self._force_models = [
+                    (force_model, wp.zeros((plan.worlds, count), dtype=float))
+                    for force_model, count in plan.force_models
+                ]
+                edited = sorted({name for force_model, _ in plan.force_models for name in force_model.edits})
                 self._unedited = [(getattr(self.model, name), wp.clone(getattr(self.model, name))) for name in edited]
                 self._integrate = INTEGRATORS[mujoco.mjtIntegrator(compiled.opt.integrator)]
                 for part in (self._begin, self._step, self._begin, self._end):
@@ -173,7 +176,7 @@ class Program:
         self,
         spheres: dict[str, Any],
         fields: dict[str, Any],
-        laws: Sequence[Any],
+        force_models: Sequence[Any],
         qpos: Any,
         qvel: Any,
         ctrl: Any,
@@ -184,7 +187,7 @@ class Program:
         Args:
             spheres: The properties that the plan names, shape (N, S, ...).
             fields: The fields that the plan names, shape (N, ...).
-            laws: Parameters of the laws that the plan names, shape (N, P) each.
+            force_models: Parameters of the force models that the plan names, shape (N, P) each.
             qpos: Shape (N, nq) or None for the model's own.
             qvel: Shape (N, nv) or None for zero.
             ctrl: Shape (n, K, nu).
@@ -194,7 +197,7 @@ class Program:
         self._world_model.load(spheres, fields)
         for field, unedited in self._unedited:
             wp.copy(unedited, field)
-        for (_, values), given in zip(self._laws, laws, strict=True):
+        for (_, values), given in zip(self._force_models, force_models, strict=True):
             wp.to_torch(values).copy_(tensor(given))
         initial = wp.to_torch(m.qpos0) if qpos is None else tensor(qpos)
         wp.to_torch(self._qpos).copy_(initial.expand(self.plan.worlds, -1))
@@ -263,7 +266,7 @@ class Program:
         wp.copy(d.qpos, self._qpos)
         wp.copy(d.qvel, self._qvel)
         self._world_model.place(d)
-        if self._laws:
+        if self._force_models:
             d.qfrc_actuator.zero_()
             d.qfrc_bias.zero_()
         self._clock.zero_()
@@ -291,7 +294,7 @@ class Program:
             inputs=[plan.steps, self._commands, self._clock],
             outputs=[d.ctrl],
         )
-        self._apply_laws()
+        self._apply_force_models()
         mjw.forward(m, d)
         widest = max(m.nq, m.nv, m.nsensordata, len(plan.bodies), 1)
         wp.launch(
@@ -316,17 +319,17 @@ class Program:
             outputs=self._records,
         )
 
-    def _apply_laws(self) -> None:
-        """Let force laws act on the coming step, from fields as they were loaded and no applied force."""
-        if not self._laws:
+    def _apply_force_models(self) -> None:
+        """Let force models act on the coming step, from fields as they were loaded and no applied force."""
+        if not self._force_models:
             return
         m, d = self.model, self.data
         for field, unedited in self._unedited:
             wp.copy(field, unedited)
         d.qfrc_applied.zero_()
         d.xfrc_applied.zero_()
-        for law, values in self._laws:
-            law.launch(m, d, values)
+        for force_model, values in self._force_models:
+            force_model.launch(m, d, values)
 
     def _take_contacts(self) -> None:
         """Keep what the plan asks for of this step's contacts."""

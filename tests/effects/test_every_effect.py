@@ -70,9 +70,9 @@ VARYING = [
     pytest.param(scene, e, id=f"{e.name} {scene} {' '.join(e.target)}")
     for scene, e in FOUND
     for m in [MODELS[scene].compile()]
-    if not e.edits and (e.fields(m) or e.law(m))
+    if not e.edits and (e.fields(m) or e.force_model(m))
 ]
-"""Effects that act by fields or by laws."""
+"""Effects that act by fields or by force models."""
 DERIVED = {"body_margin", "flg_gravcomp"}
 """What engines derive from the fields that `write` sets."""
 
@@ -153,11 +153,11 @@ def test_values_as_fields_and_laws_of_variants_do_the_same_as_in_the_model(scene
     engine = MujocoEngine(null, threads=1)
     m = engine.compiled
     fields = written(m, [effect], values, [slice(None)])
-    law = effect.law(m)
+    force_model = effect.force_model(m)
     start = {name: np.array([motion[name]], dtype=float) for name in ("qpos", "qvel") if name in motion}
     ctrl = effect.command(m, motion.get("ctrl", np.zeros((300, m.nu))), values[0])
-    laws = None if law is None else ((law, values),)
-    varied = engine.run(Variants(1, fields=fields, laws=laws, **start), ctrl)
+    force_models = None if force_model is None else ((force_model, values),)
+    varied = engine.run(Variants(1, fields=fields, force_models=force_models, **start), ctrl)
     added = move(MODELS[scene].add(effect, values[0]), 0.6, **motion)
     np.testing.assert_allclose(varied.qpos[0], added.qpos, rtol=0, atol=1e-9)
 

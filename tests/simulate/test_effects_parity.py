@@ -68,7 +68,7 @@ def typical(effect: Effect, m) -> list[float]:
 
 
 def on_every_target(model: Model, names: Sequence[str]) -> list[Effect]:
-    """Return effects that fields, laws and commands can express, on each target."""
+    """Return effects that fields, force models and commands can express, on each target."""
     m = model.compile()
     found = [cls(*target) for name in names for cls in [effect_classes()[name]] for target in cls.targets(m)]
     return [effect for effect in found if not effect.edits]
@@ -91,14 +91,14 @@ def all_at_once(device: str, names: Sequence[str] = ON_MOTION) -> tuple[list[Eff
     rows = np.tile(np.concatenate([a.array for a in model.effects]), (1 + len(chosen), 1))
     for n, (part, value) in enumerate(zip(parts, values, strict=True)):
         rows[1 + n, part] = value
-    acting = ((effect.law(m), rows[:, part]) for effect, part in zip(chosen, parts, strict=True))
+    acting = ((effect.force_model(m), rows[:, part]) for effect, part in zip(chosen, parts, strict=True))
     ctrl = np.tile(commands(m), (len(rows), 1, 1))
     for n, (effect, value) in enumerate(zip(chosen, values, strict=True)):
         ctrl[1 + n] = effect.command(m, ctrl[1 + n], np.array(value))
     variants = Variants(
         len(rows),
         fields=written(m, chosen, rows, parts),
-        laws=tuple((law, given) for law, given in acting if law is not None),
+        force_models=tuple((force_model, given) for force_model, given in acting if force_model is not None),
         qvel=np.tile(QVEL, (len(rows), 1)),
     )
     expected, found = engine.run(variants, ctrl), warp_engine.run(variants, ctrl).numpy()
@@ -170,7 +170,7 @@ class Half(Needy):
     name = "half"
     engines = ("mujoco", "warp")
 
-    def law(self, m):  # noqa: ARG002
+    def force_model(self, m):  # noqa: ARG002
         return NoKernel()
 
 

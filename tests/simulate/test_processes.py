@@ -1,4 +1,4 @@
-"""Laws in Python, in processes of their own."""
+"""Force models in Python, in processes of their own."""
 
 import numpy as np
 import pytest
@@ -22,13 +22,13 @@ def run(threads: int):
     model = Model(Scene(PENDULUM))
     effect = effect_class("load_friction")("hinge")
     engine = MujocoEngine(model.add(effect), threads=threads)
-    law = effect.law(engine.compiled)
-    assert law is not None
+    force_model = effect.force_model(engine.compiled)
+    assert force_model is not None
     values = np.linspace(0.0, 0.4, COUNT)[:, None] * np.ones(len(effect.parameters(engine.compiled)))
     mass = np.stack([engine.compiled.body_mass * scale for scale in np.linspace(1.0, 2.0, COUNT)])
     ctrl = 0.2 * np.sin(np.arange(STEPS) * 0.02)[None, :, None] * np.array([1.0, 2.0])[:, None, None]
     variants = Variants(
-        COUNT, qpos=np.linspace(0, 1, COUNT)[:, None], fields={"body_mass": mass}, laws=((law, values),)
+        COUNT, qpos=np.linspace(0, 1, COUNT)[:, None], fields={"body_mass": mass}, force_models=((force_model, values),)
     )
     return engine.run(variants, ctrl, bodies=[])
 
@@ -53,8 +53,8 @@ def test_an_error_in_another_process_is_told_as_here(monkeypatch):
     monkeypatch.setattr(mujoco_engine, "WORTH", 1)
     effect = effect_class("load_friction")("hinge")
     engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3)
-    law = effect.law(engine.compiled)
-    assert law is not None
+    force_model = effect.force_model(engine.compiled)
+    assert force_model is not None
     monkeypatch.setattr(MujocoEngine, "_simulate", None)  # in this process alone
-    with pytest.raises(ValueError):  # a law without its parameters
-        engine.run(Variants(3, laws=((law, np.zeros((3, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])
+    with pytest.raises(ValueError):  # a force model without its parameters
+        engine.run(Variants(3, force_models=((force_model, np.zeros((3, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])

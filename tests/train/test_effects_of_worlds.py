@@ -107,17 +107,21 @@ def test_each_world_moves_as_a_model_with_its_values(varied, engine):
 
 
 def one_by_one(model, task: Task, ctrl: np.ndarray, steps: int) -> np.ndarray:
-    """Return where C MuJoCo brings a single model, its laws written out here, shape (nq,)."""
+    """Return where C MuJoCo brings a single model, its force models written out here, shape (nq,)."""
     m = model.compile(task.collidable)
     d = mujoco.MjData(m)
     d.qpos[:] = task.replay.qpos[0]
     d.ctrl[:] = ctrl.astype(np.float32)
-    laws = [(law, added.array) for added in model.effects if (law := added.effect.law(m)) is not None]
+    force_models = [
+        (force_model, added.array)
+        for added in model.effects
+        if (force_model := added.effect.force_model(m)) is not None
+    ]
     loss = m.dof_frictionloss.copy()
     for _ in range(steps):
         m.dof_frictionloss[:] = loss
-        for law, values in laws:
-            law.apply(m, d, values)
+        for force_model, values in force_models:
+            force_model.apply(m, d, values)
         mujoco.mj_step(m, d)
     return d.qpos.copy()
 

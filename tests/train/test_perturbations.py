@@ -25,18 +25,18 @@ def acted(environment: Environment) -> torch.Tensor:
     return environment.physics.wrench.clone()
 
 
-@pytest.mark.parametrize("law", [False, True])
+@pytest.mark.parametrize("force_model", [False, True])
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_wrench_moves_the_body_that_it_acts_on_as_newton_says(task, engine, law):
+def test_wrench_moves_the_body_that_it_acts_on_as_newton_says(task, engine, force_model):
     m, body, steps = task.compiled, task.objects[0], 5
     effect = effect_class("stribeck_friction")(m.joint(int(task.robot.joint[0])).name)
-    acting = effect.law(m)
+    acting = effect.force_model(m)
     assert acting is not None
-    laws = [(acting, np.zeros((2, len(effect.parameters(m)))))] if law else []
+    force_models = [(acting, np.zeros((2, len(effect.parameters(m)))))] if force_model else []
     if engine == "warp":
-        physics = WarpPhysics(m, 2, steps, laws, device="cpu", nconmax=200, njmax=800)
+        physics = WarpPhysics(m, 2, steps, force_models, device="cpu", nconmax=200, njmax=800)
     else:
-        physics = MujocoPhysics(m, 2, steps, laws)
+        physics = MujocoPhysics(m, 2, steps, force_models)
     physics.qpos[:] = torch.as_tensor(task.replay.qpos[0]).to(physics.qpos.dtype)
     joint = m.body_jntadr[body]
     physics.qpos[:, m.jnt_qposadr[joint] + 2] += 1.0  # in the air

@@ -115,8 +115,10 @@ class MujocoPhysics:
         self._models = [self._model_of(i, fields or {}) for i in range(worlds)]
         self._data = [mujoco.MjData(m) for m in self._models]
         rows = list(enumerate(zip(self._models, self._data, strict=True)))
-        self._force_models = [[law.bound(m, d, values[i]) for law, values in force_models] for i, (m, d) in rows]
-        edited = sorted({name for law, _ in force_models for name in law.edits})
+        self._force_models = [
+            [force_model.bound(m, d, values[i]) for force_model, values in force_models] for i, (m, d) in rows
+        ]
+        edited = sorted({name for force_model, _ in force_models for name in force_model.edits})
         self._unedited = [[(getattr(m, name), getattr(m, name).copy()) for name in edited] for m in self._models]
         self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
         self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
@@ -178,8 +180,8 @@ class MujocoPhysics:
                     d.xfrc_applied[:] = wrench[i]
                     for target, values in self._unedited[i]:
                         target[:] = values
-                    for law in self._force_models[i]:
-                        law()
+                    for force_model in self._force_models[i]:
+                        force_model()
                     for actor in self._actors[i]:
                         if actor.force is not None:
                             actor.force(m, d)
@@ -252,7 +254,7 @@ class WarpPhysics:
         self.model, self.worlds, self.nconmax, self.njmax = model, worlds, nconmax, njmax
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
-        edited = sorted({name for law, _ in force_models for name in law.edits})
+        edited = sorted({name for force_model, _ in force_models for name in force_model.edits})
         varied = dict(fields or {})
         for name in set(edited) - set(varied):
             value = getattr(model, name)
@@ -267,7 +269,7 @@ class WarpPhysics:
             wp.synchronize_device(self._warp_device)
             self._unedited = [(getattr(self._model, n), wp.clone(getattr(self._model, n))) for n in edited]
             self._force_models: list[tuple[ForceModel, Any]] = [
-                (law, wp.array(values, dtype=float)) for law, values in force_models
+                (force_model, wp.array(values, dtype=float)) for force_model, values in force_models
             ]
             self._data = d = mjw.make_data(made.typical, nworld=worlds, nconmax=nconmax, njmax=njmax)
             self.qpos, self.qvel, self.ctrl = wp.to_torch(d.qpos), wp.to_torch(d.qvel), wp.to_torch(d.ctrl)
@@ -339,8 +341,8 @@ class WarpPhysics:
                     wp.copy(target, values)
                 self._data.qfrc_applied.zero_()
                 wp.copy(self._data.xfrc_applied, self._wrench)
-                for law, values in self._force_models:
-                    law.launch(self._model, self._data, values)
+                for force_model, values in self._force_models:
+                    force_model.launch(self._model, self._data, values)
             self._mjw.step(self._model, self._data)
         self._mjw.kinematics(self._model, self._data)
 

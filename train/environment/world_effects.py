@@ -74,7 +74,9 @@ def sample_world_effects(
             f"the simulator cannot vary {', '.join(fixed)} between worlds: all have the fitted value", stacklevel=2
         )
     force_models = [
-        (law, v) for added, v in zip(effects, values, strict=True) if (law := added.effect.law(m)) is not None
+        (force_model, v)
+        for added, v in zip(effects, values, strict=True)
+        if (force_model := added.effect.force_model(m)) is not None
     ]
     dynamics = tuple(
         _command_dynamics(m, a.effect, v) for a, v in zip(effects, values, strict=True) if a.effect.commands
@@ -97,8 +99,8 @@ def _is_uncertain(added: AddedEffect) -> bool:
 
 def _changes_motion(effect: Effect) -> bool:
     """Return whether an effect changes the motion, not only sensor readings."""
-    law, write = type(effect).law is not Effect.law, type(effect).write is not Effect.write
-    return law or write or effect.edits or effect.commands
+    force_model, write = type(effect).force_model is not Effect.force_model, type(effect).write is not Effect.write
+    return force_model or write or effect.edits or effect.commands
 
 
 def _can_vary(effect: Effect, fields: tuple[str, ...], variable: Callable[[str], bool] | None) -> bool:

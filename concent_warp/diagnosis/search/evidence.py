@@ -13,7 +13,7 @@ from concent_warp.diagnosis.search.candidates import label
 from concent_warp.diagnosis.search.null_distribution import null_p_value
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
+from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
 from concent_warp.fit.effects.prediction import Prediction
 
 
@@ -69,12 +69,12 @@ def assess(
 def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
-    The error of the formula itself is included, see `law_errors`.
+    The error of the formula itself is included, see `discretisation_errors`.
     """
     prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
     std = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.std is None else c.std
     fresh = range(prediction.owned, len(prediction.parameters))
-    formula = law_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
+    formula = discretisation_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
     found = []
     for k in fresh:
         p, value = prediction.parameters[k], float(c.fit.values[k])

@@ -151,7 +151,7 @@ class AnisotropicFriction(SurfaceEffect):
         """One ratio."""
         return (Parameter("ratio", "-", 1.0, 0.05, 10.0, 0.4),)
 
-    def law(self, m: mujoco.MjModel) -> ForceModel:
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """The force that the grain adds."""
         return AnisotropicForce(m, self.ids(m))
 
@@ -221,7 +221,7 @@ class Adhesion(SurfaceEffect):
         scan = tuple(weight * x for x in (0.1, 0.3, 1.0, 3.0))
         return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
 
-    def law(self, m: mujoco.MjModel) -> ForceModel:
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """The pull."""
         moving = np.flatnonzero(np.isin(m.body_weldid, m.body_weldid[self.ids(m)]))
         return AdhesionForce(m, moving, self.GAP)

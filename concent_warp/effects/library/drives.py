@@ -252,7 +252,7 @@ class Backlash(ServoEffect):
         scan = tuple(size * x for x in (0.005, 0.01, 0.02, 0.04, 0.08))
         return (Parameter("play", unit, 0.0, 0.0, 0.5 * size, 0.02 * size, scan=scan),)
 
-    def law(self, m: mujoco.MjModel) -> ForceModel:
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Torque that takes back the drive's within the play."""
         return LooseGear(self.ids(m), m.nuserdata - m.nu)
 

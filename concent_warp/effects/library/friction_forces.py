@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class DofLaw(ForceModel):
-    """A law that acts on some degrees of freedom."""
+    """A force model that acts on some degrees of freedom."""
 
     def __init__(self, dof: np.ndarray) -> None:
         """Act on the degrees of freedom `dof`, shape (n,) int."""

@@ -183,7 +183,7 @@ class Stribeck(DryFriction):
         )
         return (*parameters, speed)
 
-    def law(self, m: mujoco.MjModel) -> ForceModel:
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on speed."""
         return StribeckFriction(dof_of(m, self.ids(m)))
 
@@ -201,6 +201,6 @@ class LoadDependentFriction(DryFriction):
         """One coefficient for each joint."""
         return self.each("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
 
-    def law(self, m: mujoco.MjModel) -> ForceModel:
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on load."""
         return LoadFriction(dof_of(m, self.ids(m)))

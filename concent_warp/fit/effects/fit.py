@@ -12,7 +12,7 @@ from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, law_errors
+from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
 from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
@@ -229,17 +229,17 @@ def _fitted_parameters(
 ) -> tuple[list[FittedParameter], np.ndarray]:
     """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
 
-    The intervals are those of the linear fit with the law's own error, see `law_errors`.
+    The intervals combine the covariance of the linear fit with `discretisation_errors`.
     """
     blocks = cut_blocks(windows)
     limit = huber_limit([piece.residual for piece in pieces])
     covered = covariance(block_sums(pieces, blocks, limit), blocks)
     std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
-    law = np.zeros(len(std))
+    force_model = np.zeros(len(std))
     for part in solver.p.split:
         if part.stop > part.start:
-            law[part] = law_errors(solver.p.parameters[part], fit.values[part])
-    reaches = NORMAL * np.hypot(std * solver.scale, law)
+            force_model[part] = discretisation_errors(solver.p.parameters[part], fit.values[part])
+    reaches = NORMAL * np.hypot(std * solver.scale, force_model)
     found = []
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)

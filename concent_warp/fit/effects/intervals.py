@@ -11,8 +11,8 @@ from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.least_squares import PRIOR
 
-LAW_ERROR = 0.005
-"""Standard deviation of an effect's size over which simulations of one law in steps of time differ, as a share."""
+DISCRETISATION_ERROR = 0.005
+"""Relative standard deviation of an effect's size between time-stepping schemes of one force model [-]."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ def covariance(sums: Sums, blocks: Blocks) -> np.ndarray:
     return found
 
 
-def law_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
-    """Return what is uncertain of an effect's values because simulations of one law differ, one standard deviation.
+def discretisation_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
+    """Return standard deviations of an effect's values due to time discretisation, in the units of these, (P,).
 
-    A share of the effect's size, the largest difference of a parameter from its null value in units of its scale: the
-    others are told no better than that. It is no property of the data: the fit of a law that acts in steps of time to
-    data from another simulation of the same law is off by about this much (type B: Guide to the Expression of
+    `DISCRETISATION_ERROR` of the effect's size, which is the largest difference of a parameter from its null value in
+    units of its scale, for every parameter. It does not depend on the data: a force model fitted to data from another
+    time-stepping scheme of the same model is off by about this much (type B evaluation: Guide to the Expression of
     Uncertainty in Measurement, 2008, section 4.3).
     """
     scale = np.array([p.scale for p in parameters])
     null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
     finite = np.where(np.isfinite(values), values, null)
-    return LAW_ERROR * scale * float(np.abs((finite - null) / scale).max())
+    return DISCRETISATION_ERROR * scale * float(np.abs((finite - null) / scale).max())

@@ -196,12 +196,12 @@ class Prediction:
                 plain[trial.window] = self._commands(m, w, steps)
             ctrl[i] = self._acting(m, plain[trial.window], values[i], steps)
         fields = written(bare, self.effects, values, self.split)
-        laws = [
-            (law, values[:, part])
+        force_models = [
+            (force_model, values[:, part])
             for e, part in zip(self.effects, self.split, strict=True)
-            if (law := e.law(m)) is not None
+            if (force_model := e.force_model(m)) is not None
         ]
-        variants = Variants(n, qpos=qpos, qvel=qvel, fields=fields, laws=laws)
+        variants = Variants(n, qpos=qpos, qvel=qvel, fields=fields, force_models=force_models)
         rollout = engine.run(variants, ctrl, bodies=[]).numpy()
         self.simulated += n * steps * m.opt.timestep
         courses = []

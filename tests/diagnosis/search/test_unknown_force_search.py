@@ -145,10 +145,11 @@ def test_a_model_that_explains_nothing_needs_no_such_test():
 
 
 def test_bumps_lie_where_the_joint_was():
-    laws = [
-        force.law(mujoco.MjModel.from_xml_string(rail())) for force in _forces(nodes_of(ridden())[0], CFG.unknown_force)
+    force_models = [
+        force.force_model(mujoco.MjModel.from_xml_string(rail()))
+        for force in _forces(nodes_of(ridden())[0], CFG.unknown_force)
     ]
-    position, velocity = laws
+    position, velocity = force_models
     assert isinstance(position, UnknownJointForce)
     assert isinstance(velocity, UnknownJointForce)
     low, high = position.centre[0, [0, -1]]
