@@ -47,8 +47,8 @@ from concent_warp.fit.effects.observe import channel_noises, observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
+from concent_warp.simulate.parallel import limit_simulations
 from concent_warp.simulate.select import EngineName
-from concent_warp.simulate.threads import at_most
 
 BASELINE_SPAN, ADDITIONS_SPAN = 0.1, 0.85
 """Shares of a diagnosis that the baseline and the additions take, for the progress."""
@@ -79,7 +79,7 @@ class Procedure:
 
     def run(self) -> Diagnosis:
         """Return the diagnosis."""
-        with at_most(self.cfg.jobs if self.cfg.jobs > 0 else None):
+        with limit_simulations(self.cfg.jobs if self.cfg.jobs > 0 else None):
             return self._run()
 
     def _run(self) -> Diagnosis:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, cast
 
-from concent_warp.simulate.threads import at_most
+from concent_warp.simulate.parallel import limit_simulations
 
 T = TypeVar("T")
 
@@ -66,5 +66,5 @@ def run_tasks(task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], jobs
 
 def _with_threads(threads: int, task: Callable[..., T], *arguments: Any) -> T:
     """Run a task with at most so many simulations at a time, at least one."""
-    with at_most(threads):
+    with limit_simulations(threads):
         return task(*arguments)

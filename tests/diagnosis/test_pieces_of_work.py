@@ -3,7 +3,7 @@
 import os
 
 from concent_warp.diagnosis.tasks import run_tasks
-from concent_warp.simulate.threads import at_most, simulations_at_a_time
+from concent_warp.simulate.parallel import limit_simulations, simulations_at_a_time
 
 CPUS = len(os.sched_getaffinity(0))
 
@@ -13,7 +13,7 @@ def allowed(_: int) -> int:
 
 
 def test_tasks_share_the_cpus():
-    with at_most(2):
+    with limit_simulations(2):
         assert list(run_tasks(allowed, [(0,)], 2)) == [min(2, CPUS)]  # one task alone may take all
         assert list(run_tasks(allowed, [(0,), (1,)], 2)) == [1, 1]
         assert list(run_tasks(allowed, [(0,), (1,), (2,)], 2)) == [1, 1, 1]

@@ -2,18 +2,18 @@
 
 import os
 
-from concent_warp.simulate.threads import at_most, simulations_at_a_time
+from concent_warp.simulate.parallel import limit_simulations, simulations_at_a_time
 
 CPUS = len(os.sched_getaffinity(0))
 
 
 def test_one_simulation_runs_for_each_cpu_or_fewer():
     assert simulations_at_a_time() == CPUS
-    with at_most(1):
+    with limit_simulations(1):
         assert simulations_at_a_time() == 1
-        with at_most(None):
+        with limit_simulations(None):
             assert simulations_at_a_time() == 1
-        with at_most(CPUS + 7):
+        with limit_simulations(CPUS + 7):
             assert simulations_at_a_time() == CPUS
         assert simulations_at_a_time() == 1
     assert simulations_at_a_time() == CPUS

@@ -1,8 +1,11 @@
-"""Simulations in processes of their own: where each step calls Python, threads would wait for one another."""
+"""How simulations of C MuJoCo run at the same time: in threads, or in processes where each step calls Python."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -13,18 +16,35 @@ if TYPE_CHECKING:
     from concent_warp.simulate.inputs import SimulationRun
 
 T = TypeVar("T")
-FEWEST = 3
-"""Processes from which on it pays: what they are sent and send back takes its time as well."""
-WORTH = 20_000
-"""Steps, of all simulations together, from which on it pays to hand them over: they take a second in one thread."""
+MIN_PROCESSES = 3
+"""Fewest processes that are started: with two, sending data takes as long as is saved."""
+MIN_STEPS = 20_000
+"""Fewest steps of all simulations together for which processes are started: about one second in one thread."""
+
+_limit: ContextVar[int | None] = ContextVar("limit of simulations at a time", default=None)
+
+
+def simulations_at_a_time() -> int:
+    """Return how many simulations an engine of C MuJoCo runs at a time by default: one a CPU, within the limit set."""
+    return min(len(os.sched_getaffinity(0)), _limit.get() or 2**31)
+
+
+@contextmanager
+def limit_simulations(count: int | None) -> Iterator[None]:
+    """Limit engines that are made within to `count` simulations at a time; None keeps the limit."""
+    token = _limit.set(_limit.get() if count is None else max(count, 1))
+    try:
+        yield
+    finally:
+        _limit.reset(token)
 
 
 def in_processes(
     work: Callable[[SimulationRun], list[T]], run: SimulationRun, rows: Sequence[int], count: int
 ) -> list[T]:
-    """Return what `work` finds for some variants of a run, in their order, shared among `count` processes.
+    """Return the results of `work` for some variants of a run, in their order, computed in `count` processes.
 
-    The processes stay for a while, for the next time.
+    The processes stay alive for the next call.
     """
     from joblib import Parallel, delayed
 

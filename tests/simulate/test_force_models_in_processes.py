@@ -35,7 +35,7 @@ def run(threads: int):
 
 def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
     alone = run(1)
-    monkeypatch.setattr(mujoco_engine, "WORTH", 1)
+    monkeypatch.setattr(mujoco_engine, "MIN_STEPS", 1)
     with monkeypatch.context() as here:
         here.setattr(MujocoEngine, "_simulate", None)  # in this process alone
         shared = run(3)
@@ -50,7 +50,7 @@ def test_few_steps_stay_where_they_are(monkeypatch):
 
 
 def test_an_error_in_another_process_is_told_as_here(monkeypatch):
-    monkeypatch.setattr(mujoco_engine, "WORTH", 1)
+    monkeypatch.setattr(mujoco_engine, "MIN_STEPS", 1)
     effect = effect_class("load_friction")("hinge")
     engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3)
     force_model = effect.force_model(engine.compiled)
