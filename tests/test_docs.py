@@ -67,6 +67,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
 def test_python_of_a_page_runs_from_top_to_bottom(page, recorded, tmp_path):
     (tmp_path / "demo.h5").symlink_to(recorded)
+    (tmp_path / "runs" / "demo").mkdir(parents=True)
+    (tmp_path / "runs" / "demo" / "demo.h5").symlink_to(recorded)
     (tmp_path / "page.py").write_text("\n".join([GIVEN.get(page.name, ""), *blocks(page, "python")]))
     done = subprocess.run(
         [sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
