@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError
-from concent_warp.estimation.object_tracks import whole
+from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.fit.newton.descent import (
     Descent,
     GradientCfg,
@@ -31,13 +32,16 @@ def metric(swelling=0.0) -> Metric:
     return Metric(GEOMETRY, EVERY, growth, 1e-4, swelling, 1e-4)
 
 
-def quadratic(parameters) -> SimpleNamespace:
+def quadratic(parameters) -> Any:
     """Return the distance to the goal, summed in squares, and its gradient."""
     away = parameters.position - GEOMETRY.position - GOAL
     return SimpleNamespace(loss=(away**2).sum(axis=(1, 2)), by={"position": 2 * away})
 
 
-def run(state, loss=quadratic, cfg=CFG) -> Descent:
+QUADRATIC: Any = quadratic
+
+
+def run(state, loss: Any = quadratic, cfg=CFG) -> Descent:
     while not state.finished:
         descend(state, loss, GEOMETRY.position, metric(), cfg, lambda values: values)
     return state
@@ -56,26 +60,26 @@ def test_a_descent_finds_the_minimum_of_a_smooth_loss():
 
 def test_steps_grow_while_the_loss_falls_and_are_halved_where_it_does_not():
     state = started()
-    descend(state, quadratic, GEOMETRY.position, metric(), CFG, lambda values: values)
+    descend(state, QUADRATIC, GEOMETRY.position, metric(), CFG, lambda values: values)
     assert state.step[0] == pytest.approx(1e-3)
     assert np.linalg.norm(state.now[0], axis=1).max() == pytest.approx(1e-3)
-    descend(state, quadratic, GEOMETRY.position, metric(), CFG, lambda values: values)
+    descend(state, QUADRATIC, GEOMETRY.position, metric(), CFG, lambda values: values)
     assert state.step[0] == pytest.approx(1.2e-3)
     best = state.best.copy()
     state.now = state.best + 1.0
-    descend(state, quadratic, GEOMETRY.position, metric(), CFG, lambda values: values)
+    descend(state, QUADRATIC, GEOMETRY.position, metric(), CFG, lambda values: values)
     assert state.step[0] == pytest.approx(0.6e-3)
     np.testing.assert_array_equal(state.best, best)
 
 
 def test_a_loss_that_is_not_finite_counts_as_no_progress():
-    def broken(parameters):
+    def broken(parameters) -> Any:
         found = quadratic(parameters)
         found.loss[0] = np.nan
         return found
 
     state = started(2)
-    descend(state, broken, GEOMETRY.position, metric(), CFG, lambda values: values)
+    descend(state, cast(Any, broken), GEOMETRY.position, metric(), CFG, lambda values: values)
     assert state.losses == [[np.inf, pytest.approx((GOAL**2).sum())]]
     assert state.kept_start == [1]
     assert np.isinf(state.lowest[0])
@@ -146,7 +150,7 @@ def test_a_saved_state_is_read_for_the_same_descent_alone(tmp_path):
 
 
 def test_a_shortened_stretch_is_its_beginning(drop, swollen):
-    segment = whole(swollen.scene, drop[0], ("block",))
+    segment = whole_demonstration(swollen.scene, drop[0], ("block",))
     short = shortened(swollen.scene.model, segment, 0.2)
     (target,), (before,) = short.targets, segment.targets
     assert len(short.ctrl) == 50
@@ -157,7 +161,7 @@ def test_a_shortened_stretch_is_its_beginning(drop, swollen):
 
 
 def test_the_tilt_is_the_largest_change_of_the_angle_to_the_vertical(drop, swollen):
-    (target,) = whole(swollen.scene, drop[0], ("block",)).targets
+    (target,) = whole_demonstration(swollen.scene, drop[0], ("block",)).targets
     assert _tilt(target) == pytest.approx(0.0, abs=1e-6)
     turned = target.points.copy()
     angle = 0.4
