@@ -106,7 +106,7 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
     """Write the resolved settings, the command and the versions to the run folder, and return them.
 
     Raises:
-        ConcentError: A run to go on with was begun with other settings; nothing in the folder has been touched then.
+        ConcentError: The folder holds an interrupted run with other settings; nothing in the folder is changed.
     """
     import tomli_w
 
@@ -131,7 +131,7 @@ def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[st
             where=path.parent,
             expected=", ".join(f"{name} {before.get(name)}" for name in differing),
             found=", ".join(f"{name} {now.get(name)}" for name in differing),
-            fix=f"go on with `{_resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
+            fix=f"continue with `{_resuming(shlex.split(stored.get('command', '')))}`, or start anew with --overwrite",
         )
 
 

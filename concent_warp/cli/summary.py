@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def fit_progress() -> Iterator[Callable[[Progress], None]]:
-    """Show the progress of a fit; an interruption says with which command to go on."""
+    """Show the progress of a fit; on an interruption, name the command that continues it."""
     quiet_warp()
     try:
         with status_bar("fitting") as update:
@@ -36,7 +36,7 @@ def fit_progress() -> Iterator[Callable[[Progress], None]]:
 
             yield show
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"The state is saved; go on with: {resuming_command()}") from None
+        raise KeyboardInterrupt(f"The state is saved; continue with: {resuming_command()}") from None
 
 
 def say_grounded(found: Grounded, folder: Path) -> None:

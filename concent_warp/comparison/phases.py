@@ -26,14 +26,12 @@ from concent_warp.events.grasp import opposed
 from concent_warp.events.roles import Roles
 from concent_warp.events.staging import ROBOT
 from concent_warp.events.touches import BodyPoses, ReplayContacts
-from concent_warp.simulate.replay import replay
 
 if TYPE_CHECKING:
     import mujoco
 
     from concent_warp.model import Model
-    from concent_warp.recording.recording import Demonstration
-    from concent_warp.simulate.engine import Engine, Rollout
+    from concent_warp.simulate.engine import Rollout
 
 IMPACT, SLIDE, GRASPED, FREE, STICK, REST = "impact", "slide", "grasped", "free", "stick", "rest"
 MOTIONS: tuple[str, ...] = (IMPACT, SLIDE, GRASPED, FREE, STICK, REST)
@@ -113,16 +111,6 @@ class ContactStage(StageLike, Protocol):
 def tell_a_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
     """Return whether contact stages, by demonstration, part what a robot does: it opens one of two or more of them."""
     return any(len(found) > 1 and any(ROBOT in s.bodies for s in found) for found in stages.values())
-
-
-def _replay_phases(model: Model, demonstration: Demonstration, engine: Engine) -> tuple[Phase, ...]:
-    """Return the ways of moving over a demonstration's replay; one span over all where it does not stay finite."""
-    return _motion_phases(model, engine.compiled, replay(model, demonstration, engine, contacts="all").numpy())
-
-
-def _motion_phases(model: Model, compiled: mujoco.MjModel, rollout: Rollout) -> tuple[Phase, ...]:
-    """Return the ways of moving over a replay, without gaps; see `phases_by_body` for the arguments."""
-    return phases_by_body(model, compiled, rollout)[None]
 
 
 def phases_by_body(

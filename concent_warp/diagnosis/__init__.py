@@ -1,1 +1,1 @@
-"""Comparison of a model with measurements."""
+"""Diagnosis of the physical effect that a model lacks, from measurements."""

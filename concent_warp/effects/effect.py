@@ -99,8 +99,6 @@ class Effect:
     """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders what data cannot tell apart."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
-    threshold: ClassVar[bool] = False
-    """Whether small changes about the null value say little, so that `Parameter.scan` is to be tried."""
     history: ClassVar[float] = 0.0
     """How far back [s] the commands reach into what acts now."""
 

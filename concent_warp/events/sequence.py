@@ -157,17 +157,6 @@ class ContactEventSequence:
         """Entities by name."""
         return {entity.name: entity for entity in self.entities}
 
-    def stage_at(self, time: float) -> int:
-        """Return the index of the stage that has begun at a time [s]; -1 before the first."""
-        return sum(stage.start <= time + 1e-9 for stage in self.stages) - 1
-
-    def target_at(self, time: float) -> int:
-        """Return the index of the stage whose target event is to be achieved next at a time [s].
-
-        On the way to a stage's first contact that is the stage to come; in the last stage, the last one.
-        """
-        return min(self.stage_at(time) + 1, len(self.stages) - 1)
-
     def save(self, path: str | Path) -> None:
         """Write a JSON file, in one piece or not at all; the same sequence gives the same bytes."""
         path = Path(path)

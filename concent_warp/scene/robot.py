@@ -2,7 +2,7 @@
 
 Where the figures come from:
 
-- kinematics (modified Denavit-Hartenberg), limits of position, velocity and torque: Franka Control Interface
+- kinematics (modified Denavit-Hartenberg), limits of position and torque: Franka Control Interface
   documentation, "Robot and interface specifications";
 - link masses, centres of mass and inertias: the `inertial` elements of `franka_description`, which follow Gaz et al.,
   "Dynamic identification of the Franka Emika Panda robot with retrieval of feasible parameters using penalty-based
@@ -44,8 +44,6 @@ RANGE = (
     (-2.8973, 2.8973),
 )
 """Joint limits [rad]."""
-MAX_VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
-"""Joint velocity limits [rad/s]."""
 MAX_TORQUE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 """Joint torque limits [N m]."""
 STIFFNESS = (600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0)

@@ -43,7 +43,7 @@ class LeRobotWriter:
     def __init__(
         self, folder: Path, layout: EpisodeLayout, *, codec: Codec = "h264", video_mb: float = VIDEO_MB
     ) -> None:
-        """Open a data set, new or to go on with.
+        """Open a data set, new or to be continued.
 
         Args:
             folder: Its folder.

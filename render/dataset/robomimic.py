@@ -30,7 +30,7 @@ class RobomimicWriter:
     """A file in robomimic's layout that grows episode by episode."""
 
     def __init__(self, folder: Path, layout: EpisodeLayout) -> None:
-        """Open a data set, new or to go on with.
+        """Open a data set, new or to be continued.
 
         Raises:
             RenderError: It was begun with other settings.

@@ -92,11 +92,3 @@ def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: P
                     packet.stream = stream
                     whole.mux(packet)
             before += length
-
-
-def _read_frames(path: Path) -> np.ndarray:
-    """Return all frames of a video, shape (T, H, W, 3) uint8."""
-    import av
-
-    with av.open(str(path)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])

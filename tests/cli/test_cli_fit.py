@@ -110,7 +110,7 @@ def test_an_interrupted_fit_says_how_to_go_on_and_then_ends_as_if_it_had_not_bee
     assert fit(bench, folder, "--overwrite") == 130
     error = capsys.readouterr().err
     assert "The state is saved" in error
-    again = shlex.split(error.rsplit("go on with: concent ")[1])
+    again = shlex.split(error.rsplit("continue with: concent ")[1])
     assert not (folder / "model.toml").exists()
     monkeypatch.undo()
     assert main(again) == 0

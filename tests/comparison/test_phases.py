@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from concent_warp.comparison.phases import Phase, _replay_phases, phases_by_body, stage_phases, tell_a_task
+from concent_warp.comparison.phases import Phase, phases_by_body, stage_phases, tell_a_task
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -35,7 +35,9 @@ def phases(xml, duration, qvel=None, command=None, qpos=None):
         action=action,
         measured={"clock": Channel(time, np.zeros((2, 1)))},
     )
-    return _replay_phases(model, demonstration, MujocoEngine(model))
+    engine = MujocoEngine(model)
+    rollout = replay(model, demonstration, engine, contacts="all").numpy()
+    return phases_by_body(model, engine.compiled, rollout)[None]
 
 
 def names(found):

@@ -56,13 +56,6 @@ def test_contacts_lie_within_the_contacts_of_their_bodies(insertion: ContactEven
         assert any(start <= c.start and c.end <= end for start, end in spans[bodies])
 
 
-def test_stage_and_target_at_a_time(insertion: ContactEventSequence):
-    pick, align, insert = (stage.start for stage in insertion.stages)
-    times = (0.0, pick, align - 1e-3, align, insert, insertion.duration)
-    assert [insertion.stage_at(t) for t in times] == [-1, 0, 0, 1, 2, 2]
-    assert [insertion.target_at(t) for t in times] == [0, 1, 1, 2, 2, 2]
-
-
 BROKEN = {
     "truncated": (lambda t: t[: len(t) // 2], "not a JSON file"),
     "not JSON": (lambda _: "hello", "not a JSON file"),

@@ -11,6 +11,14 @@ from concent_warp.render.dataset.layout import EpisodeLayout
 LAYOUT = EpisodeLayout(10, ("base", "wrist"), (32, 48), ("a", "b"), ("x", "y", "z"))
 
 
+def read_frames(path: Path) -> np.ndarray:
+    """Return all frames of a video, shape (T, H, W, 3) uint8."""
+    import av
+
+    with av.open(str(path)) as container:
+        return np.stack([image.to_ndarray(format="rgb24") for image in container.decode(video=0)])
+
+
 def frame(key: int, t: int) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Return images whose grey tells episode and time, a state and an action."""
     images = {

@@ -8,14 +8,14 @@ import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from small_dataset import LAYOUT, frame, length, write
+from small_dataset import LAYOUT, frame, length, read_frames, write
 
 from concent_warp.errors import RenderError
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
 from concent_warp.render.dataset.statistics import ImageHistogram, merged, of_values
-from concent_warp.render.dataset.video import VideoWriter, _read_frames
+from concent_warp.render.dataset.video import VideoWriter
 
 
 def episodes(folder: Path) -> list[dict]:
@@ -47,7 +47,7 @@ def check(folder: Path, keys: list[int]) -> None:
         for camera in LAYOUT.cameras:
             prefix = f"videos/observation.images.{camera}"
             place = {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
-            video = _read_frames(folder / info["video_path"].format(video_key=f"observation.images.{camera}", **place))
+            video = read_frames(folder / info["video_path"].format(video_key=f"observation.images.{camera}", **place))
             start = round(row[f"{prefix}/from_timestamp"] * 10)
             assert round(row[f"{prefix}/to_timestamp"] * 10) == start + length(key)
             for t in range(length(key)):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import small_arm
 from small_arm import ball
+from small_dataset import read_frames
 
 from concent_warp.cli.entry import main
 from concent_warp.recording.formats.hdf5 import write_hdf5
-from concent_warp.render.dataset.video import _read_frames
 
 TRAIN = [
     "--network.size", "16", "--network.width", "16", "--network.factors", "1", "2", "--flow.batch", "8",
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def frames(dataset: Path, camera: str) -> np.ndarray:
     """Return the images of a camera in a data set of one file, 0..1."""
-    return _read_frames(dataset / f"videos/observation.images.{camera}/chunk-000/file-000.mp4") / 255
+    return read_frames(dataset / f"videos/observation.images.{camera}/chunk-000/file-000.mp4") / 255
 
 
 def test_hybrid_images_are_nearer_to_the_cameras_than_the_simulations(folder):
@@ -59,7 +59,7 @@ def test_hybrid_images_are_nearer_to_the_cameras_than_the_simulations(folder):
         real = small_arm.filmed(small_arm.states(9, 16), objects=True)[camera][: len(raw)] / 255
         gain = 10 * np.log10(np.square(raw - real).mean() / np.square(hybrid - real).mean())
         assert gain > 6, camera
-    film = _read_frames(folder / "hybrid" / "films" / "episode_000000.mp4")
+    film = read_frames(folder / "hybrid" / "films" / "episode_000000.mp4")
     assert film.shape[1:] == (64, 128, 3)
     info = json.loads((folder / "hybrid" / "meta" / "info.json").read_text())
     assert info["features"]["observation.state"]["names"] == ["turn", "bend"]

@@ -28,12 +28,12 @@ class Arguments:
     out: OutPath = Path("runs/demo")
     """Run folder."""
     seeds: tuple[int, ...] = (0,)
-    """Demonstrations to fit, by the seed that draws them."""
+    """Seeds of the demonstrations to fit."""
     unseen_seeds: tuple[int, ...] = (1, 2)
-    """Further demonstrations, which the fit never sees, to judge it by."""
+    """Seeds of further demonstrations, on which the fit is evaluated and which it does not use."""
     engine: EngineOption = "auto"
     resume: bool = False
-    """Go on with an interrupted run, to the same result."""
+    """Continue an interrupted run; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     geometry: Annotated[ContactGeometryCfg, tyro.conf.OmitArgPrefixes] = field(

@@ -61,7 +61,7 @@ class Arguments:
     jobs: int = -1
     """Processes at a time; -1: one a CPU."""
     seed: int = 0
-    """Seed of all that is drawn."""
+    """Seed of all random numbers."""
     out: OptionalOutPath = None
     """Folder for finished parts, from which the same command continues after an interruption, and for the motion of the
     suggested experiment."""

@@ -43,7 +43,7 @@ class Arguments:
     start for the former. Where gradients do not help, "es" is taken and said so."""
     engine: EngineOption = "auto"
     resume: bool = False
-    """Go on with an interrupted run, to the same result."""
+    """Continue an interrupted run; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     geometry: Annotated[ContactGeometryCfg, tyro.conf.OmitArgPrefixes] = field(default_factory=ContactGeometryCfg)

@@ -36,7 +36,7 @@ class Arguments:
     """Steps of each network; short for --flow.steps and --enlarge.steps."""
     device: DeviceOption = None
     resume: bool = False
-    """Go on with an interrupted training, as if it had not stopped."""
+    """Continue an interrupted training; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     train: Annotated[RenderTrainCfg, tyro.conf.arg(name="")] = field(default_factory=RenderTrainCfg)
@@ -79,7 +79,7 @@ def run(arguments: Arguments) -> RenderTraining:
 
                 training.learn(show)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"The state is saved; go on with: {resuming_command()}") from None
+            raise KeyboardInterrupt(f"The state is saved; continue with: {resuming_command()}") from None
     frames = ", ".join(f"{one.camera.name} {len(one)}" for one in pairs)
     say(f"trained on frames: {frames}; {total} steps of {len(names)} networks")
     say_written(folder / CHECKPOINT)

@@ -48,7 +48,7 @@ class Arguments:
     """Larger images are made smaller, so that their longer edge has so many pixels."""
     device: DeviceOption = None
     resume: bool = False
-    """Go on with an interrupted fit, to the same result."""
+    """Continue an interrupted fit; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     fit: SplatFitCfg = field(default_factory=SplatFitCfg)
@@ -68,7 +68,7 @@ def run(arguments: Arguments) -> list[Score]:
             fit = _fitted(arguments, views, folder / CHECKPOINT)
         except KeyboardInterrupt:
             saved = (folder / CHECKPOINT).exists()
-            ending = f"The state is saved; go on with: {resuming_command()}" if saved else "Nothing was saved yet."
+            ending = f"The state is saved; continue with: {resuming_command()}" if saved else "Nothing was saved yet."
             raise KeyboardInterrupt(ending) from None
         return _write_results(fit, folder)
 

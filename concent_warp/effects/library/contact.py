@@ -212,7 +212,6 @@ class Adhesion(SurfaceEffect):
     signature = "lift-off and first slip too late; residual friction that does not go with the weight"
     confusions = ("sliding_friction", "mass")
     rarity = 6.0
-    threshold = True
     GAP = 0.001
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -237,7 +236,6 @@ class PadFriction(Effect):
     source = f"Coulomb friction in MuJoCo's contacts, the pads' coefficient by priority ({MUJOCO})"
     signature = "the grasped object slips or does not"
     confusions = ("grip_force", "mass")
-    threshold = True
     wants = "bodies with geoms that collide"
 
     def suits(self, m: mujoco.MjModel, i: int) -> bool:

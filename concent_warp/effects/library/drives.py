@@ -100,7 +100,6 @@ class GripForce(ActuatorGain):
     source = f"MuJoCo's actuator gain and bias ({MUJOCO})"
     signature = "the grasped object slips or does not; fingers close slower or faster"
     confusions = ("pad_friction", "mass")
-    threshold = True
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
@@ -130,7 +129,6 @@ class ActuatorSaturation(DriveEffect):
     source = f"MuJoCo's force range ({MUJOCO})"
     signature = "residuals only where much torque is commanded: slow start, late arrival"
     confusions = ("actuator_gain", "actuator_lag")
-    threshold = True
     FREE = 1e6
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
@@ -239,7 +237,6 @@ class Backlash(ServoEffect):
     source = "play between inertias: Nordin and Gutman, Automatica 38(10), 2002; the rotor's left out"
     signature = "error that flips by the play at each reversal of the load; free swing in between"
     confusions = ("joint_friction", "stribeck_friction", "joint_compliance")
-    threshold = True
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Make room for how far each rotor is ahead of its link."""

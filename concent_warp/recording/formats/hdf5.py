@@ -251,8 +251,3 @@ class Reader(SafeFile):
             np.asarray(matrices["pose"]),
             self.text_attribute(group, "body"),
         )
-
-
-def _reason(error: Exception) -> str:
-    """Return what an exception says, in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
