@@ -69,7 +69,7 @@ def prediction_errors(model: Model, spans: Spans, channels: Sequence[str]) -> di
     """Return the root mean square error of each window beyond its head, by channel, each of shape (W,), in SI units."""
     solver = Solver(Prediction(model, (), spans.head, threads=1))
     values = solver.p.start
-    offsets, _ = solver.refine_starts(values, [np.zeros(len(w.spread)) for w in spans.head])
+    offsets, _ = solver.fit_initial_states(values, [np.zeros(len(w.spread)) for w in spans.head])
     judged = Solver(Prediction(model, (), spans.whole, threads=1))
     residuals = judged.p.residuals(judged.trials(values, offsets))
     found = {name: np.full(len(spans.whole), np.nan) for name in channels}
@@ -144,7 +144,7 @@ def noise_errors(model: Model, spans: Spans) -> np.ndarray:
     """Return the root mean square of residual over noise of each window beyond its head, all channels, shape (W,)."""
     solver = Solver(Prediction(model, (), spans.head, threads=1))
     values = solver.p.start
-    offsets, _ = solver.refine_starts(values, [np.zeros(len(w.spread)) for w in spans.head])
+    offsets, _ = solver.fit_initial_states(values, [np.zeros(len(w.spread)) for w in spans.head])
     judged = Solver(Prediction(model, (), spans.whole, threads=1))
     found = np.full(len(spans.whole), np.nan)
     for k, r in enumerate(judged.p.residuals(judged.trials(values, offsets))):

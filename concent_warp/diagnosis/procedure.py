@@ -41,7 +41,7 @@ from concent_warp.effects.effect import Effect
 from concent_warp.estimation.noise import UNDERESTIMATE
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
-from concent_warp.fit.effects.initial_states import ROUNDS
+from concent_warp.fit.effects.initial_states import InitialStateCfg
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, observe
 from concent_warp.fit.effects.prediction import Prediction
@@ -110,12 +110,14 @@ class Procedure:
         recorded = [d.measured for d in self.recording.demonstrations]
         stated = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
         if stated >= set(noise):
-            return self._fitted_baseline(noise, ROUNDS)
+            return self._fitted_baseline(noise, InitialStateCfg.iterations)
         search = self.cfg.search
         rough = self._fitted_baseline(noise, search.quiet_state_iterations)
         ratios = quiet_noise_ratios(rough, search.quiet_quantile)
         larger = {c: r for c, r in ratios.items() if c not in stated and r > UNDERESTIMATE}
-        return self._fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()}, ROUNDS)
+        return self._fitted_baseline(
+            {c: std * larger.get(c, 1.0) for c, std in noise.items()}, InitialStateCfg.iterations
+        )
 
     def _fitted_baseline(self, noise: Mapping[str, float], state_iterations: int) -> FittedModel:
         """Return the model as given, fitted to readings of some noise."""

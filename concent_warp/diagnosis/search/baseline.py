@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
-from concent_warp.fit.effects.initial_states import ROUNDS
+from concent_warp.fit.effects.initial_states import InitialStateCfg
 from concent_warp.fit.effects.least_squares import Fit, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
@@ -24,7 +24,7 @@ def fit_baseline(
     blocks: Blocks,
     engine: EngineName = "mujoco",
     *,
-    state_iterations: int = ROUNDS,
+    state_iterations: int = InitialStateCfg.iterations,
 ) -> FittedModel:
     """Fit a model's own parameters and the initial states of all windows.
 
@@ -38,8 +38,8 @@ def fit_baseline(
     """
     solver = Solver(Prediction(model, (), windows, engine=engine))
     measured = [np.zeros(len(w.spread)) for w in windows]
-    fit = solver.fit(None, *solver.refine_starts(solver.p.start, measured, state_iterations))
-    if len(fit.values) and state_iterations >= ROUNDS:
+    fit = solver.fit(None, *solver.fit_initial_states(solver.p.start, measured, state_iterations))
+    if len(fit.values) and state_iterations >= InitialStateCfg.iterations:
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
     return _fitted_model(model, windows, blocks, fit, engine)
@@ -64,7 +64,7 @@ def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> F
     A fit may end in a local minimum of an initial state; a rival that only left such a minimum has explained nothing.
     """
     solver = Solver(Prediction(base.model, (), base.windows, engine=base.engine))
-    fit = solver.better_starts(base.fit, [c.fit.offsets for c in rivals])
+    fit = solver.improve_initial_states(base.fit, [c.fit.offsets for c in rivals])
     found = _fitted_model(base.model, base.windows, base.blocks, fit, base.engine)
     return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 

@@ -64,9 +64,9 @@ def restart_candidate(
     which a stuck fit needs; `quick` tries the latter alone.
     """
     cfg, solver = cfg or SearchCfg(), candidate_solver(base, candidate.effect)
-    start = solver.led(candidate.fit, leader)
+    start = solver.fit_at_states_of(leader, candidate.fit)
     if not quick:
-        by_window = solver.better_starts(candidate.fit, [leader.offsets], noise=0.0)
+        by_window = solver.improve_initial_states(candidate.fit, [leader.offsets], noise=0.0)
         start = min(by_window, start, key=lambda f: f.cost)
     if start.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost:
         return candidate

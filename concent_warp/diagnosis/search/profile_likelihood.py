@@ -73,7 +73,7 @@ def profile_point(
     values = solver.inside(c.fit.values + move * solver.scale)
     windows = range(len(base.windows))
     offsets, starts, residuals = solver.search.refined(
-        values, solver.follow(c.fit, move), windows, cfg.state_iterations
+        values, solver.first_order_offsets(c.fit, move), windows, cfg.state_iterations
     )
     expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
     cost = solver.cost(residuals, offsets, values)

@@ -13,7 +13,7 @@ from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.least_squares import Linear, Solver, projected
 from concent_warp.fit.effects.prediction import Prediction
-from concent_warp.fit.effects.robust import huber, trust
+from concent_warp.fit.effects.robust import cauchy_weight, huber
 
 
 def screen(base: FittedModel, effect: Effect, cfg: SearchCfg | None = None) -> ScreenedCandidate:
@@ -64,7 +64,7 @@ def projected_residuals(
     residuals = solver.p.residuals(solver.trials(values, offsets))
     found = []
     for r, a, o in zip(residuals, base.fit.starts, offsets, strict=True):
-        near = trust(o)
+        near = cauchy_weight(o)
         inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
         found.append(r - a @ inner)
     return found

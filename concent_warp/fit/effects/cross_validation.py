@@ -1,16 +1,16 @@
-"""Evidence by blocks of time: held-out gain of a candidate over a model, and how far chance alone would go.
+"""Evidence by blocks of time: held-out gain of a candidate over a model, and its null distribution.
 
 Residuals are correlated in time, so what counts as one observation is a block of time and not a row. All figures follow
 from sums over blocks: with residuals r and sensitivities J of block b (initial states eliminated),
 H_b = J_b' J_b, u_b = J_b' r_b and q_b = r_b' r_b.
 
-Held out: the parameters are fitted without a fold of blocks by one Newton step from the fit to all of them,
+Cross-validation: the parameters are fitted without a fold of blocks by one Newton step from the fit to all of them,
 delta_f = -(H - H_f + prior)^-1 (u - u_f), and the fold's error is q_b + 2 delta_f' u_b + delta_f' H_b delta_f.
 
-Chance: under a model that lacks nothing, residuals are noise. Blocks of what no candidate can explain, each with a
+Null distribution: under a complete model, residuals are noise. Blocks of what no candidate can explain, each with a
 random sign (wild bootstrap: Wu, Annals of Statistics 14, 1986; by blocks: Shao, J. Am. Stat. Assoc. 105, 2010), are
-noise with the recording's own correlation. The largest gain of all candidates on such data is what the search finds
-where there is nothing to be found.
+noise with the recording's own correlation. The largest gain of all candidates on such data is a sample of the null
+distribution of the best candidate.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.robust import huber_weight
 
 FOLDS = 5
-"""Parts that are held out in turn."""
+"""Folds of the cross-validation [-]."""
 FEWEST_BLOCKS = 12
-"""Blocks that a recording is cut into, at least, where it is long enough."""
+"""Least blocks that a recording is cut into [-], at the cost of shorter blocks."""
 MOST_BLOCKS = 60
-"""Blocks at most."""
+"""Most blocks [-]."""
 SHORTEST = 0.1
-"""Shortest block [s]."""
+"""Shortest block [s], unless there are fewer than `FEWEST_BLOCKS`."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ class Sums:
     """q_b, shape (B,)."""
 
 
-def block_sums(pieces: Sequence[Linear], blocks: Blocks, limit: float) -> Sums:
+def block_sums(linear: Sequence[Linear], blocks: Blocks, limit: float) -> Sums:
     """Return the sums of projected residuals and sensitivities, one piece a window."""
-    size = pieces[0].jacobian.shape[1]
+    size = linear[0].jacobian.shape[1]
     normal, slope = np.zeros((blocks.count, size, size)), np.zeros((blocks.count, size))
     square = np.zeros(blocks.count)
-    for piece, rows in zip(pieces, blocks.of_row, strict=True):
-        weight = np.sqrt(huber_weight(piece.residual, limit))
-        j, r = piece.jacobian * weight[:, None], piece.residual * weight
+    for of_window, rows in zip(linear, blocks.of_row, strict=True):
+        weight = np.sqrt(huber_weight(of_window.residual, limit))
+        j, r = of_window.jacobian * weight[:, None], of_window.residual * weight
         for b in np.unique(rows):
             mine = rows == b
             normal[b] = j[mine].T @ j[mine]
@@ -136,37 +136,37 @@ class HeldOut:
         return self.errors(self.sums.slope, self.sums.square)
 
 
-def sign_flip_p(gain: np.ndarray, rng: np.random.Generator, draws: int = 20000) -> float:
-    """Return the probability of a mean gain at least this large if the sign of each block's gain were chance.
+def sign_flip_p(gain: np.ndarray, rng: np.random.Generator, samples: int = 20000) -> float:
+    """Return the probability of a mean gain at least this large if the sign of each block's gain were random.
 
     Args:
         gain: Gain of each block, shape (B,).
         rng: Source of the signs.
-        draws: Draws; with few blocks all signs are gone through.
+        samples: Number of random sign vectors; with up to 14 blocks all of them are enumerated.
     """
     if len(gain) <= 14:
         signs = 1.0 - 2.0 * ((np.arange(2 ** len(gain))[:, None] >> np.arange(len(gain))) & 1)
         return float(np.mean(signs @ gain >= gain.sum() - 1e-12))
-    signs = rng.choice([-1.0, 1.0], size=(draws, len(gain)))
-    return float((1 + np.sum(signs @ gain >= gain.sum())) / (draws + 1))
+    signs = rng.choice([-1.0, 1.0], size=(samples, len(gain)))
+    return float((1 + np.sum(signs @ gain >= gain.sum())) / (samples + 1))
 
 
 def bootstrap_interval(
-    gain: np.ndarray, error: np.ndarray, group: np.ndarray, rng: np.random.Generator, draws: int = 2000
+    gain: np.ndarray, error: np.ndarray, group: np.ndarray, rng: np.random.Generator, samples: int = 2000
 ) -> tuple[float, float]:
-    """Return the 95 % interval of sum(gain) / sum(error) over draws of blocks, or of demonstrations where there are 8.
+    """Return the 95 % interval of sum(gain) / sum(error) by bootstrap over blocks, or 8 or more demonstrations.
 
     Args:
         gain: Gain of each block, shape (B,).
         error: Error of each block without the candidate, shape (B,).
         group: Demonstration of each block, shape (B,).
-        rng: Source of the draws.
-        draws: Draws.
+        rng: Source of the samples.
+        samples: Number of bootstrap samples.
     """
     known, place = np.unique(group, return_inverse=True)
     if len(known) >= 8:
         gain, error = np.bincount(place, gain), np.bincount(place, error)
-    chosen = rng.integers(len(gain), size=(draws, len(gain)))
+    chosen = rng.integers(len(gain), size=(samples, len(gain)))
     share = gain[chosen].sum(axis=1) / np.maximum(error[chosen].sum(axis=1), 1e-12)
     low, high = np.percentile(share, [2.5, 97.5])
     return float(low), float(high)

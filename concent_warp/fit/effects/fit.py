@@ -137,7 +137,7 @@ def fit_effects(
     check_finite(solver.p, model.scene.source)
     said(0.1, "initial states")
     start = solver.p.start
-    offsets, starts = solver.refine_starts(start, [np.zeros(len(w.spread)) for w in windows])
+    offsets, starts = solver.fit_initial_states(start, [np.zeros(len(w.spread)) for w in windows])
     given = _rest(solver, start, offsets, starts)
     said(0.3, "trial values")
     chosen = _best_start(solver, start, offsets, starts)

@@ -1,8 +1,8 @@
 """The initial states of windows, each window by itself, at fixed parameters.
 
-Damped steps along derivatives (Levenberg, Marquardt) find them where motion is smooth. An impact turns small
-differences into large ones and, in steps of time, into jumps: there steps of several sizes, draws and new beginnings
-help on.
+Damped steps along derivatives (Levenberg, Marquardt) find them where motion is smooth. An impact amplifies small
+differences and, with discrete time steps, makes residuals jump: there steps of several sizes, random samples and
+restarts are tried as well.
 """
 
 from __future__ import annotations
@@ -14,35 +14,48 @@ import numpy as np
 
 from concent_warp.fit.effects.fading import ReferenceSimulation, is_long, residuals_near
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.fit.effects.robust import far, huber, huber_limit, huber_weight, trust
-
-DAMPINGS = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
-"""Dampings that are tried on initial states."""
-PROBE = (0.003, 1.0)
-"""Bounds of the step of a finite difference of the initial state, in units of its spread."""
-PROBE_FIRST = 0.3
-"""The step at first."""
-SEEN = (1.0, 3.0, 0.3)
-"""Mean change of the residuals that such a step aims at, in units of noise: an impact turns a small difference into a
-large one, and is straight over a small one only. The next one is taken where an odd window gets no further."""
-DRAWS = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
-"""Spread of initial states that are drawn where derivatives lead no further, in standard deviations of the fit."""
-ROUNDS = 12
-"""How often the dependence on the initial states is computed, as long as it still helps."""
-ODD = 1.2
-"""A window whose residual is this many times that of the others has probably not found its initial state: only for
-such ones more is tried than a few damped steps."""
-BEGINNINGS, WIDTHS = 128, (0.5, 1.0, 2.0)
-"""Such a window is begun anew from the likeliest of so many initial states, drawn with these spreads in turn."""
-FALL = 3e-3
-"""A window's initial state is found once a step lowers its cost by less than this share."""
-PROSPECT = 3.0
-"""How many times the last fall of a cost the falls to come may add up to."""
+from concent_warp.fit.effects.robust import cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 
 
 @dataclass(frozen=True)
-class _Look:
-    """What small changes of one window's initial state do."""
+class InitialStateCfg:
+    """Settings of the search for the initial states of windows.
+
+    The values were chosen on recordings with impacts: see `tests/fit/effects/test_least_squares.py` for the share of
+    initial states that are found.
+    """
+
+    iterations: int = 12
+    """Most computations of the derivatives with respect to the initial states [-]."""
+    min_fall: float = 3e-3
+    """Relative fall of a window's cost below which its initial state counts as found [-]."""
+    prospect: float = 3.0
+    """A window whose cost must fall below a bound is given up if this many times its last fall is not enough [-]."""
+    dampings: tuple[float, ...] = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
+    """Levenberg-Marquardt dampings that are tried in each iteration, relative to the curvature [-]."""
+    first_step: float = 0.3
+    """First step of a finite difference, in units of the state's spread [-]."""
+    smallest_step: float = 0.003
+    """Smallest step of a finite difference, in units of the state's spread [-]."""
+    largest_step: float = 1.0
+    """Largest step of a finite difference, in units of the state's spread [-]."""
+    target_changes: tuple[float, ...] = (1.0, 3.0, 0.3)
+    """Mean changes of the residuals that finite differences aim at, in units of noise [-]. An impact is linear over a
+    small difference only, so the next value is taken where an outlying window makes no progress."""
+    outlier_ratio: float = 1.2
+    """Residual of a window over the median of all windows beyond which its initial state counts as not found [-]:
+    samples are tried for such windows in addition to damped steps."""
+    sample_spreads: tuple[float, ...] = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
+    """Spreads of the states sampled about an iterate, in standard deviations of the linear fit [-]; empty for none."""
+    restart_samples: int = 128
+    """States sampled about the measured one, of which the likeliest restarts an outlying window; 0 for none."""
+    restart_spreads: tuple[float, ...] = (0.5, 1.0, 2.0)
+    """Spreads of these samples, used in turn, in units of the state's spread [-]."""
+
+
+@dataclass(frozen=True)
+class _FiniteDifferences:
+    """Finite differences of one window by its initial state."""
 
     columns: np.ndarray
     """dr / d(offset / spread), shape (n, 2 nv)."""
@@ -52,52 +65,52 @@ class _Look:
     """Their residuals, each (n,)."""
 
 
-class StartSearch:
-    """Looks for the initial states of the windows of a prediction."""
+class InitialStateSearch:
+    """Fits the initial states of the windows of a prediction."""
 
-    def __init__(self, prediction: Prediction) -> None:
-        """Prepare to look for those of `prediction`."""
-        self.p = prediction
-        self.probe = [np.full(len(w.spread), PROBE_FIRST) for w in prediction.windows]
+    def __init__(self, prediction: Prediction, cfg: InitialStateCfg | None = None) -> None:
+        """Prepare to fit those of `prediction`."""
+        self.p, self.cfg = prediction, cfg or InitialStateCfg()
+        self.steps = [np.full(len(w.spread), self.cfg.first_step) for w in prediction.windows]
         self.fading = [np.full(len(w.spread), is_long(prediction, i)) for i, w in enumerate(prediction.windows)]
         """Components of each window's initial state whose errors have faded so far."""
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[SimulationRequest]:
-        """Return one trial a window."""
+        """Return one simulation for each window."""
         return [SimulationRequest(w, values, offset * self.p.windows[w].spread) for w, offset in enumerate(offsets)]
 
-    def look_around(
+    def finite_differences(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
-    ) -> list[_Look]:
-        """Move each component of the initial state of some windows a little, and see what that does.
+    ) -> list[_FiniteDifferences]:
+        """Return finite differences of the residuals of some windows by each component of the initial state.
 
         Args:
             values: Parameters, shape (P,).
             offsets: Errors of the initial states of all windows, in units of their spread.
             residuals: Residuals of all windows there.
-            windows: Which ones to look at.
+            windows: Indices of the windows.
         """
-        trials, moved, hoped = [], [], []
+        trials, moved, may_fade = [], [], []
         for w in windows:
-            moved.append(offsets[w] + np.diag(self.probe[w]))
+            moved.append(offsets[w] + np.diag(self.steps[w]))
             trials += [SimulationRequest(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
-            hoped += self.fading[w].tolist()
-        found, faded = residuals_near(self.p, self.known(values, offsets, residuals, windows), trials, hoped)
-        looks, at = [], 0
+            may_fade += self.fading[w].tolist()
+        found, faded = residuals_near(self.p, self.references(values, offsets, residuals, windows), trials, may_fade)
+        differences, at = [], 0
         for w, offset in zip(windows, moved, strict=True):
             seen = found[at : at + len(offset)]
             self.fading[w] &= faded[at : at + len(offset)]
             at += len(offset)
-            columns = np.stack([(r - residuals[w]) / h for r, h in zip(seen, self.probe[w], strict=True)], axis=1)
-            wild = np.abs(columns).max(axis=0) * self.probe[w] > 0.5 * np.abs(residuals[w]).max() + 1e2
-            columns[:, wild] = 0.0
-            looks.append(_Look(columns, offset, seen))
-        return looks
+            columns = np.stack([(r - residuals[w]) / h for r, h in zip(seen, self.steps[w], strict=True)], axis=1)
+            invalid = np.abs(columns).max(axis=0) * self.steps[w] > 0.5 * np.abs(residuals[w]).max() + 1e2
+            columns[:, invalid] = 0.0
+            differences.append(_FiniteDifferences(columns, offset, seen))
+        return differences
 
-    def known(
+    def references(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], residuals: Sequence[np.ndarray], windows: Sequence[int]
     ) -> dict[int, ReferenceSimulation]:
-        """Return the simulations of some windows that others are close to."""
+        """Return the simulations of some windows at given initial states, as references for `residuals_near`."""
         return {
             w: ReferenceSimulation(SimulationRequest(w, values, offsets[w] * self.p.windows[w].spread), residuals[w])
             for w in windows
@@ -108,35 +121,39 @@ class StartSearch:
         values: np.ndarray,
         offsets: Sequence[np.ndarray],
         windows: Sequence[int],
-        rounds: int,
-        rival: Mapping[int, float] | None = None,
+        iterations: int,
+        upper_bounds: Mapping[int, float] | None = None,
     ) -> tuple[list[np.ndarray], dict[int, np.ndarray], list[np.ndarray]]:
-        """Fit the initial states of some windows; returns all states, the dependence of those, and all residuals.
+        """Fit the initial states of some windows; returns all states, the derivatives of those, and all residuals.
 
         Args:
             values: Parameters, shape (P,).
             offsets: Errors of the initial states of all windows, in units of their spread.
             windows: Whose initial states are fitted.
-            rounds: How often the dependence on the initial states is computed at most.
-            rival: Costs that windows are to get below, or else are of no use; they are given up where the falls of
-                their costs do not promise it.
+            iterations: Most computations of the derivatives with respect to the initial states.
+            upper_bounds: Costs by window that are to be undercut; a window is given up where the falls of its cost do
+                not suffice for it, see `InitialStateCfg.prospect`.
         """
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
-        self._settle(values, offsets, residuals, starts, windows, rounds, rng, rival or {})
+        self._iterate(values, offsets, residuals, starts, windows, iterations, rng, upper_bounds or {})
         size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
-        odd = [w for w in windows if size[w] > ODD * max(1.0, float(np.median(size)))] if rounds == ROUNDS else []
-        if odd and BEGINNINGS:
+        outlying = (
+            [w for w in windows if size[w] > self.cfg.outlier_ratio * max(1.0, float(np.median(size)))]
+            if iterations == self.cfg.iterations
+            else []
+        )
+        if outlying and self.cfg.restart_samples:
             found, limit = dict(starts), huber_limit(residuals)
-            begin, there = self._drawn(values, offsets, residuals, odd, limit, rng)
-            beaten = {w: start_cost(residuals[w], offsets[w], limit) for w in odd}
-            self._settle(values, begin, there, found, odd, rounds, rng, beaten)
-            for w in odd:
+            begin, there = self._restarts(values, offsets, residuals, outlying, limit, rng)
+            beaten = {w: start_cost(residuals[w], offsets[w], limit) for w in outlying}
+            self._iterate(values, begin, there, found, outlying, iterations, rng, beaten)
+            for w in outlying:
                 if start_cost(there[w], begin[w], limit) < beaten[w]:
                     offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
         return offsets, starts, residuals
 
-    def _drawn(
+    def _restarts(
         self,
         values: np.ndarray,
         offsets: Sequence[np.ndarray],
@@ -145,102 +162,109 @@ class StartSearch:
         limit: float,
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return all initial states with the likeliest of some drawn ones for some windows, and all residuals."""
+        """Return all initial states, with the likeliest of random samples for some windows, and all residuals."""
+        count = self.cfg.restart_samples
         begin, there = list(offsets), list(residuals)
-        widths = np.resize(WIDTHS, (BEGINNINGS, 1))
-        drawn = [widths * rng.normal(size=(BEGINNINGS, len(offsets[w]))) for w in windows]
+        widths = np.resize(self.cfg.restart_spreads, (count, 1))
+        samples = [widths * rng.normal(size=(count, len(offsets[w]))) for w in windows]
         rows = [
             SimulationRequest(w, values, o * self.p.windows[w].spread)
-            for w, of in zip(windows, drawn, strict=True)
+            for w, of in zip(windows, samples, strict=True)
             for o in of
         ]
         seen = self.p.residuals(rows)
         for k, w in enumerate(windows):
-            mine = seen[k * BEGINNINGS : (k + 1) * BEGINNINGS]
-            best = int(np.argmin([start_cost(r, o, limit) for r, o in zip(mine, drawn[k], strict=True)]))
-            begin[w], there[w] = drawn[k][best], mine[best]
+            mine = seen[k * count : (k + 1) * count]
+            best = int(np.argmin([start_cost(r, o, limit) for r, o in zip(mine, samples[k], strict=True)]))
+            begin[w], there[w] = samples[k][best], mine[best]
         return begin, there
 
-    def _settle(
+    def _iterate(
         self,
         values: np.ndarray,
         offsets: list[np.ndarray],
         residuals: list[np.ndarray],
         starts: dict[int, np.ndarray],
         windows: Sequence[int],
-        rounds: int,
+        iterations: int,
         rng: np.random.Generator,
-        rival: Mapping[int, float],
+        upper_bounds: Mapping[int, float],
     ) -> None:
-        """Take the initial states of some windows to where no step helps any more; writes into what it is given."""
-        unsettled, aim = list(windows), [0] * len(offsets)
-        odd = ODD * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
-        for _ in range(rounds):
-            looks = self.look_around(values, offsets, residuals, unsettled)
+        """Iterate the initial states of some windows until no step lowers their cost; changes its arguments."""
+        cfg = self.cfg
+        remaining, aim = list(windows), [0] * len(offsets)
+        outlying = cfg.outlier_ratio * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
+        for _ in range(iterations):
+            differences = self.finite_differences(values, offsets, residuals, remaining)
             limit = huber_limit(residuals)
-            tried, rows, hoped = [], [], []
-            for w, look in zip(unsettled, looks, strict=True):
-                there = [offsets[w] + start_step(residuals[w], look.columns, offsets[w], limit, d) for d in DAMPINGS]
-                if np.mean(residuals[w] ** 2) > odd**2:
-                    there += _around(residuals[w], look.columns, offsets[w], there[0], limit, rng)
+            tried, rows, may_fade = [], [], []
+            for w, difference in zip(remaining, differences, strict=True):
+                there = [
+                    offsets[w] + start_step(residuals[w], difference.columns, offsets[w], limit, d)
+                    for d in cfg.dampings
+                ]
+                if np.mean(residuals[w] ** 2) > outlying**2:
+                    there += _samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng, cfg)
                 tried.append(there)
                 rows += [SimulationRequest(w, values, o * self.p.windows[w].spread) for o in there]
-                hoped += [bool(self.fading[w].all())] * len(there)
-            known = self.known(values, offsets, residuals, unsettled)
-            (found, _), moving, at = residuals_near(self.p, known, rows, hoped), [], 0
-            for k, (w, look) in enumerate(zip(unsettled, looks, strict=True)):
-                starts[w] = look.columns
-                there = [*tried[k], *look.offsets]
-                seen = [*found[at : at + len(tried[k])], *look.residuals]
+                may_fade += [bool(self.fading[w].all())] * len(there)
+            references = self.references(values, offsets, residuals, remaining)
+            (found, _), moving, at = residuals_near(self.p, references, rows, may_fade), [], 0
+            for k, (w, difference) in enumerate(zip(remaining, differences, strict=True)):
+                starts[w] = difference.columns
+                there = [*tried[k], *difference.offsets]
+                seen = [*found[at : at + len(tried[k])], *difference.residuals]
                 at += len(tried[k])
                 cost = start_cost(residuals[w], offsets[w], limit)
                 costs = [start_cost(r, o, limit) for r, o in zip(seen, there, strict=True)]
                 best = int(np.argmin(costs))
                 if costs[best] < cost:
                     offsets[w], residuals[w] = there[best], seen[best]
-                if costs[best] > (1 - FALL) * cost:
-                    aim[w] += 1 if np.mean(residuals[w] ** 2) > odd**2 else len(SEEN)
-                short = min(costs[best], cost) - rival.get(w, np.inf)
-                if aim[w] < len(SEEN) and short <= PROSPECT * max(cost - costs[best], 0.0):
+                if costs[best] > (1 - cfg.min_fall) * cost:
+                    aim[w] += 1 if np.mean(residuals[w] ** 2) > outlying**2 else len(cfg.target_changes)
+                short = min(costs[best], cost) - upper_bounds.get(w, np.inf)
+                if aim[w] < len(cfg.target_changes) and short <= cfg.prospect * max(cost - costs[best], 0.0):
                     moving.append(w)
-                    change = np.sqrt(np.mean(look.columns**2, axis=0))
-                    self.probe[w] = np.clip(SEEN[aim[w]] / np.maximum(change, 1e-12), *PROBE)
-            unsettled = moving
-            if not unsettled:
+                    change = np.sqrt(np.mean(difference.columns**2, axis=0))
+                    self.steps[w] = np.clip(
+                        cfg.target_changes[aim[w]] / np.maximum(change, 1e-12), cfg.smallest_step, cfg.largest_step
+                    )
+            remaining = moving
+            if not remaining:
                 break
 
 
 def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float) -> float:
     """Return the cost of one window with the prior of its initial state."""
-    return float(huber(residual, limit).sum()) + far(offset)
+    return float(huber(residual, limit).sum()) + cauchy_cost(offset)
 
 
 def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limit: float, damping: float) -> np.ndarray:
     """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
     weighted = start.T * huber_weight(residual, limit)
     normal = weighted @ start
-    near = trust(offset)
+    near = cauchy_weight(offset)
     normal += np.diag(near + damping * (near + np.diag(normal)))
     return -np.linalg.solve(normal, weighted @ residual + near * offset)
 
 
-def _around(
+def _samples_about(
     residual: np.ndarray,
     start: np.ndarray,
     offset: np.ndarray,
     step: np.ndarray,
     limit: float,
     rng: np.random.Generator,
+    cfg: InitialStateCfg,
 ) -> list[np.ndarray]:
-    """Return initial states drawn about one and about where a step leads, farthest where residuals tell least.
+    """Return initial states sampled about one and about where a step leads, farthest where residuals depend least.
 
-    Time steps cut an impact's course into teeth, each with a minimum of its own: derivatives do not lead from one to
-    the next, draws do.
+    With discrete time steps the cost of an impact has many local minima; derivatives do not lead from one to the next.
     """
     weighted = start.T * huber_weight(residual, limit)
-    factor = np.linalg.cholesky(weighted @ start + np.diag(trust(offset)))
+    factor = np.linalg.cholesky(weighted @ start + np.diag(cauchy_weight(offset)))
     return [
         centre + size * np.linalg.solve(factor.T, rng.normal(size=len(offset)))
-        for size in DRAWS
+        for size in cfg.sample_spreads
         for centre in (offset, step)
     ]

@@ -1,4 +1,4 @@
-"""Losses by which single values far off do not decide a fit: Huber's of residuals, Cauchy's of initial states.
+"""Robust losses: Huber's for residuals, Cauchy's for initial states.
 
 Each comes with the weights of iteratively reweighted least squares (Holland and Welsch, Commun. Stat. 6, 1977): a
 weight times its argument is the slope of the loss.
@@ -11,25 +11,27 @@ from collections.abc import Sequence
 import numpy as np
 
 HUBER = 4.0
-"""Residuals beyond this many times their spread count linearly."""
+"""Residual over the spread of the residuals beyond which Huber's loss is linear [-]."""
 TRUSTED = 2.0
-"""Errors of initial states beyond this many times their spread count little more."""
+"""Scale of Cauchy's loss, in units of the initial state's spread [-]."""
 
 
-def far(offset: np.ndarray) -> float:
-    """Return the cost of an error of an initial state in units of its spread, by Cauchy's prior: half the square while
-    it is small, and hardly more for one that is far off. A state told in the middle of an impact may be.
+def cauchy_cost(offset: np.ndarray) -> float:
+    """Return the cost of an error of an initial state in units of its spread [-], by Cauchy's loss.
+
+    It is half the square for small errors and grows logarithmically for large ones, as of states measured during an
+    impact.
     """
     return float(0.5 * TRUSTED**2 * np.log1p((offset / TRUSTED) ** 2).sum())
 
 
-def trust(offset: np.ndarray) -> np.ndarray:
-    """Return the weight of each component in iteratively reweighted least squares, see `far`."""
+def cauchy_weight(offset: np.ndarray) -> np.ndarray:
+    """Return the weight of each component in iteratively reweighted least squares, see `cauchy_cost`."""
     return 1.0 / (1.0 + (offset / TRUSTED) ** 2)
 
 
 def huber_limit(residuals: Sequence[np.ndarray]) -> float:
-    """Return where Huber's loss turns linear: `HUBER` times the spread of the residuals, at least of the noise."""
+    """Return the residual from which Huber's loss is linear: `HUBER` times the spread, at least that of the noise."""
     pooled = np.concatenate(residuals)
     return HUBER * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
 

@@ -50,7 +50,7 @@ def test_a_smooth_minimum_keeps_its_value_and_its_spread(base, found):
 def test_a_fit_that_ended_beside_the_minimum_is_restarted(base, found):
     solver = candidate_solver(base, found.effect)
     beside = found.fit.values * 1.2
-    offsets, starts = solver.refine_starts(beside, found.fit.offsets)
+    offsets, starts = solver.fit_initial_states(beside, found.fit.offsets)
     pieces = solver.linearise(beside, offsets)
     cost = solver.cost([piece.residual for piece in pieces], offsets, beside)
     fit = replace(found.fit, values=beside, offsets=tuple(offsets), starts=starts, linear=pieces, cost=cost)

@@ -4,7 +4,7 @@ import pytest
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects import fading
 from concent_warp.fit.effects.fading import AFTER, FADED, ReferenceSimulation, _has_faded, is_long, residuals_near
-from concent_warp.fit.effects.initial_states import StartSearch
+from concent_warp.fit.effects.initial_states import InitialStateSearch
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -83,7 +83,7 @@ def test_initial_states_are_found_as_without_it(windows, monkeypatch):
     for longest in (fading.LONG, np.inf):
         monkeypatch.setattr(fading, "LONG", longest)
         prediction = Prediction(Model(Scene(swing_scene(STRONG))), (effect_class("armature")("hinge"),), windows)
-        offsets, starts, _ = StartSearch(prediction).refined(np.array([1e-5]), [np.ones(2)], [0], 4)
+        offsets, starts, _ = InitialStateSearch(prediction).refined(np.array([1e-5]), [np.ones(2)], [0], 4)
         found.append((offsets[0], starts[0], prediction.simulated))
     np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-2)
     np.testing.assert_allclose(found[0][1], found[1][1], atol=0.05)

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects import initial_states
-from concent_warp.fit.effects.initial_states import start_step
-from concent_warp.fit.effects.least_squares import MANY, Fit, Linear, Solver, projected
+from concent_warp.fit.effects.initial_states import InitialStateCfg, start_step
+from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.prediction import Prediction
-from concent_warp.fit.effects.robust import HUBER, trust
+from concent_warp.fit.effects.robust import HUBER, cauchy_weight
 from tests.scenes.bouncing import SPREAD, bounced
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
@@ -50,7 +49,7 @@ def test_initial_states_alone_are_fitted_at_fixed_parameters():
     solver = solver_for(swung(told=0.006), "joint_damping", length=0.5)
     values = np.array([DAMPING])
     zero = [np.zeros(2) for _ in solver.p.windows]
-    offsets, starts = solver.refine_starts(values, zero)
+    offsets, starts = solver.fit_initial_states(values, zero)
     before, after = (solver.p.residuals(solver.trials(values, o)) for o in (zero, offsets))
     assert solver.cost(after, offsets, values) < 0.5 * solver.cost(before, zero, values)
     assert offsets[0][0] * solver.p.windows[0].spread[0] == pytest.approx(-0.006, abs=1.5e-3)
@@ -77,7 +76,7 @@ def test_outliers_hardly_move_the_estimate():
 
 def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_either():
     solver = solver_for(swung(), "joint_damping")
-    offsets, starts = solver.refine_starts(solver.p.start, [np.zeros(2)])
+    offsets, starts = solver.fit_initial_states(solver.p.start, [np.zeros(2)])
     begun = solver.cost(solver.p.residuals(solver.trials(solver.p.start, offsets)), offsets, solver.p.start)
     fit = solver.fit(solver.p.start, offsets, starts)
     assert fit.cost < begun
@@ -87,9 +86,9 @@ def test_a_fit_ends_no_worse_than_it_began_and_taking_it_up_again_no_worse_eithe
 def test_of_many_windows_a_sample_leads_all_to_the_parameters():
     solver = solver_for(swung(told=0.006), "joint_damping", length=0.1)
     count = len(solver.p.windows)
-    assert count > MANY
+    assert count > solver.cfg.max_polished_windows
     values, zero = np.array([3 * DAMPING]), tuple(np.zeros(2) for _ in range(count))
-    offsets, starts = solver.refine_starts(values, zero)
+    offsets, starts = solver.fit_initial_states(values, zero)
     linear = solver.linearise(values, offsets)
     begun = Fit(
         values, tuple(offsets), solver.cost([x.residual for x in linear], offsets, values), linear, starts, True, 0.0
@@ -112,10 +111,10 @@ def test_the_initial_state_of_another_fit_leads_a_stuck_one_to_the_parameters_th
     values, zero = np.array([1.5 * DAMPING]), (np.zeros(2),)
     linear = solver.linearise(values, zero)
     stuck = Fit(values, zero, np.inf, linear, good.starts, True, 0.0)
-    led = solver.led(stuck, good)
-    assert led.values[0] == pytest.approx(DAMPING, rel=0.1)
-    assert led.offsets[0] == pytest.approx(good.offsets[0])
-    assert led.cost == pytest.approx(good.cost, rel=0.05)
+    found = solver.fit_at_states_of(good, stuck)
+    assert found.values[0] == pytest.approx(DAMPING, rel=0.1)
+    assert found.offsets[0] == pytest.approx(good.offsets[0])
+    assert found.cost == pytest.approx(good.cost, rel=0.05)
 
 
 def test_values_stay_within_their_bounds_and_infinite_ones_stay_infinite():
@@ -145,7 +144,7 @@ def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
     rng = np.random.default_rng(1)
     a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -4.0])
     step = start_step(r, a, o, HUBER, 0.0)
-    root = np.sqrt(trust(o))
+    root = np.sqrt(cauchy_weight(o))
     stacked = np.vstack([a, np.diag(root)])
     expected = -np.linalg.lstsq(stacked, np.concatenate([r, root * o]), rcond=None)[0]
     np.testing.assert_allclose(step, expected, atol=1e-10)
@@ -158,7 +157,7 @@ def test_better_initial_states_are_looked_for_in_the_windows_in_question_only():
     cost = solver.cost([piece.residual for piece in linear], zero, values)
     starts = tuple(np.zeros((w.count, 2)) for w in solver.p.windows)
     fit = Fit(values, tuple(zero), cost, linear, starts, False, 0.0)
-    found = solver.better_starts(fit, [], windows=[0])
+    found = solver.improve_initial_states(fit, [], windows=[0])
     assert found.cost < cost
     assert np.abs(found.offsets[0]).max() > 0
     assert np.abs(found.starts[0]).max() > 0
@@ -170,21 +169,21 @@ def test_better_initial_states_are_looked_for_in_the_windows_in_question_only():
 def test_a_leap_that_fails_where_it_promises_most_is_not_gone_on_with():
     solver = solver_for(swung(), "joint_damping", length=0.5)
     right = solver.polish(solver.fit())
-    assert solver._tried(right, right.values + 0.5 * DAMPING, [0], 1.0) is right
-    off = solver.better_starts(replace(right, values=np.zeros(1)), [])
-    first = solver._hopeful(off, right.values)
+    assert solver._fit_at(right, right.values + 0.5 * DAMPING, [0], 1.0) is right
+    off = solver.improve_initial_states(replace(right, values=np.zeros(1)), [])
+    first = solver._promising_windows(off, right.values)
     assert 0 < len(first) < len(solver.p.windows)
-    assert solver._tried(off, right.values, first, 1.0).cost == pytest.approx(right.cost, rel=0.02)
+    assert solver._fit_at(off, right.values, first, 1.0).cost == pytest.approx(right.cost, rel=0.02)
 
 
-def bounced_ratio() -> np.ndarray:
+def bounced_ratio(cfg: LeastSquaresCfg | None = None) -> np.ndarray:
     """Return residuals over those of the true initial states, falls told 3 spreads off; shape (falls,)."""
     recording, errors = bounced(12, off=3.0, seed=1)
     windows = windows_of(recording, length=10.0)
     np.testing.assert_allclose(windows[0].spread, SPREAD)
-    solver = Solver(Prediction(drawing(recording), (), windows, threads=1))
+    solver = Solver(Prediction(drawing(recording), (), windows, threads=1), cfg)
     values = np.zeros(0)
-    offsets, _ = solver.refine_starts(values, [np.zeros(4) for _ in windows])
+    offsets, _ = solver.fit_initial_states(values, [np.zeros(4) for _ in windows])
     found, true, told = (
         np.array([np.sqrt(np.mean(r**2)) for r in solver.p.residuals(solver.trials(values, o))])
         for o in (offsets, errors, [np.zeros(4) for _ in windows])
@@ -197,10 +196,9 @@ def test_initial_states_far_off_are_found_across_a_bounce():
     assert (bounced_ratio() < 1.2).sum() >= 11
 
 
-def test_derivatives_alone_do_not_find_all_of_these(monkeypatch):
-    monkeypatch.setattr(initial_states, "DRAWS", ())
-    monkeypatch.setattr(initial_states, "BEGINNINGS", 0)
-    assert (bounced_ratio() < 1.2).sum() <= 9
+def test_derivatives_alone_do_not_find_all_of_these():
+    cfg = LeastSquaresCfg(initial_states=InitialStateCfg(sample_spreads=(), restart_samples=0))
+    assert (bounced_ratio(cfg) < 1.2).sum() <= 9
 
 
 def test_sensitivities_are_those_of_finite_differences():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.robust import HUBER, far, huber, huber_limit, huber_weight, trust
+from concent_warp.fit.effects.robust import HUBER, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 
 
 def test_the_loss_is_quadratic_and_then_linear():
@@ -14,10 +14,10 @@ def test_the_loss_is_quadratic_and_then_linear():
 
 def test_the_prior_of_an_initial_state_and_its_weights_belong_together():
     o, h = np.array([0.1, -1.0, 4.0, -30.0]), 1e-6
-    slope = [(far(o + h * e) - far(o - h * e)) / (2 * h) for e in np.eye(4)]
-    np.testing.assert_allclose(trust(o) * o, slope, rtol=1e-6)
-    assert far(np.array([0.01])) == pytest.approx(0.5 * 0.01**2, rel=1e-4)
-    assert far(np.array([100.0])) < 20.0
+    slope = [(cauchy_cost(o + h * e) - cauchy_cost(o - h * e)) / (2 * h) for e in np.eye(4)]
+    np.testing.assert_allclose(cauchy_weight(o) * o, slope, rtol=1e-6)
+    assert cauchy_cost(np.array([0.01])) == pytest.approx(0.5 * 0.01**2, rel=1e-4)
+    assert cauchy_cost(np.array([100.0])) < 20.0
 
 
 def test_a_weight_times_the_residual_is_the_slope_of_the_loss():
