@@ -17,7 +17,7 @@ from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.comparison.result import Comparison
 from concent_warp.events.extract_events import extract_events, save_events
-from concent_warp.events.overlap import Frames, iou, pair, resample, sequence_frames, settle_frames, time_grid
+from concent_warp.events.overlap import Frames, debounce_frames, iou, pair, resample, sequence_frames, time_grid
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_json
 from concent_warp.fit.fit_geometry import FitCfg, Method, fit_geometry
@@ -174,6 +174,6 @@ def contact_overlap(
         if name in truth and pairs:
             time, frames = truth[name]
             grid = time_grid(sequence.duration, OVERLAP_FRAME)
-            real = settle_frames(resample(frames, time, grid), OVERLAP_FRAME, sequence.settings)
+            real = debounce_frames(resample(frames, time, grid), OVERLAP_FRAME, sequence.settings)
             found[name] = iou(sequence_frames(sequence, grid), real, pairs).pooled
     return found

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from concent_warp.events.overlap import contact_frames, iou, resample, settle_frames, time_grid
+from concent_warp.events.overlap import contact_frames, debounce_frames, iou, resample, time_grid
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.fit.geometry.faces import Faces, flattened
 from concent_warp.model import Model
@@ -91,8 +91,8 @@ def judge(model: Model, demonstration: Demonstration, truth: Truth) -> dict[str,
     bodies = m.geom_bodyid[log.geom]
     grid = time_grid(float(truth.time[-1]), FRAME)
     contacts = ((t, names[a], names[b]) for t, (a, b) in zip(log.step * engine.timestep, bodies, strict=True))
-    simulated = settle_frames(contact_frames(contacts, grid), FRAME)
-    real = settle_frames(resample(truth.contacts, truth.time, grid), FRAME)
+    simulated = debounce_frames(contact_frames(contacts, grid), FRAME)
+    real = debounce_frames(resample(truth.contacts, truth.time, grid), FRAME)
     pairs = {pair for pair in (*simulated, *real) if "block" in pair}
     return {
         "mean": float(error.mean()),

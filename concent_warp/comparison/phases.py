@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from concent_warp.events.filter import drop_blips, runs, steps_of, windowed
-from concent_warp.events.grasp import opposed
+from concent_warp.events.grasp import forces_cancel
 from concent_warp.events.roles import Roles
 from concent_warp.events.staging import ROBOT
 from concent_warp.events.touches import BodyPoses, ReplayContacts
@@ -214,7 +214,7 @@ def _body_state(
     state[still] = MOTIONS.index(REST)
     hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
     if len(hands.step) and roles.body_role[body] != "robot":
-        held = hands.frames(steps) & opposed(hands, steps, steps_of(cfg.grasp_window, dt), cfg.grasp_share)
+        held = hands.frames(steps) & forces_cancel(hands, steps, steps_of(cfg.grasp_window, dt), cfg.grasp_share)
         state[held] = MOTIONS.index(GRASPED)
     state = _prevailing(state, steps_of(cfg.majority_window, dt))
     width = steps_of(cfg.impact_window, dt)

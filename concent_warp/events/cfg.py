@@ -35,14 +35,14 @@ class StagingCfg:
     moved: float = 0.005
     """An object that the robot touches without grasping it opens a stage if it is moved by more than this [m]."""
     approach: float = 0.01
-    """Length of path before the first contact of two objects that tells the direction of approach [m]."""
+    """Length of path before the first contact of two objects from which the direction of approach is taken [m]."""
     depth: float = 0.003
     """An object is inside another once it is this far beyond the plane of their first contact [m]."""
     share: float = 0.5
     """A pair belongs to a target event if it touched during this share of the window [-]."""
     target: Literal["settled", "transition"] = "settled"
-    """Which configuration of a stage is its target event: the last steady one of the stage, before what carries it lets
-    go or the next stage begins, or the one right at the transition (the paper's words taken literally)."""
+    """Which configuration of a stage is its target event: the last steady one of the stage, before the object is
+    released or the next stage begins, or the one at the transition (the literal reading of the paper)."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -1,4 +1,4 @@
-"""From a replayed demonstration to its contact event sequence (paper, section 3.1.2)."""
+"""Extraction of the contact event sequence from the replay of a demonstration (paper, section 3.1.2)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def extract(
     model: Model, demonstration: Demonstration, engine: Engine, cfg: StagingCfg | None = None
 ) -> ContactEventSequence:
-    """Replay a demonstration through a model and return who touched whom, the stages and their target events.
+    """Return the contact event sequence of a demonstration, from its replay through a model.
 
     Args:
         model: Scene and contact geometry.
@@ -42,7 +42,7 @@ def extract(
         raise EventsError(
             "the replay does not stay finite, so that there are no contacts to read",
             where=demonstration.name,
-            fix="shorten the time step, or look for spheres that start deep within one another",
+            fix="shorten the time step, or check for spheres that overlap in the initial state",
         )
     roles = Roles.of(engine.compiled, model)
     steps = step_count(demonstration, engine.timestep)
@@ -73,8 +73,8 @@ def _from_log(
     """
     cfg = cfg or StagingCfg()
     everything = ReplayContacts.of(log, roles, variant)
-    settled = everything.settled_pairs(motion.steps, motion.timestep, cfg)
-    touches = everything.within(settled)
+    in_contact = everything.debounced_pairs(motion.steps, motion.timestep, cfg)
+    touches = everything.within(in_contact)
     used = sorted({int(i) for i in touches.entity.ravel()}, key=lambda i: roles.entities[i].name)
     return ContactEventSequence(
         demonstration=name,
@@ -82,25 +82,25 @@ def _from_log(
         steps=motion.steps,
         settings=cfg,
         entities=tuple(roles.entities[i] for i in used),
-        body_contacts=_body_intervals(touches, settled, motion, roles),
-        contacts=_entity_intervals(touches, settled, motion, roles, steps_of(cfg.gap, motion.timestep)),
-        stages=find_stages(touches, settled, motion, roles, geometry, cfg),
+        body_contacts=_body_intervals(touches, in_contact, motion, roles),
+        contacts=_entity_intervals(touches, in_contact, motion, roles, steps_of(cfg.gap, motion.timestep)),
+        stages=find_stages(touches, in_contact, motion, roles, geometry, cfg),
     )
 
 
 def _body_intervals(
-    touches: ReplayContacts, settled: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles
+    touches: ReplayContacts, in_contact: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of bodies."""
     found = []
-    for (a, b), touching in settled.items():
+    for (a, b), touching in in_contact.items():
         names = roles.bodies[a], roles.bodies[b]
         found += _intervals(touches.between(a, b), touching, motion, names)
     return _in_order(found)
 
 
 def _entity_intervals(
-    touches: ReplayContacts, settled: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles, gap: int
+    touches: ReplayContacts, in_contact: dict[tuple[int, int], np.ndarray], motion: BodyPoses, roles: Roles, gap: int
 ) -> tuple[ContactInterval, ...]:
     """Return the contacts of pairs of entities: breaks closed, within the contacts of their bodies."""
     found = []
@@ -110,7 +110,7 @@ def _entity_intervals(
     for rows in np.split(np.arange(len(order)), edges) if len(order) else []:
         group = ordered[rows]
         a, b = group.body[0].tolist()
-        touching = close_gaps(group.frames(motion.steps), gap) & settled[a, b]
+        touching = close_gaps(group.frames(motion.steps), gap) & in_contact[a, b]
         first, second = (roles.entities[i].name for i in group.entity[0])
         found += _intervals(group, touching, motion, (first, second))
     return _in_order(found)

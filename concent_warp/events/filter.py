@@ -5,7 +5,7 @@ A resting or sliding contact of stiff spheres flickers from step to step. Per pa
 1. breaks shorter than `gap` between two touches are closed, then
 2. contacts shorter than `blip` are dropped.
 
-In this order, so that a flickering contact survives as one and a lone tap does not. The robot's links count as pairs
+In this order a flickering contact becomes one contact and an isolated tap is dropped. The robot's links count as pairs
 of their own; a contact between two spheres, or a link and a sphere, has its breaks closed by the same rule and counts
 only while the pair of bodies does.
 """
@@ -39,8 +39,8 @@ def drop_blips(touching: np.ndarray, blip: int) -> np.ndarray:
     return result
 
 
-def settle(touching: np.ndarray, gap: int, blip: int) -> np.ndarray:
-    """Return `touching` (K,) after the chatter rule, with `gap` and `blip` in steps."""
+def debounce(touching: np.ndarray, gap: int, blip: int) -> np.ndarray:
+    """Return `touching` (K,) without contact chatter, with `gap` and `blip` in steps."""
     return drop_blips(close_gaps(touching, gap), blip)
 
 

@@ -1,11 +1,11 @@
-"""Robot on object: when the robot begins to grasp or to push an object, and while it holds it."""
+"""Contacts of the robot with objects: onsets of grasps and pushes, and the steps in which an object is grasped."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import runs, settle, steps_of, windowed
+from concent_warp.events.filter import debounce, runs, steps_of, windowed
 from concent_warp.events.onset import Onset
 from concent_warp.events.roles import Roles
 from concent_warp.events.touches import BodyPoses, ReplayContacts
@@ -14,7 +14,7 @@ from concent_warp.events.touches import BodyPoses, ReplayContacts
 def robot_onsets(
     touches: ReplayContacts, motion: BodyPoses, roles: Roles, cfg: StagingCfg
 ) -> tuple[list[Onset], dict[int, np.ndarray]]:
-    """Return what the robot begins to do with objects, and when it holds each, shape (K,) bool by body id.
+    """Return the onsets of grasps and pushes, and when each object is grasped, shape (K,) bool by body id.
 
     The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
     to less than `squeeze` of the sum of their magnitudes, over windows, for `persist`: then they press from opposite
@@ -26,17 +26,17 @@ def robot_onsets(
     initial = cfg.initial / motion.timestep
     by_robot = touches[np.isin(touches.body[:, 0], roles.ids("robot"))]
     onsets: list[Onset] = []
-    held: dict[int, np.ndarray] = {}
+    grasped: dict[int, np.ndarray] = {}
     for body in roles.ids("object"):
         rows = by_robot[by_robot.body[:, 1] == body]
-        touching = settle(rows.frames(motion.steps), gap, blip)
-        squeezing = settle(touching & opposed(rows, motion.steps, width, cfg.squeeze), gap, persist) & touching
-        held[body] = np.zeros(motion.steps, dtype=bool)
+        touching = debounce(rows.frames(motion.steps), gap, blip)
+        squeezing = debounce(touching & forces_cancel(rows, motion.steps, width, cfg.squeeze), gap, persist) & touching
+        grasped[body] = np.zeros(motion.steps, dtype=bool)
         seen: set[str] = set()
         for start, end in runs(touching):
             if squeezing[start:end].any():
                 kind = "pick"
-                held[body][start:end] = True
+                grasped[body][start:end] = True
             elif np.linalg.norm(motion.position[end - 1, body] - motion.position[start, body]) > cfg.moved:
                 kind = "push"
             else:
@@ -44,10 +44,10 @@ def robot_onsets(
             if start > initial and not seen & {kind, "pick"}:
                 onsets.append(Onset(kind, int(start), (None, body), squeezing if kind == "pick" else touching))
             seen.add(kind)
-    return onsets, held
+    return onsets, grasped
 
 
-def opposed(rows: ReplayContacts, steps: int, width: int, share: float) -> np.ndarray:
+def forces_cancel(rows: ReplayContacts, steps: int, width: int, share: float) -> np.ndarray:
     """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,)."""
     total = np.zeros((steps, 4))
     np.add.at(total, rows.step, np.concatenate([rows.force[:, None] * rows.normal, rows.force[:, None]], axis=1))

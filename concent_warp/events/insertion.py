@@ -1,16 +1,16 @@
 """Object on object: the first contact, and the move of this contact onto a new region, inside the other object.
 
-Spheres give bumpy surfaces and so bumpy normals: a single normal does not tell a rim from a wall. So the kinds of
-contact are told by place, and by forces summed over windows:
+Surfaces of spheres are bumpy, and so are their normals: a single normal does not distinguish a rim from a wall. The
+kinds of contact are therefore distinguished by position, and by forces summed over windows:
 
 - The *first contact* has a plane. Its normal is the reverse of the motion that the contact stopped (the approach, or
   the way that the object goes on while in contact), turned into the layer of spheres that the contact is on: both are
-  far less bumpy than contact normals, which only tell whether the contact opposed the motion.
+  far less bumpy than contact normals, which are only used to decide whether the contact opposed the motion.
 - An object is *beyond* this plane once the foremost of its points that ever touch has passed it by `depth`. If it then
   touches surfaces that stand across the plane, or any surface beyond it, it has entered; if the other object is all
   around it there, that is insertion, and these surfaces are inner ones.
-- A first contact that did not oppose the motion, or that is deep within the other object, was not in the way: the
-  object has gone straight in.
+- A first contact that did not oppose the motion, or that is deep within the other object, did not block it: the
+  object has entered directly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import runs, settle, steps_of, windowed
+from concent_warp.events.filter import debounce, runs, steps_of, windowed
 from concent_warp.events.onset import Onset
 from concent_warp.events.touches import BodyPoses, ReplayContacts
 
@@ -51,7 +51,7 @@ class Plane:
     normal: np.ndarray
     """Its unit normal, against the approach, shape (3,)."""
     barred: bool
-    """Whether the contact was in the way; if not, the plane lies across the approach, at the first touch."""
+    """Whether the contact blocked the motion; if not, the plane is normal to the approach, at the first touch."""
 
 
 @dataclass(frozen=True)
@@ -114,26 +114,26 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 def object_onsets(
     touches: ReplayContacts,
-    settled: np.ndarray,
+    in_contact: np.ndarray,
     pair: tuple[int, int],
     motion: BodyPoses,
-    held: np.ndarray,
+    grasped: np.ndarray,
     spheres: np.ndarray,
     cfg: StagingCfg,
 ) -> list[Onset]:
-    """Return what two objects begin to do with one another.
+    """Return the onsets of contact between two objects: touch, align, enter, insert.
 
     Args:
         touches: Contacts of the two, a before b.
-        settled: When they are in contact, shape (K,) bool.
+        in_contact: When they are in contact, shape (K,) bool.
         pair: Their body ids.
         motion: Poses.
-        held: When the robot holds one of them, shape (K,) bool.
+        grasped: When the robot grasps one of them, shape (K,) bool.
         spheres: Sphere centres of b [m], frame of b, shape (n, 3).
         cfg: Settings.
     """
-    touching = settled.copy()
-    for start, end in runs(settled):
+    touching = in_contact.copy()
+    for start, end in runs(in_contact):
         if start <= cfg.initial / motion.timestep:
             touching[start:end] = False
     rows = touches[touching[touches.step]]
@@ -146,7 +146,7 @@ def object_onsets(
     entered = int(np.flatnonzero(inside)[0]) if inside.any() else motion.steps
     onsets = []
     if entered - first >= steps_of(cfg.blip, motion.timestep):
-        onsets.append(Onset("align" if held[first] else "touch", first, pair, touching & ~beyond))
+        onsets.append(Onset("align" if grasped[first] else "touch", first, pair, touching & ~beyond))
     if inside.any():
         deepest = entered + int(np.argmin(contact.height(plane)[entered : contact.step[-1] + 1]))
         kind = "insert" if _surrounded(contact, plane, deepest, cfg.depth) else "enter"
@@ -226,7 +226,7 @@ def _passage(
     total = windowed(np.bincount(contact.step, contact.force, minlength=steps), width)
     now = np.bincount(contact.step, inner, minlength=steps) > 0
     inside = beyond & now & (on_inner > INNER_SHARE * total)
-    return beyond, settle(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
+    return beyond, debounce(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
 
 
 def _surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> bool:

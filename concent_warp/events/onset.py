@@ -9,7 +9,7 @@ import numpy as np
 
 Kind = Literal["push", "pick", "touch", "align", "enter", "insert"]
 """Robot on object: "push", or "pick" where it grasps. Object on object: "touch", or "align" where the robot holds one;
-then, beyond the plane of the first contact, "enter", or "insert" where the one surrounds the other."""
+beyond the plane of the first contact, "enter", or "insert" where the one surrounds the other."""
 
 
 @dataclass(frozen=True)
@@ -21,5 +21,5 @@ class Onset:
     """First step of the contact."""
     body: tuple[int | None, int]
     """Body ids; None stands for the robot."""
-    holds: np.ndarray
-    """When contact of this kind holds, shape (K,) bool."""
+    active: np.ndarray
+    """When there is contact of this kind, shape (K,) bool."""

@@ -1,7 +1,7 @@
-"""How well two accounts of contact agree: frames in contact, pairs of bodies, and the spheres of target events.
+"""Agreement of two contact records: frames in contact, pairs of bodies, and the spheres of target events.
 
 A simulator and a measurement share no geoms, so they are compared by bodies, on one time grid. A small error of motion
-says little about contact: a fit can reach it by dissolving the contact, which shows here as an overlap near zero.
+says little about contact: a fit can reach it by losing the contact, which gives an overlap near zero.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import settle, steps_of
+from concent_warp.events.filter import debounce, steps_of
 from concent_warp.events.sequence import ContactEventSequence
 
 Pair = tuple[str, str]
 """Two body names in alphabetical order."""
 Frames = Mapping[Pair, np.ndarray]
-"""When pairs of bodies are in contact, shape (T,) bool each; a pair that is not there never is."""
+"""When pairs of bodies are in contact, shape (T,) bool each; a missing pair is never in contact."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class FrameOverlap:
     """Intersection over union of contact in time; 1 is perfect agreement."""
 
     pairs: dict[Pair, float]
-    """Of each pair of bodies that is in contact in either account."""
+    """Of each pair of bodies that is in contact in either record."""
     pooled: float
-    """Over all frames and pairs together; 1 where neither account has any contact."""
+    """Over all frames and pairs together; 1 where neither record has any contact."""
 
 
 @dataclass(frozen=True)
@@ -100,24 +100,24 @@ def sequence_frames(sequence: ContactEventSequence, grid: np.ndarray) -> dict[Pa
     return frames
 
 
-def settle_frames(frames: Frames, period: float, cfg: StagingCfg | None = None) -> dict[Pair, np.ndarray]:
-    """Return frames of length `period` [s] after the chatter rule that sequences have been through."""
+def debounce_frames(frames: Frames, period: float, cfg: StagingCfg | None = None) -> dict[Pair, np.ndarray]:
+    """Return frames of length `period` [s] after the chatter rule, as sequences have them."""
     cfg = cfg or StagingCfg()
     gap, blip = steps_of(cfg.gap, period), steps_of(cfg.blip, period)
-    return {key: settle(np.asarray(touching, dtype=bool), gap, blip) for key, touching in frames.items()}
+    return {key: debounce(np.asarray(touching, dtype=bool), gap, blip) for key, touching in frames.items()}
 
 
 def iou(a: Frames, b: Frames, pairs: Iterable[Pair] | None = None) -> FrameOverlap:
-    """Return how well two accounts of contact on the same grid agree.
+    """Return the intersection over union of two contact records on the same grid.
 
     Args:
-        a: One account.
+        a: One contact record.
         b: The other.
         pairs: Pairs to compare; all by default.
     """
     a, b = ({pair(*key): np.asarray(value, dtype=bool) for key, value in frames.items()} for frames in (a, b))
     if len({len(value) for value in (*a.values(), *b.values())}) > 1:
-        raise EventsError("the accounts of contact are not on the same time grid")
+        raise EventsError("the contact records are not on the same time grid")
     chosen = sorted({pair(*key) for key in pairs} if pairs is not None else set(a) | set(b))
     scores: dict[Pair, float] = {}
     common = total = 0

@@ -1,4 +1,4 @@
-"""Who is who in a scene: robot, object or surroundings, and the name that each geom touches under."""
+"""Roles of bodies in a scene (robot, object or world), and the entity that each geom belongs to."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Roles:
     body_role: tuple[Role, ...]
     """Roles, by body id."""
     entities: tuple[Entity, ...]
-    """All that can touch."""
+    """Entities that contacts refer to: robot links, spheres of objects, geoms of the surroundings."""
     geom_body: np.ndarray
     """Body id of each geom, shape (ngeom,)."""
     geom_entity: np.ndarray
@@ -33,11 +33,11 @@ class Roles:
 
     @staticmethod
     def of(compiled: mujoco.MjModel, model: Model) -> Roles:
-        """Read the roles off a model.
+        """Return the roles of a model.
 
         Objects are the bodies with contact geometry, or those that the scene names where the model has none. Robot is
         every other body in a kinematic tree that an actuator moves, be it directly, through a tendon or through an
-        equality that couples joints. All else is world, also the bodies that stand still below a robot's first joint.
+        equality that couples joints. All else is world, including the static bodies below a robot's first joint.
 
         Args:
             compiled: The model as the engine compiled it; geom ids are its.

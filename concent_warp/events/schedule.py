@@ -1,4 +1,4 @@
-"""The contact schedule as a picture: who touches whom when, the stages, and their target events."""
+"""Plot of the contact schedule: pairs of bodies in contact over time, stages and target events."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LABEL = 26
 
 
 def plot_schedule(sequence: ContactEventSequence, path: Path | None = None, title: str | None = None) -> Figure:
-    """Draw the contact schedule.
+    """Return a figure of the contact schedule.
 
     Rows are pairs of bodies: robot links on objects, objects on objects, objects on the surroundings. A bar is a
     contact after the chatter rule; its dark part is as high as the number of pairs of spheres (or links and spheres)
@@ -34,7 +34,7 @@ def plot_schedule(sequence: ContactEventSequence, path: Path | None = None, titl
     in a stage's target event, at its time.
 
     Args:
-        sequence: What to draw.
+        sequence: The sequence to plot.
         path: Where to write the picture, in one piece or not at all; its suffix gives the format (png, svg, pdf).
         title: Title; by default the demonstration's name.
     """

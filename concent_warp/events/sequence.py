@@ -75,7 +75,7 @@ class ContactPair:
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """e_s: who touches whom in the configuration that a stage is to achieve.
+    """Target event e_s: the pairs of entities in contact in the configuration that a stage is to achieve.
 
     Example:
         >>> import concent_warp as cw
@@ -139,7 +139,7 @@ class ContactEventSequence:
     settings: StagingCfg
     """Settings that the sequence was extracted with."""
     entities: tuple[Entity, ...]
-    """All that touched anything, sorted by name."""
+    """Entities with any contact, sorted by name."""
     body_contacts: tuple[ContactInterval, ...]
     """Contacts of pairs of bodies after the chatter rule, sorted by start; `a` and `b` are body names."""
     contacts: tuple[ContactInterval, ...]
@@ -182,7 +182,7 @@ class ContactEventSequence:
         """Read what `save` wrote.
 
         Raises:
-            EventsError: The file is missing, is not such a file, or contradicts itself.
+            EventsError: The file is missing, of another format, or inconsistent.
         """
         path = Path(path)
         if not path.is_file():

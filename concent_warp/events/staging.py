@@ -8,7 +8,7 @@ Each new kind of contact that involves an object opens a stage. What a kind is n
 
 A kind counts once for each object or pair of objects: losing and regaining a contact is no new one. Contacts in which
 the task starts, contacts with the surroundings, and an object that rests on another's floor after entering it open no
-stage. What is not there is not found: an object that goes in without touching first gives no "align".
+stage. An object that enters another without touching it first gives no "align".
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ROBOT = "robot"
 
 def find_stages(
     touches: ReplayContacts,
-    settled: dict[tuple[int, int], np.ndarray],
+    in_contact: dict[tuple[int, int], np.ndarray],
     motion: BodyPoses,
     roles: Roles,
     geometry: ContactGeometry | None,
@@ -44,18 +44,18 @@ def find_stages(
     """Return the stages with their target events.
 
     Args:
-        touches: Contacts within `settled`.
-        settled: When each pair of bodies is in contact, shape (K,) bool each.
+        touches: Contacts within `in_contact`.
+        in_contact: When each pair of bodies is in contact, shape (K,) bool each.
         motion: Poses at every step.
         roles: Names and roles.
         geometry: Spheres of the objects, where they have any.
         cfg: Settings.
     """
-    onsets, held = robot_onsets(touches, motion, roles, cfg)
+    onsets, grasped = robot_onsets(touches, motion, roles, cfg)
     objects = set(roles.ids("object"))
-    for (a, b), touching in settled.items():
+    for (a, b), touching in in_contact.items():
         if a in objects and b in objects:
-            carried = held[a] | held[b]
+            carried = grasped[a] | grasped[b]
             spheres = np.zeros((0, 3))
             if geometry is not None and roles.bodies[b] in geometry.bodies:
                 spheres = geometry.position[geometry.of(roles.bodies[b])]
@@ -69,19 +69,19 @@ def find_stages(
             start=round(onset.step * motion.timestep, 6),
             end=round(end * motion.timestep, 6),
             bodies=_body_names(onset, roles),
-            event=target_event(touches, motion, roles, onset.step, end, _steady(onset, held), cfg),
+            event=target_event(touches, motion, roles, onset.step, end, _steady(onset, grasped), cfg),
         )
         for onset, end, name in zip(onsets, ends, names, strict=True)
     )
 
 
-def _steady(onset: Onset, held: dict[int, np.ndarray]) -> np.ndarray:
-    """Return when the contact of a stage holds, and the robot still holds what it held at first, shape (K,) bool."""
-    holds = onset.holds.copy()
+def _steady(onset: Onset, grasped: dict[int, np.ndarray]) -> np.ndarray:
+    """Return when the contact of a stage exists and the robot still grasps what it grasped at the onset, (K,) bool."""
+    active = onset.active.copy()
     for body in onset.body:
-        if body is not None and held[body][onset.step]:
-            holds &= held[body]
-    return holds
+        if body is not None and grasped[body][onset.step]:
+            active &= grasped[body]
+    return active
 
 
 def _body_names(onset: Onset, roles: Roles) -> tuple[str, str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import settle, steps_of
+from concent_warp.events.filter import debounce, steps_of
 from concent_warp.events.roles import Roles
 from concent_warp.simulate.engine import ContactLog, Rollout
 
@@ -21,7 +21,7 @@ class BodyPoses:
     """Poses of all bodies at every step."""
 
     timestep: float
-    """[s]."""
+    """Time step [s]."""
     position: np.ndarray
     """Body frame origins [m], world frame, shape (K, nbody, 3)."""
     rotation: np.ndarray
@@ -114,29 +114,29 @@ class ReplayContacts:
         """Return whether there is any contact at each of K steps, shape (K,) bool."""
         return np.bincount(self.step, minlength=steps)[:steps] > 0
 
-    def settled_pairs(self, steps: int, timestep: float, cfg: StagingCfg) -> dict[tuple[int, int], np.ndarray]:
+    def debounced_pairs(self, steps: int, timestep: float, cfg: StagingCfg) -> dict[tuple[int, int], np.ndarray]:
         """Return for each pair of bodies when it is in contact after the chatter rule, shape (K,) bool."""
         gap, blip = steps_of(cfg.gap, timestep), steps_of(cfg.blip, timestep)
         pairs = {(int(a), int(b)) for a, b in np.unique(self.body, axis=0)}
-        settled = {pair: settle(self.between(*pair).frames(steps), gap, blip) for pair in sorted(pairs)}
-        return {pair: touching for pair, touching in settled.items() if touching.any()}
+        in_contact = {pair: debounce(self.between(*pair).frames(steps), gap, blip) for pair in sorted(pairs)}
+        return {pair: touching for pair, touching in in_contact.items() if touching.any()}
 
-    def within(self, settled: dict[tuple[int, int], np.ndarray]) -> ReplayContacts:
-        """Return the contacts that fall in the settled contacts of their pair of bodies."""
+    def within(self, in_contact: dict[tuple[int, int], np.ndarray]) -> ReplayContacts:
+        """Return the contacts at steps at which their pair of bodies is in contact, `in_contact[pair]` (K,) bool."""
         kept = np.zeros(len(self.step), dtype=bool)
-        for pair, touching in settled.items():
+        for pair, touching in in_contact.items():
             kept |= (self.body == pair).all(axis=1) & touching[self.step]
         return self[kept]
 
 
 def _body_rank(roles: Roles, step: np.ndarray, body: np.ndarray, role: np.ndarray) -> np.ndarray:
-    """Return the rank of each body, shape (nbody,): robot, objects by time in the robot's hands, world; then name."""
-    held = dict.fromkeys(roles.ids("object"), 0)
-    for b in held:
+    """Return the rank of each body, (nbody,): robot, objects by time in contact with the robot, world; then name."""
+    contact_steps = dict.fromkeys(roles.ids("object"), 0)
+    for b in contact_steps:
         by_robot = ((body == b) & (role[:, ::-1] == ORDER["robot"])).any(axis=1)
-        held[b] = len(np.unique(step[by_robot]))
+        contact_steps[b] = len(np.unique(step[by_robot]))
     order = sorted(
-        range(len(roles.bodies)), key=lambda i: (ORDER[roles.body_role[i]], -held.get(i, 0), roles.bodies[i])
+        range(len(roles.bodies)), key=lambda i: (ORDER[roles.body_role[i]], -contact_steps.get(i, 0), roles.bodies[i])
     )
     rank = np.empty(len(order), dtype=int)
     rank[order] = np.arange(len(order))

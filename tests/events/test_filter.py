@@ -1,6 +1,6 @@
 import numpy as np
 
-from concent_warp.events.filter import close_gaps, drop_blips, runs, settle, steps_of, windowed
+from concent_warp.events.filter import close_gaps, debounce, drop_blips, runs, steps_of, windowed
 
 
 def frames(text: str) -> np.ndarray:
@@ -29,7 +29,7 @@ def test_contacts_shorter_than_the_blip_are_dropped():
 
 
 def test_a_flickering_contact_survives_as_one_and_a_lone_tap_does_not():
-    assert text(settle(frames("#.#.#.#......#...."), gap=3, blip=4)) == "#######..........."
+    assert text(debounce(frames("#.#.#.#......#...."), gap=3, blip=4)) == "#######..........."
 
 
 def test_durations_become_whole_steps():

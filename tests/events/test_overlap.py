@@ -6,11 +6,11 @@ import pytest
 from concent_warp.errors import EventsError
 from concent_warp.events.overlap import (
     contact_frames,
+    debounce_frames,
     iou,
     overlap,
     resample,
     sequence_frames,
-    settle_frames,
     time_grid,
 )
 from concent_warp.events.sequence import ContactEventSequence
@@ -70,7 +70,7 @@ def test_accounts_on_different_grids_are_refused():
 
 
 def test_the_chatter_rule_can_be_applied_to_measured_frames():
-    found = settle_frames({("x", "y"): frames("#.#.##......#...")}, 0.02)
+    found = debounce_frames({("x", "y"): frames("#.#.##......#...")}, 0.02)
     assert found["x", "y"].tolist() == frames("######..........").tolist()
 
 
