@@ -1,4 +1,4 @@
-"""The list of effects as the documentation has it: ``python -m concent_warp.effects.catalogue`` prints it."""
+"""Table of effects for the documentation: ``python -m concent_warp.effects.catalogue`` prints it."""
 
 from __future__ import annotations
 

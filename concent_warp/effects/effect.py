@@ -1,6 +1,6 @@
-"""What an effect is: one named piece of physics with parameters, and the hooks by which it changes a model.
+"""Base class of physical effects: one named effect with parameters, and the methods by which it changes a model.
 
-An effect acts in up to five places, and says nothing where it does not act:
+An effect implements those of these methods that it needs:
 
 - `prepare` edits the MJCF once, whatever the parameters' values (it switches something on);
 - `edit` edits the MJCF by value, where a compiled model cannot be changed (sizes);
@@ -59,14 +59,13 @@ class Parameter:
     null: float
     """Value at which the effect does nothing; infinite for a limit."""
     low: float
-    """Smallest value that makes sense."""
+    """Lower bound."""
     high: float
-    """Largest."""
+    """Upper bound."""
     scale: float
-    """Typical difference from the null value where the effect is there: the standard deviation of the prior, and the
-    unit in which a fit moves."""
+    """Typical difference from the null value: the standard deviation of the prior, and the unit of a fit's steps."""
     scan: tuple[float, ...] = ()
-    """Values worth a trial where nothing is learnt from small changes about the null value."""
+    """Values to try where the sensitivity at the null value is zero or misleading, as for effects with a threshold."""
 
 
 class Effect:
@@ -81,40 +80,41 @@ class Effect:
     """
 
     name: ClassVar[str]
-    """What users type."""
+    """Name in the command line, model files and reports."""
     family: ClassVar[Family]
     kind: ClassVar[Kind]
-    """What a target names."""
-    wants: ClassVar[str] = ""
-    """What a target must be beyond that, in words; see `suits`."""
+    """Kind of element that a target names."""
+    requirement: ClassVar[str] = ""
+    """Requirement on a target besides its kind, as text for messages; see `applies_to`."""
     summary: ClassVar[str]
     """What it does, with the formula."""
     source: ClassVar[str]
     """Where the formula is from."""
     signature: ClassVar[str]
-    """What it leaves in the residuals of a model that lacks it."""
+    """Typical residuals of a model that lacks it."""
     confusions: ClassVar[tuple[str, ...]] = ()
-    """Effects that leave something alike, by name."""
+    """Names of effects with similar residuals."""
     rarity: ClassVar[float] = 0.0
-    """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders what data cannot tell apart."""
+    """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders effects that the data do
+    not distinguish."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
     history: ClassVar[float] = 0.0
-    """How far back [s] the commands reach into what acts now."""
+    """Length [s] of the history of commands on which the present command depends."""
 
     def __init__(self, *target: str) -> None:
         self.target = target
 
     def __repr__(self) -> str:
-        """Return how the effect is made."""
+        """Return the constructor call of the effect."""
         return f"{type(self).__name__}({', '.join(map(repr, self.target))})"
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the selections to which the effect may apply in a model, each to be tried by itself."""
+        """Return the selections to which the effect may apply in a model; each is a separate candidate."""
         raise NotImplementedError
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:  # noqa: ARG002
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:  # noqa: ARG002
         """Return whether the effect may act on the joint, actuator, body, geom or sensor of an id."""
         return True
 
@@ -140,11 +140,11 @@ class Effect:
         return None
 
     def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        """Return what acts where `ctrl`, shape (K, nu), was commanded, one row a time step."""
+        """Return the commands that act for the given ones `ctrl`, shape (K, nu) each, one row a time step."""
         return ctrl
 
-    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # noqa: ARG002
-        """Return what `command` comes to where it is a delay and a first-order lag, None where it is something else.
+    def delay_and_lag(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # noqa: ARG002
+        """Return `command` as a delay and a first-order lag, or None where it has another form.
 
         Returns:
             Delays and time constants of all actuators [s], shape (nu,) each.
@@ -152,7 +152,7 @@ class Effect:
         return None
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
-        """Return what the instruments read where `read` is what there was to see."""
+        """Return the reader of the instruments; `read` gives the true values."""
         return read
 
     @property
@@ -171,10 +171,10 @@ class Effect:
         return type(self).command is not Effect.command
 
     def check(self, m: mujoco.MjModel) -> None:
-        """Check that the targets exist in a model and suit the effect.
+        """Check that the targets exist in a model and that the effect can act on them.
 
         Raises:
-            ModelError: One does not, or there is none.
+            ModelError: A target does not exist or does not meet the requirement, or there is no target.
         """
         if self.kind == "none":
             if self.target:
@@ -183,18 +183,18 @@ class Effect:
         known = _names(m, self.kind)
         if unknown := [name for name in self.target if name not in known]:
             raise ModelError(
-                f"{self.name} on what the model lacks", expected=f"{self.kind}s among {known}", found=unknown
+                f"{self.name} has an unknown target", expected=f"{self.kind}s among {known}", found=unknown
             )
         if not self.target:
             raise ModelError(f"{self.name} has no target", expected=f"{self.kind}s among {known}", found="none")
-        if unfit := [n for n, i in zip(self.target, self.ids(m), strict=True) if not self.suits(m, int(i))]:
-            raise ModelError(f"{self.name} cannot act there", expected=self.wants, found=unfit)
+        if unfit := [n for n, i in zip(self.target, self.ids(m), strict=True) if not self.applies_to(m, int(i))]:
+            raise ModelError(f"{self.name} cannot act on these targets", expected=self.requirement, found=unfit)
 
     def ids(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the ids of the targets, shape (n,) int."""
         return np.array([mujoco.mj_name2id(m, OBJECTS[self.kind], name) for name in self.target], dtype=int)
 
-    def each(
+    def parameter_per_target(
         self, name: str, unit: str, null: Sequence[float] | np.ndarray | float, **rest: float
     ) -> tuple[Parameter, ...]:
         """Return one parameter a target; `rest` are the other entries of `Parameter`."""
@@ -207,7 +207,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class AddedEffect:
-    """An effect with the values of its parameters: what a model holds."""
+    """An effect with the values of its parameters, as a model has it."""
 
     effect: Effect
     values: tuple[float, ...]
@@ -229,7 +229,7 @@ def _names(m: mujoco.MjModel, kind: str) -> list[str]:
 
 
 def prepare(spec: mujoco.MjSpec, effects: Sequence[AddedEffect]) -> None:
-    """Let effects edit the MJCF that a model is compiled from."""
+    """Edit an MJCF by effects, before it is compiled."""
     for added in effects:
         added.effect.prepare(spec)
     for added in effects:
@@ -237,12 +237,12 @@ def prepare(spec: mujoco.MjSpec, effects: Sequence[AddedEffect]) -> None:
 
 
 def write(m: mujoco.MjModel, effects: Sequence[AddedEffect]) -> None:
-    """Let effects set the fields of a model that was compiled from an MJCF prepared for them, one after the other."""
+    """Set the fields of a compiled model by effects, in their order; its MJCF is prepared for them."""
     for added in effects:
         added.effect.write(m, added.array)
 
 
-def written(
+def variant_fields(
     m: mujoco.MjModel, effects: Sequence[Effect], values: np.ndarray, split: Sequence[slice]
 ) -> Mapping[str, np.ndarray]:
     """Return the model fields of N variants in which effects have other values.

@@ -1,4 +1,4 @@
-"""Which effects there are: ours, and those that installed packages register.
+"""Registry of effects: those of the library, and those that installed packages register.
 
 A package adds its own by an entry point of the group ``concent_warp.effects`` that names a subclass of `Effect`.
 """

@@ -1,4 +1,4 @@
-"""What an effect may apply to in a model: driven joints, free bodies, fingers, what stands still."""
+"""Selections of model elements for effects: driven joints, free bodies, fingers, static geoms."""
 
 from __future__ import annotations
 
@@ -118,14 +118,14 @@ def geoms_of(m: mujoco.MjModel, body: int) -> np.ndarray:
     return np.flatnonzero(m.body_weldid[m.geom_bodyid] == m.body_weldid[body])
 
 
-def standing_geoms(m: mujoco.MjModel) -> np.ndarray:
+def static_geoms(m: mujoco.MjModel) -> np.ndarray:
     """Return the geoms that cannot move, shape (n,) int."""
     return geoms_of(m, 0)
 
 
 def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
-    """Return the colliding geoms of a body and of all that stands still: where it slides, rolls and lands."""
-    ids = np.union1d(geoms_of(m, body), standing_geoms(m))
+    """Return the colliding geoms of a body and all static colliding geoms, shape (n,) int."""
+    ids = np.union1d(geoms_of(m, body), static_geoms(m))
     return ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
 
 

@@ -1,6 +1,7 @@
-"""A force of no known form: bumps over position, velocity or place, each of its own size.
+"""A non-parametric force: a sum of Gaussian basis functions of joint position, velocity or body position.
 
-It is no effect that is added to a model; it stands for what no effect in the library can do. Bumps are Gaussian,
+It is not registered as an effect; it represents forces that no effect of the library can produce. Basis functions
+("bumps") are Gaussian,
 exp(-x^2 / 2) with x the distance from a centre in widths.
 """
 
@@ -17,7 +18,7 @@ from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.force_model import ForceModel
 
 SMALLEST = 1e-12
-"""Sizes below this count as none."""
+"""Sizes below this are zero."""
 
 
 class UnknownJointForce(ForceModel):
@@ -27,7 +28,7 @@ class UnknownJointForce(ForceModel):
     """
 
     def __init__(self, of: np.ndarray, dof: np.ndarray, centre: np.ndarray, scale: np.ndarray, *, moving: bool) -> None:
-        """Lay out bumps.
+        """Set the basis functions.
 
         Args:
             of: Where in the positions, or the velocities if `moving`, each joint is, shape (n,) int.
@@ -82,7 +83,7 @@ class UnknownBodyForce(ForceModel):
     def __init__(
         self, body: int, place: int, dof: int, centre: np.ndarray, width: float, scale: float, way: Way
     ) -> None:
-        """Lay out bumps.
+        """Set the basis functions.
 
         Args:
             body: Id.
@@ -132,7 +133,7 @@ class UnknownBodyForce(ForceModel):
 
 
 class UnknownForce(Effect):
-    """A force of no known form, see this module; it is not registered."""
+    """A non-parametric force, see this module; it is not registered."""
 
     name = "unknown_force"
     family = "world"

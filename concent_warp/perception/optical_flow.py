@@ -1,7 +1,7 @@
-"""Following points from image to image, and reading their depth.
+"""Tracking of pixels between images, and their depth.
 
 Optical flow by Lucas and Kanade ("An iterative image registration technique with an application to stereo vision",
-IJCAI 1981), over an image pyramid, kept where following the point back returns to where it started (Kalal, Mikolajczyk
+IJCAI 1981), over an image pyramid, kept where tracking the point back returns to its start (Kalal, Mikolajczyk
 and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR 2010). Points are corners in the
 sense of Shi and Tomasi ("Good features to track", CVPR 1994).
 """
@@ -11,25 +11,25 @@ from __future__ import annotations
 import numpy as np
 
 
-def grey(rgb: np.ndarray) -> np.ndarray:
+def grayscale(rgb: np.ndarray) -> np.ndarray:
     """Return the brightness, uint8, shape (H, W), of an image, uint8, shape (H, W, 3)."""
     import cv2
 
     return cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
 
 
-def follow(
+def track_pixels(
     before: np.ndarray, after: np.ndarray, pixels: np.ndarray, guess: np.ndarray, *, window: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points went, shape (n, 2) [px], and whether they can be trusted, shape (n,) bool.
+    """Return the tracked pixels, shape (n, 2) [px], and whether each passed the forward-backward test, shape (n,) bool.
 
     Args:
         before: Brightness of the image that the points are known in, uint8, shape (H, W).
         after: Brightness of the next image.
         pixels: Points in `before` [px], shape (n, 2).
-        guess: Where they may be in `after` [px], shape (n, 2).
+        guess: Initial estimate of the points in `after` [px], shape (n, 2).
         window: Edge of the square around a point that is compared [px].
-        tolerance: Largest distance between a point and where following it back leads [px].
+        tolerance: Largest forward-backward error [px].
     """
     import cv2
 
@@ -79,7 +79,7 @@ def corners(image: np.ndarray, region: np.ndarray, taken: np.ndarray, count: int
     return pixels[mask[row, column] > 0]
 
 
-def shrunk(region: np.ndarray, margin: int) -> np.ndarray:
+def eroded(region: np.ndarray, margin: int) -> np.ndarray:
     """Return a region (H, W) bool without the pixels within `margin` [px] of its border."""
     import cv2
 

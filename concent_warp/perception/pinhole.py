@@ -35,7 +35,7 @@ class Pinhole:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels [px], shape (..., 2), and depths [m], shape (...), of world points [m], shape (..., 3).
 
-        Points behind the camera have a depth below 0, and their pixels mean nothing.
+        Points behind the camera have a depth below 0, and their pixels are undefined.
         """
         local = (points - self.position) @ self.pose[:3, :3]
         image = local @ self.intrinsics.T
@@ -47,7 +47,7 @@ class Pinhole:
         return self.position + np.asarray(depth)[..., None] * (self.rays(pixels) @ self.pose[:3, :3].T)
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
-        """Return what pixels (..., 2) [px] look along, camera frame, scaled to a depth of 1, shape (..., 3)."""
+        """Return the viewing rays of pixels (..., 2) [px], camera frame, scaled to a depth of 1, shape (..., 3)."""
         ones = np.ones((*np.shape(pixels)[:-1], 1))
         return np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
 

@@ -1,9 +1,9 @@
-"""RGB-D video to point tracks, without any trained network.
+"""Point tracks from RGB-D video, by optical flow and rigid motion.
 
-For each body: corners are found where the depth image shows the body, followed by optical flow (`flow`), lifted to 3D
-by their depth, and held together by the rigid motion that most of them agree with (`rigid`); points that keep
-disagreeing are dropped, new ones are found where the body now is. The body's shape and its pose at the start are all
-that is known beforehand, and both come from the recording.
+For each body: corners are detected in the region where the depth image agrees with the body's shape, tracked by optical
+flow (`optical_flow`), lifted to 3D by their depth, and fitted by a robust rigid motion (`rigid_motion`). Points that
+repeatedly disagree with this motion are dropped and new corners are detected in the current region. The body's shape
+and its initial pose are taken from the recording.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.perception.optical_flow import corners, depth_at, follow, grey, shrunk
+from concent_warp.perception.optical_flow import corners, depth_at, eroded, grayscale, track_pixels
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.rigid_motion import consensus, inverse, moved
-from concent_warp.perception.visible_region import BodyShape, shown
+from concent_warp.perception.rigid_motion import consensus, inverse, transformed
+from concent_warp.perception.visible_region import BodyShape, visible_mask
 from concent_warp.recording.recording import Demonstration, ImageStream, PointTrack, Recording
 from concent_warp.scene.scene import Scene
 
 
 @dataclass(frozen=True)
 class TrackingCfg:
-    """How points are tracked."""
+    """Settings of the point tracking."""
 
     count: int = 60
-    """Points of a body followed at a time, where so many corners are found."""
-    refill: float = 0.7
-    """Share of `count` below which new points are looked for."""
+    """Largest number of points of a body that are tracked at a time."""
+    refill_share: float = 0.7
+    """Share of `count` below which new corners are detected [-]."""
     spacing: float = 3.0
     """Least distance between new points [px]."""
     window: int = 7
@@ -43,21 +43,21 @@ class TrackingCfg:
     """Distance within which a measured depth belongs to a body [m]."""
     margin: int = 2
     """Distance that new points keep from the outline of what is visible [px]."""
-    patience: int = 3
-    """Frames for which a point that does not move with its body is still followed, in case it was mere noise."""
-    least: int = 6
-    """Points that must agree, or the body counts as lost in this frame."""
-    regain: float = 0.5
-    """Share of the pixels of a lost body that must show it, where it was last, before it is followed again."""
+    max_outlier_frames: int = 3
+    """Consecutive frames in which a point may disagree with the motion of its body before it is dropped."""
+    min_points: int = 6
+    """Least number of points that agree with a rigid motion; with fewer, the body is lost in this frame."""
+    min_visible_share: float = 0.5
+    """Share of the pixels of a lost body, at its last pose, that must be visible before it is tracked again [-]."""
     seed: int = 0
     """Seed of the random samples."""
 
 
 class BodyTracker:
-    """Follows one body from frame to frame."""
+    """Tracks one body from frame to frame."""
 
     def __init__(self, shape: BodyShape, camera: Pinhole, cfg: TrackingCfg) -> None:
-        """Start where the body is at the start, with no points yet."""
+        """Create a tracker at the initial pose of the body, without points."""
         self.shape, self.camera, self.cfg = shape, camera, cfg
         self.rng = np.random.default_rng(cfg.seed)
         self.pose, self.step = shape.start, np.eye(4)
@@ -66,32 +66,32 @@ class BodyTracker:
         self.pixel = np.zeros((0, 2))
         """Where the points were seen last [px], shape (M, 2)."""
         self.alive = np.zeros(0, dtype=bool)
-        """Which points are being followed, shape (M,)."""
-        self.astray = np.zeros(0, dtype=int)
-        """For how many frames a point has not moved with the body, shape (M,)."""
+        """Which points are tracked, shape (M,)."""
+        self.outlier_frames = np.zeros(0, dtype=int)
+        """Consecutive frames in which each point disagreed with the motion of the body, shape (M,)."""
         self.history: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         """Of each frame: the pose (4, 4), the points seen (m,) and where depth put them [m], world frame, (m, 3)."""
 
     def advance(self, before: np.ndarray | None, image: np.ndarray, depth: np.ndarray) -> None:
-        """Take one frame: brightness before and now, uint8, and depth now [m], all (H, W)."""
+        """Process one frame: brightness before and now, uint8, and depth now [m], all (H, W)."""
         if before is not None:
-            self.follow(before, image, depth)
-        if self.alive.sum() < self.cfg.refill * self.cfg.count:
+            self.update(before, image, depth)
+        if self.alive.sum() < self.cfg.refill_share * self.cfg.count:
             self.refill(image, depth)
-        rows = np.flatnonzero(self.alive & (self.astray == 0))
+        rows = np.flatnonzero(self.alive & (self.outlier_frames == 0))
         seen = self.camera.lift(self.pixel[rows], depth_at(depth, self.pixel[rows]))
         self.history.append((self.pose, rows, seen))
 
-    def follow(self, before: np.ndarray, image: np.ndarray, depth: np.ndarray) -> None:
-        """Move the points that are followed, and the body with them."""
+    def update(self, before: np.ndarray, image: np.ndarray, depth: np.ndarray) -> None:
+        """Update the pixels of the tracked points and the pose of the body."""
         rows = np.flatnonzero(self.alive)
         self.alive[:] = False
         expected = self.step @ self.pose
         guess = self.pixel[rows] + (
-            self.camera.project(moved(expected, self.local[rows]))[0]
-            - self.camera.project(moved(self.pose, self.local[rows]))[0]
+            self.camera.project(transformed(expected, self.local[rows]))[0]
+            - self.camera.project(transformed(self.pose, self.local[rows]))[0]
         )
-        pixel, sure = follow(
+        pixel, sure = track_pixels(
             before,
             image,
             self.pixel[rows],
@@ -103,48 +103,48 @@ class BodyTracker:
         sure &= np.isfinite(distance)
         rows, pixel, distance = rows[sure], pixel[sure], distance[sure]
         result = consensus(self.local[rows], self.camera.lift(pixel, distance), self.cfg.agreement, self.rng)
-        if result is None or result[1].sum() < self.cfg.least:
+        if result is None or result[1].sum() < self.cfg.min_points:
             self.step = np.eye(4)
             return
         pose, agrees = result
         self.step, self.pose = pose @ inverse(self.pose), pose
         self.pixel[rows] = pixel
-        self.astray[rows] = np.where(agrees, 0, self.astray[rows] + 1)
-        self.alive[rows] = self.astray[rows] <= self.cfg.patience
+        self.outlier_frames[rows] = np.where(agrees, 0, self.outlier_frames[rows] + 1)
+        self.alive[rows] = self.outlier_frames[rows] <= self.cfg.max_outlier_frames
 
     def refill(self, image: np.ndarray, depth: np.ndarray) -> None:
-        """Find new points where the body shows; a body that was lost must show well enough to be followed again."""
+        """Add corners in the visible region of the body; a lost body is tracked again once enough of it is visible."""
         expected = self.shape.depth(self.camera, self.pose, *depth.shape)
-        region = shown(expected, depth, self.cfg.region_tolerance)
+        region = visible_mask(expected, depth, self.cfg.region_tolerance)
         lost = bool(self.history) and not self.alive.any()
-        if lost and region.sum() < self.cfg.regain * (expected > 0).sum():
+        if lost and region.sum() < self.cfg.min_visible_share * (expected > 0).sum():
             return
-        region = shrunk(region, self.cfg.margin)
+        region = eroded(region, self.cfg.margin)
         taken = self.pixel[self.alive]
         found = corners(image, region, taken, self.cfg.count - len(taken), self.cfg.spacing)
         distance = depth_at(depth, found)
         found, distance = found[np.isfinite(distance)], distance[np.isfinite(distance)]
-        local = moved(inverse(self.pose), self.camera.lift(found, distance))
+        local = transformed(inverse(self.pose), self.camera.lift(found, distance))
         self.local = np.concatenate([self.local, local])
         self.pixel = np.concatenate([self.pixel, found])
         self.alive = np.concatenate([self.alive, np.ones(len(found), dtype=bool)])
-        self.astray = np.concatenate([self.astray, np.zeros(len(found), dtype=int)])
+        self.outlier_frames = np.concatenate([self.outlier_frames, np.zeros(len(found), dtype=int)])
 
     def track(self, time: np.ndarray) -> PointTrack:
-        """Return what was followed, at the times of the frames [s], shape (T,).
+        """Return the track of all points, at the times of the frames [s], shape (T,).
 
         A point of the body is the mean of all its sightings, moved back into the body frame; where it was seen, it is
         put where the body's motion takes it. So the noise of a single depth reading averages out.
         """
         total, count = np.zeros_like(self.local), np.zeros(len(self.local))
         for pose, rows, seen in self.history:
-            total[rows] += moved(inverse(pose), seen)
+            total[rows] += transformed(inverse(pose), seen)
             count[rows] += 1
         local = total / np.maximum(count, 1)[:, None]
         value = np.full((len(time), len(local), 3), np.nan)
         visible = np.zeros((len(time), len(local)), dtype=bool)
         for t, (pose, rows, _) in enumerate(self.history):
-            value[t, rows] = moved(pose, local[rows])
+            value[t, rows] = transformed(pose, local[rows])
             visible[t, rows] = True
         return PointTrack(np.asarray(time, float), value, visible)
 
@@ -193,10 +193,10 @@ def track_points(
         trackers[body] = BodyTracker(BodyShape(scene.model, np.asarray(state, float), body), pinhole, cfg)
     before = None
     for t in range(len(stream.time)):
-        image = grey(stream.rgb[t])
+        image = grayscale(stream.rgb[t])
         for body, tracker in trackers.items():
             tracker.advance(before, image, stream.depth[t])
-            if t == 0 and tracker.alive.sum() < cfg.least:
+            if t == 0 and tracker.alive.sum() < cfg.min_points:
                 raise RecordingError(
                     f"body {body!r} cannot be tracked",
                     where=f"{where}, first frame",

@@ -1,4 +1,4 @@
-"""Rigid motion between two sets of points, some of which are wrong.
+"""Rigid motion between two sets of points with outliers.
 
 Least squares by Kabsch ("A solution for the best rotation to relate two sets of vectors", Acta Crystallographica A32,
 1976), made robust by random sample consensus (Fischler and Bolles, "Random sample consensus", Communications of the
@@ -45,7 +45,7 @@ def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return result
 
 
-def moved(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+def transformed(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return points (..., n, 3) [m] after a rigid transform (..., 4, 4)."""
     return points @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
 
@@ -73,7 +73,7 @@ def consensus(
         source: Points [m], shape (n, 3).
         target: The same points elsewhere [m], some of them wrong, shape (n, 3).
         tolerance: Distance within which a point agrees [m].
-        rng: Source of the draws.
+        rng: Random generator of the samples.
         cfg: Settings.
     """
     cfg = cfg or ConsensusCfg()
@@ -82,7 +82,7 @@ def consensus(
         return None
     triples = np.argsort(rng.random((cfg.samples, count)), axis=1)[:, :3]
     candidates = kabsch(source[triples], target[triples])
-    distances = np.linalg.norm(moved(candidates, source[None]) - target, axis=2)
+    distances = np.linalg.norm(transformed(candidates, source[None]) - target, axis=2)
     winner = np.minimum(distances, tolerance).sum(axis=1).argmin()
     distance, transform = distances[winner], candidates[winner]
     for _ in range(cfg.refits):
@@ -90,7 +90,7 @@ def consensus(
         if agrees.sum() < min(count, 4):
             return None
         transform = kabsch(source[agrees], target[agrees])
-        distance = np.linalg.norm(moved(transform, source) - target, axis=1)
+        distance = np.linalg.norm(transformed(transform, source) - target, axis=1)
     return transform, _narrowed(distance, tolerance, cfg.max_over_median)
 
 

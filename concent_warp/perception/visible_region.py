@@ -1,4 +1,4 @@
-"""Which pixels of a depth image show a body whose shape and pose are known."""
+"""Pixels of a depth image in which a body of known shape and pose is visible."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import mujoco
 import numpy as np
 
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.perception.rigid_motion import inverse, moved
+from concent_warp.perception.rigid_motion import inverse, transformed
 
 OWN = 5
 """Geom group that the body's geoms are put into, so that rays meet no others."""
 
 
 class BodyShape:
-    """The geoms of one body, for casting rays at it wherever it is."""
+    """Geoms of one body, for ray casting at any pose of the body."""
 
     def __init__(self, model: mujoco.MjModel, qpos: np.ndarray, body: str) -> None:
-        """Take the geoms of `body` from a compiled scene; `qpos` (nq,) says where it is at the start."""
+        """Take the geoms of `body` from a compiled scene; `qpos` (nq,) is the initial state."""
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.data.qpos[:] = qpos
@@ -47,31 +47,31 @@ class BodyShape:
         pixels = pixel_grid(height, width)[window].reshape(-1, 2)
         if not len(pixels):
             return result
-        # The rays are brought to where the body was at the start, so that the compiled scene can stay as it is.
+        # The rays are transformed to the initial pose of the body, so that the compiled scene stays unchanged.
         back = self.start @ inverse(pose)
-        origin = moved(back, camera.position[None])[0]
+        origin = transformed(back, camera.position[None])[0]
         ray = camera.rays(pixels) @ (back[:3, :3] @ camera.pose[:3, :3]).T
         length = np.linalg.norm(ray, axis=1)
         group = np.zeros(6, dtype=np.uint8)
         group[OWN] = 1
-        hit = cast(self.model, self.data, origin, ray / length[:, None], group)
+        hit = cast_rays(self.model, self.data, origin, ray / length[:, None], group)
         # Rays are scaled to a depth of 1, so depth is distance over length.
         result[window] = np.where(hit >= 0, hit / length, 0.0).reshape(result[window].shape)
         return result
 
 
-def shown(expected: np.ndarray, measured: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return which pixels show a body, shape (H, W) bool.
+def visible_mask(expected: np.ndarray, measured: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the pixels in which a body is visible, shape (H, W) bool.
 
     Args:
-        expected: Depth of the body alone [m], shape (H, W), 0 where it is not.
+        expected: Depth of the body alone [m], shape (H, W), 0 outside it.
         measured: Measured depth [m], shape (H, W), 0 where there is none.
         tolerance: Largest difference between the two [m].
     """
     return (expected > 0) & (measured > 0) & (np.abs(measured - expected) < tolerance)
 
 
-def cast(
+def cast_rays(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     origin: np.ndarray,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_worlds import Motion, move
 
-from concent_warp.effects.effect import Effect, written
+from concent_warp.effects.effect import Effect, variant_fields
 from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.model import Model
@@ -152,7 +152,7 @@ def test_values_as_fields_and_laws_of_variants_do_the_same_as_in_the_model(scene
     null = MODELS[scene].add(effect)
     engine = MujocoEngine(null, threads=1)
     m = engine.compiled
-    fields = written(m, [effect], values, [slice(None)])
+    fields = variant_fields(m, [effect], values, [slice(None)])
     force_model = effect.force_model(m)
     start = {name: np.array([motion[name]], dtype=float) for name in ("qpos", "qvel") if name in motion}
     ctrl = effect.command(m, motion.get("ctrl", np.zeros((300, m.nu))), values[0])

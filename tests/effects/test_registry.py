@@ -16,7 +16,8 @@ class CableSpring(JointEffect):
     name, summary, source, signature = "cable_spring", "tau = -k q", "Hooke", "torque in proportion to position"
 
     def parameters(self, m):
-        return self.each("stiffness", "N m/rad", m.jnt_stiffness[self.ids(m)], low=0.0, high=9.0, scale=0.5)
+        rest = m.jnt_stiffness[self.ids(m)]
+        return self.parameter_per_target("stiffness", "N m/rad", rest, low=0.0, high=9.0, scale=0.5)
 
     def fields(self, m):
         return ("jnt_stiffness",)

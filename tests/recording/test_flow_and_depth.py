@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from concent_warp.perception.optical_flow import corners, depth_at, follow, grey, shrunk
+from concent_warp.perception.optical_flow import corners, depth_at, eroded, grayscale, track_pixels
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.perception.visible_region import BodyShape, shown
+from concent_warp.perception.visible_region import BodyShape, visible_mask
 
 K = np.array([[300.0, 0, 79.5], [0, 300.0, 59.5], [0, 0, 1]])
 HEIGHT, WIDTH = 120, 160
@@ -51,7 +51,7 @@ def test_flow_follows_a_shift_of_parts_of_a_pixel():
     after = np.clip(shift(before.astype(float), move[::-1], order=3, mode="nearest"), 0, 255).astype(np.uint8)
     start = corners(before, np.pad(np.ones((90, 130), bool), 15), np.zeros((0, 2)), 40, 5.0)
     assert len(start) > 30
-    there, sure = follow(before, after, start, start, window=9, tolerance=0.3)
+    there, sure = track_pixels(before, after, start, start, window=9, tolerance=0.3)
     assert sure.mean() > 0.9
     assert np.abs(there[sure] - start[sure] - move).max() < 0.15
 
@@ -61,7 +61,7 @@ def test_flow_drops_points_that_are_covered():
     after = before.copy()
     after[40:80, 60:110] = texture(1)[40:80, 60:110]
     start = corners(before, np.pad(np.ones((90, 130), bool), 15), np.zeros((0, 2)), 60, 5.0)
-    _, sure = follow(before, after, start, start, window=9, tolerance=0.3)
+    _, sure = track_pixels(before, after, start, start, window=9, tolerance=0.3)
     well_inside = ((start > [65, 45]) & (start < [105, 75])).all(axis=1)
     well_outside = ((start < [54, 34]) | (start > [116, 86])).any(axis=1)
     assert sure[well_outside].mean() > 0.95
@@ -69,7 +69,7 @@ def test_flow_drops_points_that_are_covered():
 
 
 def test_flow_of_no_points_is_no_points():
-    there, sure = follow(texture(), texture(), np.zeros((0, 2)), np.zeros((0, 2)), window=7, tolerance=0.5)
+    there, sure = track_pixels(texture(), texture(), np.zeros((0, 2)), np.zeros((0, 2)), window=7, tolerance=0.5)
     assert there.shape == (0, 2)
     assert sure.shape == (0,)
 
@@ -136,17 +136,17 @@ def test_region_of_a_box_is_where_its_depth_is_and_nothing_covers_it():
     assert column == pytest.approx(79.5 + 300 * 0.05 / 0.4, abs=1.5)
     measured = np.where(alone > 0, alone, 0.54)
     measured[:60] = 0.3
-    region = shown(alone, measured, 0.005)
+    region = visible_mask(alone, measured, 0.005)
     assert region.sum() == 12 * 24
     assert not region[:60].any()
-    assert shrunk(region, 2).sum() == 8 * 20
+    assert eroded(region, 2).sum() == 8 * 20
     behind = pose.copy()
     behind[2, 3] = 2.0
     assert not shape.depth(camera, behind, HEIGHT, WIDTH).any()
 
 
 def test_grey_weighs_colours_as_the_eye_does():
-    assert grey(np.full((2, 2, 3), 90, np.uint8)).max() == 90
+    assert grayscale(np.full((2, 2, 3), 90, np.uint8)).max() == 90
     colours = np.eye(3, dtype=np.uint8)[None] * 200
-    red, green, blue = grey(colours)[0].astype(int)
+    red, green, blue = grayscale(colours)[0].astype(int)
     assert green > red > blue

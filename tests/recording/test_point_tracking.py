@@ -8,7 +8,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.perception.point_tracking import TrackingCfg, track_points
-from concent_warp.perception.rigid_motion import inverse, moved
+from concent_warp.perception.rigid_motion import inverse, transformed
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.reality.sensors.camera import film
 from concent_warp.recording.recording import Demonstration, Recording
@@ -74,9 +74,9 @@ def test_tracked_points_move_with_the_body_within_a_millimetre(carried, tracked,
     for t in range(len(track.time)):
         rows = np.flatnonzero(track.visible[t])
         # Where true motion takes each point from where it was first seen.
-        local = np.array([moved(inverse(truth[first[k]]), track.value[first[k], k][None])[0] for k in rows])
-        error.append(np.linalg.norm(moved(truth[t], local) - track.value[t, rows], axis=1))
-        surface.append(np.abs(solid.signed_distance(moved(inverse(truth[t]), track.value[t, rows]))))
+        local = np.array([transformed(inverse(truth[first[k]]), track.value[first[k], k][None])[0] for k in rows])
+        error.append(np.linalg.norm(transformed(truth[t], local) - track.value[t, rows], axis=1))
+        surface.append(np.abs(solid.signed_distance(transformed(inverse(truth[t]), track.value[t, rows]))))
     assert np.concatenate(error).mean() < 0.6e-3
     assert np.concatenate(error).max() < 3e-3
     assert np.concatenate(surface).mean() < 0.8e-3

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from concent_warp.effects.effect import Effect, Parameter, written
+from concent_warp.effects.effect import Effect, Parameter, variant_fields
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import EngineError
@@ -97,7 +97,7 @@ def all_at_once(device: str, names: Sequence[str] = ON_MOTION) -> tuple[list[Eff
         ctrl[1 + n] = effect.command(m, ctrl[1 + n], np.array(value))
     variants = Variants(
         len(rows),
-        fields=written(m, chosen, rows, parts),
+        fields=variant_fields(m, chosen, rows, parts),
         force_models=tuple((force_model, given) for force_model, given in acting if force_model is not None),
         qvel=np.tile(QVEL, (len(rows), 1)),
     )

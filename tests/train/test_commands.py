@@ -30,7 +30,7 @@ def task_of(*effects: AddedEffect) -> Task:
 
 
 @pytest.fixture(scope="module")
-def late() -> Task:
+def delay_and_lag() -> Task:
     return task_of(DELAY, LAG)
 
 
@@ -48,7 +48,7 @@ def test_commands_are_followed_as_the_effects_have_it(late):
     rows = (np.array([[0.0], [0.005], [0.0123], [0.062], [0.29]]), np.array([[0.0], [0.03], [0.001], [0.2], [0.05]]))
     parts = []
     for added, row in zip(late.model.effects, rows, strict=True):
-        found = [added.effect.late(late.compiled, value) for value in row]
+        found = [added.effect.delay_and_lag(late.compiled, value) for value in row]
         parts.append(CommandDynamics(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
     following = CommandDynamics.combined(parts)
     assert following is not None

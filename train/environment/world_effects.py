@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.effects.effect import AddedEffect, Effect, Parameter, written
+from concent_warp.effects.effect import AddedEffect, Effect, Parameter, variant_fields
 from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.task.task import Task
 
@@ -87,7 +87,7 @@ def sample_world_effects(
 
 def _command_dynamics(m: mujoco.MjModel, effect: Effect, values: np.ndarray) -> CommandDynamics:
     """Return delays and lags of an effect on the commands with parameters (N, P) in N worlds."""
-    found = [effect.late(m, row) for row in values]
+    found = [effect.delay_and_lag(m, row) for row in values]
     delay, lag = (np.array([late[k] for late in found if late is not None]) for k in range(2))
     return CommandDynamics(delay, (lag,))
 
@@ -140,5 +140,5 @@ def _written_fields(
         return {}
     ends = np.cumsum([0, *(v.shape[1] for v in values)])
     split = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-    fields = written(bare, effects, np.concatenate(values, axis=1), split)
+    fields = variant_fields(bare, effects, np.concatenate(values, axis=1), split)
     return {name: np.asarray(fields[name]) for name in sorted(names)}

@@ -105,7 +105,7 @@ class Task:
         replayer, model = model, replace(model, scene=with_movable_fixtures(model.scene))
         compiled, _ = compile_model(model, collidable)
         unsupported = [
-            a.effect for a in model.effects if a.effect.commands and a.effect.late(compiled, a.array) is None
+            a.effect for a in model.effects if a.effect.commands and a.effect.delay_and_lag(compiled, a.array) is None
         ]
         if unsupported:
             raise TrainError(

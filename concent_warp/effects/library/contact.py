@@ -31,13 +31,13 @@ COULOMB = f"Coulomb friction in MuJoCo's contacts, the larger of the two geoms' 
 
 
 class SurfaceEffect(Effect):
-    """An effect where a free body touches what stands still."""
+    """An effect on contacts between a free body and static geoms."""
 
     family = "contact"
     kind = "body"
-    wants = "bodies with geoms that collide"
+    requirement = "bodies with geoms that collide"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the body collides."""
         return _collides(m, i)
 
@@ -136,7 +136,7 @@ class RollingFriction(FrictionEffect):
 
 
 class AnisotropicFriction(SurfaceEffect):
-    """A surface with a grain."""
+    """Friction that depends on the sliding direction."""
 
     name = "anisotropic_friction"
     summary = (
@@ -152,7 +152,7 @@ class AnisotropicFriction(SurfaceEffect):
         return (Parameter("ratio", "-", 1.0, 0.05, 10.0, 0.4),)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
-        """The force that the grain adds."""
+        """Return the additional force along y."""
         return AnisotropicForce(m, self.ids(m))
 
 
@@ -164,16 +164,16 @@ class ContactCompliance(SurfaceEffect):
     source = f"MuJoCo's solref ({MUJOCO})"
     signature = "height of rebounds; sinking in at rest and at impacts"
     confusions = ("size", "adhesion", "air_drag")
-    wants = "bodies that collide, where their contacts and those of all that stands still have a time constant"
+    requirement = "bodies that collide, where their contacts and those of all that stands still have a time constant"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the contacts have a time constant."""
-        return super().suits(m, i) and bool((m.geom_solref[surfaces(m, i), 0] > 0).all())
+        return super().applies_to(m, i) and bool((m.geom_solref[surfaces(m, i), 0] > 0).all())
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body whose contacts have a time constant."""
-        return tuple(t for t in free_body_targets(m) if cls(*t).suits(m, m.body(t[0]).id))
+        return tuple(t for t in free_body_targets(m) if cls(*t).applies_to(m, m.body(t[0]).id))
 
     def mean(self, m: mujoco.MjModel) -> np.ndarray:
         """Return time constant [s] and damping ratio of body and surroundings, as they act together, shape (2,)."""
@@ -201,7 +201,7 @@ class ContactCompliance(SurfaceEffect):
 
 
 class Adhesion(SurfaceEffect):
-    """Surfaces that stick to each other."""
+    """Adhesion between surfaces."""
 
     name = "adhesion"
     summary = (
@@ -227,7 +227,7 @@ class Adhesion(SurfaceEffect):
 
 
 class PadFriction(Effect):
-    """Pads that hold better or worse than the model's."""
+    """Another coefficient of friction of the finger pads."""
 
     name = "pad_friction"
     family = "contact"
@@ -236,9 +236,9 @@ class PadFriction(Effect):
     source = f"Coulomb friction in MuJoCo's contacts, the pads' coefficient by priority ({MUJOCO})"
     signature = "the grasped object slips or does not"
     confusions = ("grip_force", "mass")
-    wants = "bodies with geoms that collide"
+    requirement = "bodies with geoms that collide"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the finger collides."""
         return _collides(m, i)
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.force_model import ForceModel
-from concent_warp.effects.select import standing_geoms
+from concent_warp.effects.select import static_geoms
 
 if TYPE_CHECKING:
     import mujoco_warp as mjw
@@ -33,7 +33,7 @@ class AnisotropicForce(ForceModel):
         self.moving = np.zeros(m.ngeom, dtype=bool)
         self.moving[np.isin(m.geom_bodyid, bodies)] = True
         self.still = np.zeros(m.ngeom, dtype=bool)
-        self.still[standing_geoms(m)] = True
+        self.still[static_geoms(m)] = True
         self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
@@ -110,7 +110,7 @@ class AdhesionForce(ForceModel):
         self.round = np.isin(m.geom_type[self.geom], [GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_CAPSULE])
         """Whether the geom's first size is a radius about the point, shape (P,)."""
         flat = np.isin(m.geom_type, [GEOM.mjGEOM_PLANE, GEOM.mjGEOM_BOX]) & colliding
-        self.still = np.intersect1d(standing_geoms(m), np.flatnonzero(flat)).astype(np.int32)
+        self.still = np.intersect1d(static_geoms(m), np.flatnonzero(flat)).astype(np.int32)
         self._device: tuple[wp.array[Any], wp.array[Any], wp.array[Any], wp.array[Any]] | None = None
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
-from concent_warp.effects.library.gear_forces import LooseGear
+from concent_warp.effects.library.gear_forces import BacklashForce
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
     SINGLE,
@@ -28,7 +28,7 @@ FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""
 
 GRIPS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
-"""Factors of a grip's force that are worth a trial: the object slips in a narrow range only."""
+"""Factors of the grip force to try: the object slips only in a narrow range of them."""
 
 
 class DriveEffect(Effect):
@@ -36,9 +36,9 @@ class DriveEffect(Effect):
 
     family = "joints"
     kind = "actuator"
-    wants = "actuators of joints, or of tendons that add joints up"
+    requirement = "actuators of joints, or of tendons that add joints up"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the actuator drives a joint."""
         return bool(driven_joints(m, i))
 
@@ -52,9 +52,9 @@ class DriveEffect(Effect):
 class ServoEffect(DriveEffect):
     """An effect on position-controlled actuators of single joints."""
 
-    wants = "position-controlled actuators of single hinges and slides, without a filter"
+    requirement = "position-controlled actuators of single hinges and slides, without a filter"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the actuator is position-controlled by its command and drives one joint."""
         joints = driven_joints(m, i)
         single = len(joints) == 1 and int(m.jnt_type[joints[0]]) in SINGLE
@@ -63,12 +63,12 @@ class ServoEffect(DriveEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the position-controlled actuators of single joints."""
-        found = tuple(n for n in arm_actuators(m) if cls().suits(m, m.actuator(n).id))
+        found = tuple(n for n in arm_actuators(m) if cls().applies_to(m, m.actuator(n).id))
         return (found,) if found else ()
 
 
 class ActuatorGain(DriveEffect):
-    """A drive stronger or weaker than on its data sheet."""
+    """Another gain of an actuator."""
 
     name = "actuator_gain"
     summary = "The drive's force is the model's times a factor, feedback included."
@@ -78,7 +78,7 @@ class ActuatorGain(DriveEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One factor for each actuator."""
-        return self.each("gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
+        return self.parameter_per_target("gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Gain and bias."""
@@ -92,7 +92,7 @@ class ActuatorGain(DriveEffect):
 
 
 class GripForce(ActuatorGain):
-    """A gripper that holds harder or softer than the model's."""
+    """Another gain of the gripper's actuator."""
 
     name = "grip_force"
     family = "contact"
@@ -160,7 +160,7 @@ class ActuatorSaturation(DriveEffect):
 
 
 class ActuatorDelay(DriveEffect):
-    """Commands that act later than they were given."""
+    """Transport delay of commands."""
 
     name = "actuator_delay"
     summary = "What acts at time t was commanded at t - delay."
@@ -175,15 +175,15 @@ class ActuatorDelay(DriveEffect):
 
     def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Shift the commands."""
-        late, ids = ctrl.copy(), self.ids(m)
+        delayed, ids = ctrl.copy(), self.ids(m)
         position = np.maximum(np.arange(len(ctrl)) - max(float(values[0]), 0.0) / m.opt.timestep, 0.0)
         lower = np.floor(position).astype(int)
         upper = np.minimum(lower + 1, len(ctrl) - 1)
         weight = (position - lower)[:, None]
-        late[:, ids] = (1 - weight) * ctrl[lower][:, ids] + weight * ctrl[upper][:, ids]
-        return late
+        delayed[:, ids] = (1 - weight) * ctrl[lower][:, ids] + weight * ctrl[upper][:, ids]
+        return delayed
 
-    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def delay_and_lag(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the delay of the targets."""
         delay = np.zeros(m.nu)
         delay[self.ids(m)] = max(float(values[0]), 0.0)
@@ -191,7 +191,7 @@ class ActuatorDelay(DriveEffect):
 
 
 class ActuatorLag(DriveEffect):
-    """A drive that follows its commands sluggishly."""
+    """First-order lag of commands."""
 
     name = "actuator_lag"
     summary = "The set point y follows the command u as time_constant dy/dt = u - y."
@@ -219,7 +219,7 @@ class ActuatorLag(DriveEffect):
         slow[:, ids] = u + (np.asarray(before) - u) * mean
         return slow
 
-    def late(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def delay_and_lag(self, m: mujoco.MjModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the time constant of the targets."""
         lag = np.zeros(m.nu)
         lag[self.ids(m)] = max(float(values[0]), 0.0)
@@ -251,11 +251,11 @@ class Backlash(ServoEffect):
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Torque that takes back the drive's within the play."""
-        return LooseGear(self.ids(m), m.nuserdata - m.nu)
+        return BacklashForce(self.ids(m), m.nuserdata - m.nu)
 
 
 class JointCompliance(ServoEffect):
-    """Gears and links that give; the encoder sits on the motor's side."""
+    """Elasticity between motor and link; the encoder is on the motor's side."""
 
     name = "joint_compliance"
     summary = (
@@ -320,7 +320,7 @@ class JointCompliance(ServoEffect):
 
 
 class GravityCompensation(Effect):
-    """A controller that holds up more or less than the robot's weight."""
+    """Error of the controller's gravity compensation."""
 
     name = "gravity_compensation"
     family = "joints"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import warp as wp
 
 
-class LooseGear(ForceModel):
+class BacklashForce(ForceModel):
     """Lets a servo's force through to the link only where its rotor presses on an end of the play.
 
     The rotor, without mass, is ahead of the link by x, |x| <= |g| play / 2, with g the gear. With e the error of the
@@ -72,7 +72,7 @@ class LooseGear(ForceModel):
 
 @dataclass(frozen=True)
 class Gear:
-    """The numbers of one loose gear, see `LooseGear`; positions and forces as the actuator sees them."""
+    """The numbers of one loose gear, see `BacklashForce`; positions and forces as the actuator sees them."""
 
     actuator: int
     place: int

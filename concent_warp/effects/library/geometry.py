@@ -1,4 +1,4 @@
-"""Contact geometry as an effect: the faces of an object lie off where they are drawn."""
+"""Contact geometry as an effect: offsets of the faces of an object from the nominal model."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ ALIGNED = 1e-6
 
 
 class ContactGeometryOffset(BodyEffect):
-    """Faces of a body that lie farther out or in than drawn."""
+    """Outward offsets of the faces of a body from the nominal model."""
 
     name = "contact_geometry"
-    wants = "a body with colliding spheres, boxes, cylinders, capsules or ellipsoids"
+    requirement = "a body with colliding spheres, boxes, cylinders, capsules or ellipsoids"
     summary = (
         "Each face of the box about the body's colliding shapes lies outward of the model's by an offset; spheres and"
         " shapes at a face move with it, those inside by a share that falls linearly to 0 at the opposite face; mass"
@@ -48,7 +48,7 @@ class ContactGeometryOffset(BodyEffect):
         """Return each free body with shapes that can be moved."""
         return tuple((n,) for b in free_bodies(m) if len(_shapes(m, b)) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether a body has shapes that can be moved."""
         return i > 0 and len(_shapes(m, i)) > 0
 

@@ -26,9 +26,9 @@ class JointEffect(Effect):
 
     family = "joints"
     kind = "joint"
-    wants = "hinges and slides"
+    requirement = "hinges and slides"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the joint has one degree of freedom."""
         return int(m.jnt_type[i]) in SINGLE
 
@@ -42,7 +42,7 @@ class JointEffect(Effect):
         kinds = m.jnt_type[self.ids(m)]
         return slide if (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)).all() else hinge
 
-    def spread(
+    def parameter_per_joint(
         self, name: str, unit: str, null: np.ndarray, scale: np.ndarray, high: np.ndarray
     ) -> tuple[Parameter, ...]:
         """Return one parameter a joint, from 0 up."""
@@ -76,7 +76,9 @@ class JointFriction(DryFriction):
         ids = self.ids(m)
         scale = typical_torque(m, ids)
         null = m.dof_frictionloss[dof_of(m, ids)]
-        return self.spread("torque", self.units(m, "N m", "N"), null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
+        return self.parameter_per_joint(
+            "torque", self.units(m, "N m", "N"), null, 0.3 * scale, np.maximum(20 * scale, 5 * null)
+        )
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Friction loss."""
@@ -101,7 +103,7 @@ class JointDamping(JointEffect):
         ids = self.ids(m)
         scale, null = typical_torque(m, ids), m.dof_damping[dof_of(m, ids)]
         unit = self.units(m, "N m s/rad", "N s/m")
-        return self.spread("damping", unit, null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
+        return self.parameter_per_joint("damping", unit, null, 0.3 * scale, np.maximum(20 * scale, 5 * null))
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Damping."""
@@ -125,7 +127,9 @@ class Armature(JointEffect):
         """One inertia for each joint."""
         ids = self.ids(m)
         inertia, null = m.dof_M0[dof_of(m, ids)], m.dof_armature[dof_of(m, ids)]
-        return self.spread("inertia", self.units(m, "kg m^2", "kg"), null, 0.3 * inertia, null + 10 * inertia)
+        return self.parameter_per_joint(
+            "inertia", self.units(m, "kg m^2", "kg"), null, 0.3 * inertia, null + 10 * inertia
+        )
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
         """Armature."""
@@ -149,10 +153,10 @@ class JointOffset(JointEffect):
         """One offset for each joint: how far the true angle is beyond the reading."""
         slide = self.units(m, "rad", "m") == "m"
         high, scale = (0.05, 0.003) if slide else (0.5, 0.03)
-        return self.each("offset", "m" if slide else "rad", 0.0, low=-high, high=high, scale=scale)
+        return self.parameter_per_target("offset", "m" if slide else "rad", 0.0, low=-high, high=high, scale=scale)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Readings at which the joint is as drawn, and its spring relaxed."""
+        """Joint reference position and rest position of its spring."""
         return ("qpos0", "qpos_spring")
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
@@ -175,7 +179,7 @@ class Stribeck(DryFriction):
         """One torque for each joint, and the speed at which it has fallen to a third."""
         ids = self.ids(m)
         torque, zero = typical_torque(m, ids), np.zeros(len(ids))
-        parameters = self.spread("extra", self.units(m, "N m", "N"), zero, 0.3 * torque, 20 * torque)
+        parameters = self.parameter_per_joint("extra", self.units(m, "N m", "N"), zero, 0.3 * torque, 20 * torque)
         slide = self.units(m, "rad", "m") == "m"
         speed = Parameter(
             "speed", "m/s" if slide else "rad/s", 0.02 if slide else 0.2, 1e-3, 5.0, 0.02 if slide else 0.2
@@ -198,7 +202,7 @@ class LoadDependentFriction(DryFriction):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One coefficient for each joint."""
-        return self.each("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
+        return self.parameter_per_target("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Friction loss that depends on load."""

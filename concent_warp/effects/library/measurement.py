@@ -1,4 +1,4 @@
-"""Effects of the instruments: clocks, scales, frames, bias. They change what is read, not what happens."""
+"""Effects of the instruments: clocks, scales, frames, bias. They change the readings, not the motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MeasurementEffect(Effect):
 
 
 class TimeBase(MeasurementEffect):
-    """A clock that runs fast or slow."""
+    """Scale error of the instrument's clock."""
 
     name = "time_base"
     summary = "The instrument's clock shows t (1 + scale) at time t."
@@ -61,15 +61,15 @@ class Latency(MeasurementEffect):
 
 
 class LengthScale(MeasurementEffect):
-    """A ruler that is too long or too short."""
+    """Scale error of measured positions."""
 
     name = "length_scale"
     summary = "Positions are read as the true ones times 1 + scale, from the world's origin."
     signature = "residuals in proportion to the position; resting heights off, free fall with another g"
     confusions = ("size", "time_base", "frame_offset")
-    wants = "sensors of positions in space"
+    requirement = "sensors of positions in space"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the sensor shows a position."""
         return int(m.sensor_type[i]) in POSES[:1]
 
@@ -89,15 +89,15 @@ class LengthScale(MeasurementEffect):
 
 
 class FrameOffset(MeasurementEffect):
-    """A camera that stands elsewhere than calibrated."""
+    """Error of the calibrated pose of a camera."""
 
     name = "frame_offset"
     summary = "Poses are read in a frame shifted and turned against the world's."
     signature = "residuals that are constant in place, or turn with the distance from the origin"
     confusions = ("size", "gravity_tilt", "center_of_mass", "joint_offset")
-    wants = "sensors of positions and orientations in space"
+    requirement = "sensors of positions and orientations in space"
 
-    def suits(self, m: mujoco.MjModel, i: int) -> bool:
+    def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether the sensor shows a position or an orientation."""
         return int(m.sensor_type[i]) in POSES
 
@@ -148,7 +148,7 @@ class SensorBias(MeasurementEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One constant for each sensor."""
-        return self.each("bias", "rad or m", 0.0, low=-0.5, high=0.5, scale=0.01)
+        return self.parameter_per_target("bias", "rad or m", 0.0, low=-0.5, high=0.5, scale=0.01)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Add it."""
@@ -172,7 +172,7 @@ class SensorGain(MeasurementEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One scale for each sensor."""
-        return self.each("scale", "-", 0.0, low=-0.9, high=5.0, scale=0.03)
+        return self.parameter_per_target("scale", "-", 0.0, low=-0.9, high=5.0, scale=0.03)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Scale it."""

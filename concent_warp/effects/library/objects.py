@@ -1,4 +1,4 @@
-"""Effects of what an object is: mass, where it sits, inertia, size."""
+"""Effects on objects: mass, centre of mass, inertia, size."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Inertia(BodyEffect):
 
 
 class Size(BodyEffect):
-    """A body larger or smaller than drawn."""
+    """Another size of a body."""
 
     name = "size"
     summary = (
@@ -133,7 +133,7 @@ class Size(BodyEffect):
 
 
 def keep_inertia(body: mujoco.MjsBody, compiled: mujoco.MjModel) -> None:
-    """Give a body the mass and inertia that it was compiled with, whatever becomes of its geoms."""
+    """Set mass and inertia of a body to those it was compiled with, independent of its geoms."""
     b = compiled.body(body.name).id
     body.explicitinertial = True
     body.mass, body.inertia = float(compiled.body_mass[b]), compiled.body_inertia[b]

@@ -20,7 +20,7 @@ SPECK = 1e-5
 
 
 class GravityTilt(Effect):
-    """A table or robot base that is not level."""
+    """Tilt of the world against gravity, as of a table or robot base that is not level."""
 
     name = "gravity_tilt"
     family = "world"
@@ -61,7 +61,7 @@ class AirEffect(Effect):
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Use the ellipsoid model on the target's shape, and on other bodies a speck's instead of their inertia box.
+        """Use the ellipsoid fluid model on the target's shape; other bodies get one of negligible size.
 
         A model that is in a medium already keeps its own. A ball turns almost freely in air: the friction of its skin
         is a hundredth of what MuJoCo's coefficient for blunt shapes gives.

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, written
+from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, variant_fields
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, commands
@@ -195,7 +195,7 @@ class Prediction:
             if trial.window not in plain:
                 plain[trial.window] = self._commands(m, w, steps)
             ctrl[i] = self._acting(m, plain[trial.window], values[i], steps)
-        fields = written(bare, self.effects, values, self.split)
+        fields = variant_fields(bare, self.effects, values, self.split)
         force_models = [
             (force_model, values[:, part])
             for e, part in zip(self.effects, self.split, strict=True)

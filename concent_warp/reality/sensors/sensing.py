@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.visible_region import cast
+from concent_warp.perception.visible_region import cast_rays
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 
@@ -121,7 +121,7 @@ def seen(
     inside = (depth > 0) & (np.abs(pixel + 0.5 - np.array([width, height]) / 2) < np.array([width, height]) / 2).all(1)
     ray = points - camera.position
     distance = np.linalg.norm(ray, axis=1)
-    hit = cast(model, data, camera.position, ray / distance[:, None])
+    hit = cast_rays(model, data, camera.position, ray / distance[:, None])
     return inside & ((hit < 0) | (hit > distance - slack))
 
 
