@@ -82,7 +82,7 @@ def deformations(model: Any, seed: int) -> np.ndarray:
     growth = offset_directions(model.geometry, model.scene)
     every = np.ones(len(growth), dtype=bool)
     rng = np.random.default_rng(seed)
-    noise = Perturbation(model.geometry, every, "gaussian_process", 0.02).draw(DIRECTIONS, 3, rng)
+    noise = Perturbation(model.geometry, every, "gaussian_process", 0.02).sample(DIRECTIONS, 3, rng)
     noise[0] = growth
     return noise / np.linalg.norm(noise, axis=2).max(axis=1)[:, None, None]
 

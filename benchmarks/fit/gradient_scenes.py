@@ -163,6 +163,6 @@ def starting_model(scene: SceneName, recording: Recording, seed: int) -> Model:
     # A peg that is too large, or a hole that is too tight, does not go in: that is the honest start there.
     size = rng.uniform(8e-4, 2e-3) * (1 if scene in ("insertion", "tumble") else rng.choice([-1, 1]))
     every = np.ones(len(geometry), dtype=bool)
-    dents = DENT * Perturbation(geometry, every, "gaussian_process", 0.02).draw(1, 3, rng)[0]
+    dents = DENT * Perturbation(geometry, every, "gaussian_process", 0.02).sample(1, 3, rng)[0]
     wrong: ContactGeometry = replace(geometry, position=geometry.position + size * growth + dents)
     return Model(drawn, wrong, ContactParameters())

@@ -163,7 +163,7 @@ def warm_start(
     search.gradients = found = warming.run(file, resume, show)
     search.evolution.mean = found.mean if found.helped else flat
     if found.helped:
-        survey = search.survey([*search.draw(), *search.held_out])
+        survey = search.survey([*search.sample_segments(), *search.held_out])
         search.note(survey)
         if method == "gradient":
             search.stopped = "gradient descent done"

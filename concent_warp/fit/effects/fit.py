@@ -22,14 +22,8 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
-UNKNOWN = 0.5
-"""A parameter whose standard deviation is this share of its weak prior's was not measured."""
-ALIKE = 0.98
-"""Correlation of two parameters from which on the data say little of each by itself."""
-AT_NOISE = 1.05
-"""Residual over noise below which there is nothing to be explained, and chance decides which of two is smaller."""
 NORMAL = 1.96
-"""Standard deviations of a 95 % interval."""
+"""Half width of a 95 % interval of the normal distribution, in standard deviations [-]."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +60,11 @@ class FittedEffects:
     channels: tuple[ChannelError, ...]
     converged: bool
     remarks: tuple[str, ...]
-    """What is doubtful, a sentence each."""
+    """Remarks on doubtful results, a sentence each."""
 
     @property
     def fall(self) -> float:
-        """Share of the squared residual that the fit takes away."""
+        """Share of the squared residual that the fit explains [-]."""
         return 1.0 - (self.after / max(self.before, 1e-12)) ** 2
 
 
@@ -90,6 +84,16 @@ class FitEffectsCfg:
     """Settings of the least squares."""
     seed: int = 0
     """Seed of the disturbances that determine how long windows may be."""
+    undetermined_share: float = 0.5
+    """Standard deviation of a parameter over that of its weak prior from which the parameter counts as not determined
+    by the recording [-]."""
+    max_correlation: float = 0.98
+    """Correlation of two parameters beyond which a remark says that they cannot be distinguished [-]."""
+    noise_ratio: float = 1.05
+    """Residual over noise below which a fit counts as complete [-]: smaller differences are within the noise."""
+    min_scan_gain: float = 1.0
+    """Fall of the cost, half a sum of squares in units of noise, for which a fit starts from one of the values to try
+    that a parameter names [-]."""
 
 
 def fit_effects(
@@ -130,27 +134,27 @@ def fit_effects(
     cfg = cfg or FitEffectsCfg()
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
-    said = progress or _silent
-    said(0.0, "cutting windows")
+    report = progress or _silent
+    report(0.0, "cutting windows")
     windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed)
     solver = Solver(Prediction(model, (), windows, engine=engine), cfg.least_squares)
     check_finite(solver.p, model.scene.source)
-    said(0.1, "initial states")
+    report(0.1, "initial states")
     start = solver.p.start
     offsets, starts = solver.fit_initial_states(start, [np.zeros(len(w.spread)) for w in windows])
-    given = _rest(solver, start, offsets, starts)
-    said(0.3, "trial values")
-    chosen = _best_start(solver, start, offsets, starts)
-    fit = solver.fit(chosen, offsets, starts, lambda share: said(0.3 + 0.5 * share, "fitting"))
-    said(0.8, "fitting again")
+    given = _residuals_at(solver, start, offsets, starts)
+    report(0.3, "trial values")
+    chosen = _best_start(solver, start, offsets, starts, cfg)
+    fit = solver.fit(chosen, offsets, starts, lambda share: report(0.3 + 0.5 * share, "fitting"))
+    report(0.8, "fitting again")
     fit = solver.polish(fit)
-    pieces = projected(fit)
-    found = [piece.residual for piece in pieces]
-    said(1.0, "done")
-    parameters, correlation = _fitted_parameters(solver, fit, pieces, windows)
-    remarks = _doubts(solver, fit, parameters, correlation)
+    linear = projected(fit)
+    found = [window_linear.residual for window_linear in linear]
+    report(1.0, "done")
+    parameters, correlation = _fitted_parameters(solver, fit, linear, windows, cfg)
+    remarks = _remarks(solver, fit, parameters, correlation, cfg)
     before, after = noise_ratio(np.concatenate(given)), noise_ratio(np.concatenate(found))
-    if robust_noise_ratio(found) > max(robust_noise_ratio(given), AT_NOISE):
+    if robust_noise_ratio(found) > max(robust_noise_ratio(given), cfg.noise_ratio):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
@@ -167,7 +171,7 @@ def fit_effects(
 
 
 def _silent(share: float, text: str) -> None:
-    """Say nothing of progress."""
+    """Ignore progress."""
     del share, text
 
 
@@ -190,7 +194,7 @@ def check_finite(prediction: Prediction, source: str) -> None:
         )
 
 
-def _rest(
+def _residuals_at(
     solver: Solver, values: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the residuals at some values with the initial states eliminated, one (n,) a window."""
@@ -199,14 +203,10 @@ def _rest(
     return [r + a @ start_step(r, a, o, limit, 0.0) for r, a, o in zip(residuals, starts, offsets, strict=True)]
 
 
-TELLING = 1.0
-"""By how much a trial value must lower the cost, half a sum of squares in units of noise, to be set out from."""
-
-
 def _best_start(
-    solver: Solver, given: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+    solver: Solver, given: np.ndarray, offsets: Sequence[np.ndarray], starts: Sequence[np.ndarray], cfg: FitEffectsCfg
 ) -> np.ndarray:
-    """Return the values from which a fit is to start, shape (P,): those given, or some that parameters name."""
+    """Return the values from which a fit starts, shape (P,): those given, or values to try that parameters name."""
     parameters = solver.p.parameters
     trials = [np.where(np.isfinite(given), given, solver.high)]
     for k, parameter in enumerate(parameters):
@@ -217,23 +217,23 @@ def _best_start(
                 trials.append(moved)
     if len(trials) == 1:
         return trials[0]
-    residuals = [_rest(solver, values, offsets, starts) for values in trials]
+    residuals = [_residuals_at(solver, values, offsets, starts) for values in trials]
     limit = huber_limit(residuals[0])
     costs = [sum(start_cost(r, np.zeros(1), limit) for r in of_trial) for of_trial in residuals]
     best = int(np.argmin(costs))
-    return trials[best] if costs[best] < costs[0] - TELLING else trials[0]
+    return trials[best] if costs[best] < costs[0] - cfg.min_scan_gain else trials[0]
 
 
 def _fitted_parameters(
-    solver: Solver, fit: Fit, pieces: Sequence[Linear], windows: Sequence[Window]
+    solver: Solver, fit: Fit, linear: Sequence[Linear], windows: Sequence[Window], cfg: FitEffectsCfg
 ) -> tuple[list[FittedParameter], np.ndarray]:
     """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
 
     The intervals combine the covariance of the linear fit with `discretisation_errors`.
     """
     blocks = cut_blocks(windows)
-    limit = huber_limit([piece.residual for piece in pieces])
-    covered = covariance(block_sums(pieces, blocks, limit), blocks)
+    limit = huber_limit([window_linear.residual for window_linear in linear])
+    covered = covariance(block_sums(linear, blocks, limit), blocks)
     std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
     force_model = np.zeros(len(std))
     for part in solver.p.split:
@@ -244,16 +244,18 @@ def _fitted_parameters(
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)
         low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
-        untold = high - low > 2 * NORMAL * UNKNOWN * PRIOR * q.scale
-        if np.isinf(q.null) and (high >= q.high or untold):  # a limit that is never reached may as well not be there
+        undetermined = high - low > 2 * NORMAL * cfg.undetermined_share * PRIOR * q.scale
+        if np.isinf(q.null) and (high >= q.high or undetermined):  # a limit that is never reached counts as absent
             high = q.null
         at_bound = value in (q.low, q.high) and q.null not in (value, high)
         found.append(FittedParameter(q.name, value, low, high, q.unit, q.null, at_bound))
     return found, covered / np.outer(std, std)
 
 
-def _doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], correlation: np.ndarray) -> list[str]:
-    """Return what is doubtful about a fit, a sentence each."""
+def _remarks(
+    solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], correlation: np.ndarray, cfg: FitEffectsCfg
+) -> list[str]:
+    """Return remarks on what is doubtful about a fit, a sentence each."""
     found = []
     if not fit.converged:
         found.append("The fit has not converged: take its values with care, or start from better ones.")
@@ -262,7 +264,9 @@ def _doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], cor
         if q.at_bound:
             found.append(f"{q.name} ended on its bound, {q.value:g} {q.unit}: what is missing may be something else.")
         width = q.high - q.low
-        if width > 2 * NORMAL * UNKNOWN * PRIOR * prior.scale or width >= 0.99 * (prior.high - prior.low):
+        if width > 2 * NORMAL * cfg.undetermined_share * PRIOR * prior.scale or width >= 0.99 * (
+            prior.high - prior.low
+        ):
             unknown.add(k)
             found.append(f"The recording says next to nothing about {q.name}.")
     for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
@@ -270,7 +274,7 @@ def _doubts(solver: Solver, fit: Fit, parameters: Sequence[FittedParameter], cor
             found.append(f"{effect.name} may be absent: within its interval it does nothing.")
     for k in range(len(parameters)):
         for j in range(k):
-            if abs(correlation[k, j]) > ALIKE and not {k, j} & unknown:
+            if abs(correlation[k, j]) > cfg.max_correlation and not {k, j} & unknown:
                 found.append(
                     f"{parameters[j].name} and {parameters[k].name} act so alike in this recording that it tells "
                     f"little of each by itself (correlation {correlation[k, j]:.3f})."

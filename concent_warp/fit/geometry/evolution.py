@@ -36,13 +36,13 @@ class EvolutionCfg:
     """Length over which the swelling varies [m]."""
     flat_start: bool = True
     """Flatten the faces of the starting geometry unless that makes the replay worse: noise of single spheres, which
-    one demonstration cannot tell from the truth, goes."""
+    one demonstration cannot distinguish from the true shape, is removed."""
     flattening: float = 0.1
     """Share by which each generation takes the roughness out of the faces inside the mask; 0 for none."""
     face_length: float = 0.03
     """Length over which a face is flat [m]: its distance from the nominal surface varies linearly."""
     antithetic: bool = True
-    """Draw candidates in pairs of opposite displacement."""
+    """Sample candidates in pairs of opposite displacement."""
     elite_share: float = 0.25
     """Share of the candidates that move the estimate."""
     momentum: float = 0.6
@@ -50,7 +50,7 @@ class EvolutionCfg:
     mean_smoothing: float = 0.0
     """Length [m] of a further smoothing of the update inside the mask; 0 leaves it as smooth as the noise is."""
     neighbours: int = 8
-    """Spheres beside each touched one that may move too."""
+    """Neighbours of each touched sphere that may move too [-]."""
     freeze_gripped: bool = True
     """Keep the spheres that the robot touches where they are: otherwise the fit changes the grasp."""
     max_displacement: float = 0.012
@@ -66,7 +66,7 @@ class EvolutionCfg:
 
     @property
     def flattens(self) -> bool:
-        """Whether faces matter."""
+        """Whether faces are flattened."""
         return self.flat_start or self.flattening > 0
 
     def scales(self, sigma: float) -> np.ndarray:
@@ -121,7 +121,7 @@ class Evolution:
             swelling_length=cfg.swelling_length,
         )
         pairs = (cfg.population + 1) // 2 if cfg.antithetic else cfg.population
-        noise = perturbation.draw(pairs, self.mean.shape[1], rng) * cfg.scales(self.sigma) * self.shrink
+        noise = perturbation.sample(pairs, self.mean.shape[1], rng) * cfg.scales(self.sigma) * self.shrink
         if cfg.antithetic:
             noise = np.stack([noise, -noise], axis=1).reshape(-1, *self.mean.shape)[: cfg.population]
         return self.bounded(self.mean + noise)

@@ -1,12 +1,12 @@
 """Spatially coherent noise over sphere positions (paper, appendix A).
 
-The paper draws noise at the centroid of the deformable region and propagates it through an RBF kernel. Taken literally
+The paper samples noise at the centroid of the deformable region and propagates it through an RBF kernel. Literally,
 that is one translation of each object; what deforms surfaces smoothly is a sample of a Gaussian process whose
 covariance is the same RBF kernel. Both are here, and independent noise for comparison.
 
 A third of the matter is size: spheres centred on a surface inflate the object everywhere, and undoing this takes a
-motion of all spheres inward that random dents seldom add up to. So each sample may also hold a swelling: a displacement
-of all faces by the same distance (`offset`), which varies over a longer length.
+motion of all spheres inward that random dents seldom add up to. So each sample may also contain a swelling: a
+displacement of all faces by the same distance (`offset`), which varies over a longer length.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 Noise = Literal["gaussian_process", "centroid", "independent"]
 JITTER = 1e-6
+"""Added to the diagonal of the kernel, so that its Cholesky factor exists [-]."""
 
 
 class Perturbation:
-    """Draws noise of unit standard deviation over the spheres of a mask."""
+    """Samples noise of unit standard deviation over the spheres of a mask."""
 
     def __init__(
         self,
@@ -35,7 +36,7 @@ class Perturbation:
         swelling: float = 0.0,
         swelling_length: float = 0.05,
     ) -> None:
-        """Prepare the draws.
+        """Prepare to sample.
 
         Args:
             geometry: Where the spheres are.
@@ -64,7 +65,7 @@ class Perturbation:
                 factor = np.eye(len(rows))
             self.blocks.append((rows, factor, slow))
 
-    def draw(self, count: int, channels: int, rng: np.random.Generator) -> np.ndarray:
+    def sample(self, count: int, channels: int, rng: np.random.Generator) -> np.ndarray:
         """Return `count` samples with independent channels, shape (count, S, channels); zero outside the mask."""
         result = np.zeros((count, self.shape, channels))
         for rows, factor, slow in self.blocks:

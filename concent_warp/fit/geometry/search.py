@@ -21,13 +21,6 @@ from concent_warp.simulate.engine import Engine
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.select import EngineName, make_engine
 
-GRIP = 5e-4
-"""A sphere that comes this near to the robot in the observed motion counts as gripped [m]."""
-WORSE = 0.1
-"""Share by which flattening may raise the distance; where it raises it by more, the faces stay as they are."""
-TURN = np.radians(1.0) / 1e-3
-"""Turn of a jittered body relative to its displacement [rad/m]."""
-
 
 @dataclass(frozen=True)
 class GeometrySearchCfg:
@@ -52,22 +45,29 @@ class GeometrySearchCfg:
     window_stride: float | None = None
     """Time from the start of one window to that of the next [s]; None takes the length."""
     batch: int | None = None
-    """Segments that a generation tries its candidates on, drawn anew each time; None takes all. With hundreds of
-    windows a draw of 40-80 serves as well and costs less."""
+    """Segments that a generation tries its candidates on, sampled anew each time; None takes all. With hundreds of
+    windows a sample of 40-80 gives the same result at less cost."""
     jitter: float = 7e-4
-    """Spread [m] of horizontal displacements of the free bodies at the start, drawn anew for each generation, with
-    turns of 1 degree a millimetre. All candidates share them; they keep the fit from what works on one path only."""
+    """Spread [m] of horizontal displacements of the free bodies at the start, sampled anew for each generation, with
+    turns by `jitter_turn`. All candidates share them, so that the fit does not specialise on one path."""
+    jitter_turn: float = float(np.radians(1.0) / 1e-3)
+    """Turn of a jittered body relative to its displacement [rad/m]: 1 degree a millimetre."""
+    grip_distance: float = 5e-4
+    """Distance from the robot in the observed motion within which a sphere counts as gripped [m]."""
+    max_flattening_rise: float = 0.1
+    """Largest relative rise of the distance by flattening the starting geometry [-]; beyond it the faces stay as they
+    are."""
     squared: bool = False
     """Squared form of the Chamfer distance."""
     reach: float = 0.004
     """Spheres that stay farther than this from everything else [m] are left out of the collisions of the search."""
     seed: int = 0
-    """Seed of all random draws."""
+    """Seed of all random numbers."""
 
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What gradients found."""
+    """Result of the gradient start."""
 
     helped: bool
     mean: np.ndarray
@@ -77,14 +77,14 @@ class WarmStart:
     after: float
     """That of the best iterate [m]."""
     remark: str
-    """What is to be said of it."""
+    """Remark on the result."""
     losses: list[list[float]]
     """Loss in Newton of each start at each iteration [m]."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fit stands."""
+    """Progress of a fit."""
 
     generation: int
     generations: int
@@ -96,12 +96,12 @@ class Progress:
     """Estimate of the time to the last generation [s]."""
     simulations: int
     what: str = "generation"
-    """What is counted."""
+    """Unit of the count."""
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a fit found.
+    """Result of a fit of contact geometry.
 
     Example:
         >>> import concent_warp as cw
@@ -127,7 +127,7 @@ class FitResult:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a replay of an estimate with all spheres shows."""
+    """Result of a replay of an estimate with all spheres."""
 
     mask: np.ndarray
     """Spheres that may move, shape (S,) bool."""
@@ -188,7 +188,7 @@ class Search:
         """Run one generation."""
         start = time.perf_counter()
         cfg, evolution = self.cfg, self.evolution
-        segments = self.draw()
+        segments = self.sample_segments()
         survey = self.survey([*segments, *self.held_out])
         if evolution.generation == 0 and not (self.gradients and self.gradients.helped):
             survey = self.flattened(survey, [*segments, *self.held_out])
@@ -227,7 +227,7 @@ class Search:
             self.last_gain, self.progress_from = self.evolution.generation, lowest
 
     def flattened(self, rough: Survey, segments: list[Segment]) -> Survey:
-        """Flatten the faces of the starting geometry, unless what was observed speaks against it.
+        """Flatten the starting geometry's faces, unless that raises the distance by more than `max_flattening_rise`.
 
         Args:
             rough: What the geometry does as it is.
@@ -239,12 +239,15 @@ class Search:
         before, flat = evolution.mean.copy(), flattened(evolution.start, evolution.faces)
         evolution.mean[:, :3] = flat.position - evolution.start.position
         survey = self.survey(segments)
-        if survey.loss <= (1 + WORSE) * rough.loss and survey.held_out <= (1 + WORSE) * rough.held_out:
+        if (
+            survey.loss <= (1 + self.cfg.max_flattening_rise) * rough.loss
+            and survey.held_out <= (1 + self.cfg.max_flattening_rise) * rough.held_out
+        ):
             return survey
         evolution.mean = before
         return rough
 
-    def draw(self) -> list[Segment]:
+    def sample_segments(self) -> list[Segment]:
         """Return the segments that the candidates of this generation are tried on."""
         if self.cfg.batch is None or self.cfg.batch >= len(self.used):
             return self.used
@@ -261,7 +264,7 @@ class Search:
             qpos = segment.qpos.copy()
             for address in m.jnt_qposadr[free]:
                 qpos[address : address + 2] += self.rng.normal(0, self.cfg.jitter, 2)
-                turn = self.rng.normal(0, self.cfg.jitter) * TURN / 2
+                turn = self.rng.normal(0, self.cfg.jitter) * self.cfg.jitter_turn / 2
                 orientation = np.zeros(4)
                 mujoco.mju_mulQuat(
                     orientation, np.array([np.cos(turn), 0, 0, np.sin(turn)]), qpos[address + 3 : address + 7]
@@ -296,7 +299,7 @@ class Search:
         if self.cfg.evolution.freeze_gripped:
             # A replay that fails lets the object slip through the gripper; the real grasp is where it was observed.
             seen = observed.reshape(-1, observed.shape[-1])
-            self.frozen |= spheres_near(current, seen, GRIP)[:, self.robot].any(axis=1) & self.movable
+            self.frozen |= spheres_near(current, seen, self.cfg.grip_distance)[:, self.robot].any(axis=1) & self.movable
         mask = with_neighbours(geometry, touched, self.cfg.evolution.neighbours) & ~self.frozen
         reachable = spheres_near(current, states, self.cfg.reach).any(axis=1)
         self.simulations += len(segments)
@@ -315,7 +318,7 @@ class Search:
         return Objective(engine, segments, held_out=cfg.held_out, block=cfg.block, squared=cfg.squared)
 
     def progress(self) -> Progress:
-        """Return where the fit stands."""
+        """Return the progress of the fit."""
         done = self.evolution.generation
         left = self.seconds / max(done, 1) * (self.cfg.generations - done)
         return Progress(done, self.cfg.generations, self.history[-1]["loss"], self.best, left, self.simulations)

@@ -20,11 +20,7 @@ import numpy as np
 from concent_warp.errors import EngineError
 
 SPRING, DAMPER = 0.5, 0.8
-"""Largest numbers of the rules."""
-FEWEST = 4
-"""Contacts that carry a body when it rests: the stiffness is shared among so many, and no fewer are reckoned with."""
-LEAST_DAMPING = 0.6
-"""Share of the wanted damping below which a body would bounce."""
+"""Right-hand sides of the rules [-]."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +40,15 @@ class NewtonCfg:
     shortest_step: float = 1e-4
     """Shortest time step; a scene that asks for a shorter one is refused [s]."""
     creep: float = 0.02
-    """Largest speed at which a body creeps when friction should hold it [m/s]."""
+    """Largest speed at which a body creeps although friction should stop it [m/s]."""
     reach: float = 0.004
     """A sphere that comes this near to something, in MuJoCo or as observed, may collide with it [m]."""
+    min_contacts: int = 4
+    """Contacts that carry a resting body [-]: they share its stiffness, and at least so many are assumed."""
+    min_damping: float = 0.6
+    """Share of the wanted damping below which a body would bounce [-]."""
+    pair_states: int = 200
+    """States of a segment, of those simulated, in which pairs that may collide are searched for [-]."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ def choose_physics(
     """
     mass = np.array([b.mass for b in bodies])
     strength = np.array(couplings)
-    stiffness = mass * cfg.frequency**2 / FEWEST
-    damping = 2 * cfg.damping * mass * cfg.frequency / FEWEST
+    stiffness = mass * cfg.frequency**2 / cfg.min_contacts
+    damping = 2 * cfg.damping * mass * cfg.frequency / cfg.min_contacts
     first = max(int(np.ceil(timestep / cfg.longest_step - 1e-9)), 1)
     last = int(np.floor(timestep / cfg.shortest_step + 1e-9))
     steps = np.array([timestep / k for k in range(first, max(last, first) + 1)])[:, None]
@@ -125,8 +127,9 @@ def choose_physics(
     slope = limit.min(axis=1, keepdims=True)
     reasons = {
         "its contacts are too stiff": steps**2 * stiffness * strength <= SPRING,
-        "it would bounce": limit >= LEAST_DAMPING * damping,
-        "it would creep": friction * gravity * mass <= cfg.creep * slope * np.maximum(mass * strength, FEWEST),
+        "it would bounce": limit >= cfg.min_damping * damping,
+        "it would creep": friction * gravity * mass
+        <= cfg.creep * slope * np.maximum(mass * strength, cfg.min_contacts),
     }
     fine = np.logical_and.reduce(list(reasons.values())).all(axis=1)
     if not fine.any():

@@ -16,13 +16,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.errors import EngineError, ModelError
 from concent_warp.estimation.object_tracks import Segment, observed_states
-from concent_warp.fit.newton.physics import FEWEST, BodyInertia, NewtonCfg, NewtonPhysics, choose_physics, coupling
+from concent_warp.fit.newton.physics import BodyInertia, NewtonCfg, NewtonPhysics, choose_physics, coupling
 from concent_warp.model import Model
 from concent_warp.simulate.engine import Rollout, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-
-LOOKED_AT = 200
-"""States of a segment, of those simulated, in which pairs are looked for."""
 
 
 @dataclass(frozen=True)
@@ -116,10 +113,10 @@ def newton_scene(
     )
     if np.any(rollout.diverged):
         raise EngineError("the starting geometry diverges in MuJoCo, so that nothing can be replayed", fix="change it")
-    ids, pairs = _near_pairs(model, moving, _looked_at(m, segments, rollout), cfg.reach)
+    ids, pairs = _near_pairs(model, moving, _pair_states(m, segments, rollout, cfg.pair_states), cfg.reach)
     inertias = tuple(_inertia_of(m, b) for b in ids[: len(moving)])
     friction = np.concatenate([pairs.friction, model.geometry.friction])
-    strengths = [_strength(m, model, b, body, rollout) / lightest for b, body in zip(ids, inertias, strict=False)]
+    strengths = [_strength(m, model, b, body, rollout, cfg) / lightest for b, body in zip(ids, inertias, strict=False)]
     gravity = m.opt.gravity.copy()
     physics = choose_physics(
         cfg, m.opt.timestep, inertias, strengths, float(friction.max()), float(np.linalg.norm(gravity))
@@ -162,9 +159,9 @@ def _padded_commands(segments: Sequence[Segment]) -> np.ndarray:
     return np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in segments])
 
 
-def _looked_at(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout) -> np.ndarray:
-    """Return simulated and observed states in which pairs are looked for, shape (T, nq)."""
-    every = slice(None, None, max(rollout.qpos.shape[1] // LOOKED_AT, 1))
+def _pair_states(m: mujoco.MjModel, segments: Sequence[Segment], rollout: Rollout, count: int) -> np.ndarray:
+    """Return simulated and observed states, about `count` of each segment, shape (T, nq)."""
+    every = slice(None, None, max(rollout.qpos.shape[1] // count, 1))
     simulated = rollout.qpos[:, every]
     observed = [observed_states(m, s, rollout.time[every], q) for s, q in zip(segments, simulated, strict=True)]
     return np.concatenate([simulated, np.stack(observed)]).reshape(-1, m.nq)
@@ -238,17 +235,19 @@ def _inertia_of(m: mujoco.MjModel, body: int) -> BodyInertia:
     return BodyInertia(m.body(body).name, float(m.body_mass[body]), inertia, m.body_ipos[body].copy())
 
 
-def _strength(m: mujoco.MjModel, model: Model, body: int, inertia: BodyInertia, rollout: Rollout) -> float:
+def _strength(
+    m: mujoco.MjModel, model: Model, body: int, inertia: BodyInertia, rollout: Rollout, cfg: NewtonCfg
+) -> float:
     """Return how strongly the contacts of a body act on it, at the worst step of a rollout with all contacts [1/kg]."""
     assert model.geometry is not None
     assert rollout.contacts is not None
     spheres = model.geometry.position[model.geometry.of(inertia.name)]
     each = [coupling(inertia, point[None]) for point in spheres]
-    worst = FEWEST * float(np.mean(each))
+    worst = cfg.min_contacts * float(np.mean(each))
     log = rollout.contacts
     mine = np.flatnonzero((m.geom_bodyid[log.geom] == body).any(axis=1))
     step, count = np.unique(np.stack([log.variant[mine], log.step[mine]]), axis=1, return_counts=True)
-    for v, k in step[:, np.argsort(count)[-LOOKED_AT:]].T:
+    for v, k in step[:, np.argsort(count)[-cfg.pair_states :]].T:
         at = mine[(log.variant[mine] == v) & (log.step[mine] == k)]
         turn = Rotation.from_quat(rollout.body_quaternion[v, k, body], scalar_first=True)
         points = turn.inv().apply(log.position[at] - rollout.body_position[v, k, body])

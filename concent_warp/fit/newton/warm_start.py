@@ -140,7 +140,7 @@ class GradientWarmStart:
             swelling_length=evolution.cfg.swelling_length,
         )
         rng = np.random.default_rng([search.cfg.seed, 1])
-        noise = perturbation.draw(self.cfg.starts, 3, rng) * evolution.sigma
+        noise = perturbation.sample(self.cfg.starts, 3, rng) * evolution.sigma
         noise[0] = 0.0
         return self.bounded(noise)
 

@@ -15,33 +15,33 @@ def geometry():
 
 def test_a_gaussian_process_sample_has_the_covariance_of_the_kernel(geometry):
     mask = np.ones(len(geometry), dtype=bool)
-    draws = Perturbation(geometry, mask, "gaussian_process", 0.015).draw(4000, 3, np.random.default_rng(0))
-    found = np.einsum("csx,ctx->st", draws, draws) / (3 * len(draws))
+    samples = Perturbation(geometry, mask, "gaussian_process", 0.015).sample(4000, 3, np.random.default_rng(0))
+    found = np.einsum("csx,ctx->st", samples, samples) / (3 * len(samples))
     expected = rbf(geometry.position, geometry.position, 0.015)
     assert np.abs(found - expected).max() < 0.06
 
 
 def test_noise_at_the_centroid_is_one_direction_for_the_whole_object(geometry):
     mask = np.ones(len(geometry), dtype=bool)
-    draw = Perturbation(geometry, mask, "centroid", 0.015).draw(1, 3, np.random.default_rng(0))[0]
-    direction = draw / np.linalg.norm(draw, axis=1, keepdims=True)
+    sample = Perturbation(geometry, mask, "centroid", 0.015).sample(1, 3, np.random.default_rng(0))[0]
+    direction = sample / np.linalg.norm(sample, axis=1, keepdims=True)
     np.testing.assert_allclose(direction, np.broadcast_to(direction[0], direction.shape), atol=1e-9)
 
 
 def test_nothing_outside_the_mask_moves(geometry):
     mask = geometry.position[:, 2] > 0
     for kind in ("gaussian_process", "centroid", "independent"):
-        draw = Perturbation(geometry, mask, kind, 0.015).draw(3, 3, np.random.default_rng(0))
-        assert (draw[:, ~mask] == 0).all()
-        assert (draw[:, mask] != 0).all()
+        sample = Perturbation(geometry, mask, kind, 0.015).sample(3, 3, np.random.default_rng(0))
+        assert (sample[:, ~mask] == 0).all()
+        assert (sample[:, mask] != 0).all()
 
 
 def test_swelling_moves_faces_outward_together(geometry):
     mask = np.ones(len(geometry), dtype=bool)
     growth = offset_directions(geometry, Scene(DROP))
     swell = Perturbation(geometry, mask, "gaussian_process", 0.015, growth=growth, swelling=50.0, swelling_length=1.0)
-    draw = swell.draw(200, 3, np.random.default_rng(0))
-    along = (draw * growth).sum(axis=2)
+    sample = swell.sample(200, 3, np.random.default_rng(0))
+    along = (sample * growth).sum(axis=2)
     assert np.corrcoef(along[:, 0], along[:, -1])[0, 1] > 0.99
 
 

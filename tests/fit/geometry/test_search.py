@@ -120,16 +120,16 @@ def test_held_out_frames_do_not_move_the_estimate(drop, swollen):
     assert not np.array_equal(estimate_after(swollen, shifted(drop, swollen, held_out=False)), mean)
 
 
-def test_held_out_segments_are_simulated_and_never_drawn(drop, swollen):
+def test_held_out_segments_are_simulated_and_never_sampled(drop, swollen):
     segment = whole_demonstration(swollen.scene, drop[0], ("block",))
     segments = [replace(segment, held_out=False), replace(segment, held_out=True), replace(segment, held_out=False)]
     search = Search(swollen, segments, CFG, "mujoco")
-    assert search.draw() == [segments[0], segments[2]]
+    assert search.sample_segments() == [segments[0], segments[2]]
     assert search.held_out == [segments[1]]
     search = Search(swollen, segments, replace(CFG, batch=1), "mujoco")
-    drawn = [search.draw() for _ in range(12)]
-    assert all(len(one) == 1 and one[0] is not segments[1] for one in drawn)
-    assert len({id(one[0]) for one in drawn}) == 2
+    sampled = [search.sample_segments() for _ in range(12)]
+    assert all(len(one) == 1 and one[0] is not segments[1] for one in sampled)
+    assert len({id(one[0]) for one in sampled}) == 2
 
 
 def test_the_estimate_with_the_lowest_held_out_loss_is_kept(drop, swollen):
