@@ -13,7 +13,7 @@ number for each stage: 0 where the stage is to bring the two together, so that o
 
 Targets move with bodies, and sphere centres are taken into the target's frame, so that nothing is rebuilt. A target is
 
-- a triangle mesh. Which side of it a point is on is told by the winding number. The pseudo-normal of the nearest face,
+- a triangle mesh. The winding number determines which side of it a point is on. The pseudo-normal of the nearest face,
   which is cheaper, is wrong for meshes that overlap themselves (a box made of plates: the nearest face may lie within
   another plate) or are open (behind the rim of a hole, everything would be inside); on one closed surface both agree.
 - or the spheres of another object, whose distance is that of their union: the least |x - c_j| - r_j.

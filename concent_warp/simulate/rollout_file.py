@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def save_rollout(rollout: Rollout, compiled: mujoco.MjModel, path: Path, variant: int = 0) -> None:
-    """Write one variant of a rollout, in one piece or not at all.
+    """Write one variant of a rollout, atomically.
 
     Arrays: `time` (R,) [s], `qpos` (R, nq), `qvel` (R, nv), `bodies` (B,), `body_position` (R, B, 3) [m],
     `body_quaternion` (R, B, 4), and ``sensor/<name>`` (R, dim) for each sensor; with contacts also ``contact/step``,

@@ -268,7 +268,7 @@ def _remarks(
             prior.high - prior.low
         ):
             unknown.add(k)
-            found.append(f"The recording says next to nothing about {q.name}.")
+            found.append(f"The recording hardly determines {q.name}.")
     for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
         if not any(q.excludes_null for q in parameters[part]) and not set(range(len(parameters))[part]) <= unknown:
             found.append(f"{effect.name} may be absent: within its interval it does nothing.")

@@ -1,6 +1,6 @@
 """What is fitted: windows of demonstrations, with measured values in units of their noise.
 
-A window starts from a state that the measurements tell only roughly; its error is estimated along with the parameters
+A window starts from a state that is only roughly measured; its error is estimated along with the parameters
 (multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE", 1983). Where motion forgets
 its start or keeps close to it, as in pushing and in driven arms, a window is a whole demonstration; where small
 differences grow, as in impacts and tumbling, it ends before they have grown much.
@@ -30,7 +30,7 @@ START_NOISE = 3.0
 UNSEEN = (1e-3, 1e-2)
 """Uncertainty of a position [m or rad] and a velocity that no instrument reads."""
 FEWEST = 12
-"""A recording with fewer measured values than this says nothing."""
+"""Least measured values of a recording that can be compared with a model [-]."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ SHORTEST = 0.12
 LONGEST = 20.0
 """Longest window [s]."""
 DEFAULT_STD = {"rad": 1e-3, "m": 1e-3, "rad/s": 1e-2, "m/s": 1e-2}
-"""Noise of channels that tell nothing of it, by unit."""
+"""Noise of channels for which it is neither stated nor estimable, by unit."""
 
 
 def channel_noises(model: Model, recording: Recording) -> dict[str, float]:
@@ -107,7 +107,7 @@ def observe(
         length: Length of a window [s]; by default as long as the model's motion keeps close to where it started.
         noise: Standard deviation of a component of each channel; by default stated or estimated.
         engine: Which engine simulates.
-        seed: Of the disturbances that tell how fast differences grow.
+        seed: Seed of the disturbances from which the growth of differences is estimated.
 
     Raises:
         RecordingError: There is too little to compare.
@@ -164,7 +164,7 @@ def keeps_close(
             value = np.where((value * value[:1]).sum(axis=2, keepdims=True) < 0, -value, value)
         second = np.linalg.norm(value[1::2] + value[2::2] - 2 * value[:1], axis=2) / 2
         size = (2.0 if dim == 4 else 1.0) / (std * np.sqrt(dim))
-        with np.errstate(invalid="ignore"):  # between two draws that diverge: inf - inf
+        with np.errstate(invalid="ignore"):  # inf - inf between two samples that diverge
             bend = np.quantile(size * second, 0.8, axis=0)
         curved = np.maximum(curved, np.nan_to_num(bend, nan=np.inf))
     wild = np.flatnonzero(curved > CURVED)

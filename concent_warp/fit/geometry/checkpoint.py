@@ -1,4 +1,4 @@
-"""The state of a fit on disk: one ``.npz`` without pickles, written in one piece."""
+"""The state of a fit on disk: one ``.npz`` without pickles, written atomically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Checkpoint:
 
     cfg: dict[str, Any]
     start: np.ndarray
-    """Sphere centres of the starting geometry [m], shape (S, 3): tells whose checkpoint this is."""
+    """Sphere centres of the starting geometry [m], shape (S, 3): identifies the fit that the checkpoint belongs to."""
     mean: np.ndarray
     """Displacements of the estimate, shape (S, C)."""
     best_mean: np.ndarray
@@ -40,7 +40,7 @@ class Checkpoint:
     TEXTS = ("cfg", "random_state", "numbers", "history", "stopped")
 
     def save(self, path: Path) -> None:
-        """Write the checkpoint in one piece or not at all."""
+        """Write the checkpoint atomically."""
         path.parent.mkdir(parents=True, exist_ok=True)
         content: dict[str, Any] = {name: getattr(self, name) for name in self.ARRAYS}
         content |= {name: np.array(json.dumps(getattr(self, name))) for name in self.TEXTS}

@@ -54,7 +54,7 @@ class GradientCfg:
     the descent ends."""
     disagreement: float = 5.0
     """How many times farther from what was observed all starts may be in Newton than the model is in MuJoCo, on the
-    same stretches: beyond that Newton tells of another motion, as of a grasp that slips, and is not followed."""
+    same stretches: beyond that Newton simulates another motion, such as a slipping grasp, and is not used."""
     gain: float = 0.05
     """Share by which the best of them must lie below the start, or gradients count as of no help."""
     device: str | None = None
@@ -65,7 +65,7 @@ class GradientCfg:
 
 @dataclass
 class Descent:
-    """Where each of P starts stands; all displacements are relative to the starting geometry [m]."""
+    """State of each of P starts; all displacements are relative to the starting geometry [m]."""
 
     now: np.ndarray
     """Displacements to try next, shape (P, S, 3)."""
@@ -250,6 +250,6 @@ def chosen_iterates(state: Descent, each: int) -> np.ndarray:
 
 
 def identity(cfg: GradientCfg, seed: int, base: np.ndarray, names: Sequence[str]) -> dict[str, Any]:
-    """Return what tells whose state a file holds."""
+    """Return what identifies the descent that a state file belongs to."""
     start = zlib.crc32(np.ascontiguousarray(base).tobytes())
     return {"cfg": asdict(cfg), "seed": seed, "start": start, "segments": list(names)}

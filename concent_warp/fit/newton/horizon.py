@@ -1,4 +1,4 @@
-"""How long gradients stay meaningful, told from how the objects were seen to move.
+"""How long gradients stay meaningful, estimated from the observed motion of the objects.
 
 Gradients grow with the number of impacts that they pass through. An object that is pushed or settles keeps its tilt:
 gradients serve for seconds. One that tumbles changes it, and each corner that hits the ground multiplies them: there

@@ -128,7 +128,7 @@ class FactorDescent:
         """Descend.
 
         Raises:
-            EngineError: Newton tells of another motion than MuJoCo.
+            EngineError: Newton simulates another motion than MuJoCo.
         """
         cfg, count = self.cfg, self.loss.count
         now, best, direction = np.zeros(count), np.zeros(count), np.zeros(count)
@@ -164,11 +164,11 @@ class FactorDescent:
         """Check that both simulators tell of the same motion, by the distances of the model from it [m]."""
         if not newton <= self.cfg.disagreement * mujoco:
             raise EngineError(
-                "Newton tells of another motion than MuJoCo, so that its gradients say nothing",
+                "Newton simulates another motion than MuJoCo, so that its gradients are of no use",
                 where=", ".join(s.name for s in self.scene.segments),
                 expected=f"objects at most {1e3 * self.cfg.disagreement * mujoco:.2g} mm from what was observed",
                 found=f"{1e3 * newton:.2g} mm",
-                fix="take demonstrations in which nothing is held",
+                fix="take demonstrations in which nothing is grasped",
             )
 
 
@@ -210,6 +210,6 @@ def factors(model: Model, recording: Recording, cfg: FactorCfg | None = None) ->
     Raises:
         ModelError: See `FactorDescent`.
         RecordingError: See there.
-        EngineError: The scene cannot be simulated stably, or Newton tells of another motion than MuJoCo.
+        EngineError: The scene cannot be simulated stably, or Newton simulates another motion than MuJoCo.
     """
     return FactorDescent(model, recording, cfg).run()

@@ -77,7 +77,7 @@ def test_what_the_recording_says_nothing_about_is_named(recording):
     limit = fitted.parameters[1][0]
     assert np.isinf(limit.high)
     assert not limit.excludes_null
-    assert "The recording says next to nothing about limit." in fitted.remarks
+    assert "The recording hardly determines limit." in fitted.remarks
 
 
 def test_parameters_that_act_alike_are_named():
