@@ -1,4 +1,4 @@
-"""Files that appear in one piece or not at all."""
+"""Atomic writing of text and JSON files."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in one piece or not at all."""
+    """Write a text file atomically."""
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(text)
     partial.replace(path)
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file in one piece or not at all."""
+    """Write a JSON file atomically."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")

@@ -1,7 +1,4 @@
-"""A model: scene, contact geometry and effects, all that a simulation needs.
-
-On disk one ``model.toml`` with files beside it.
-"""
+"""Model of a simulation: scene, contact geometry and effects, stored as ``model.toml`` with files beside it."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ class Model:
 
     @staticmethod
     def from_recording(recording: Recording) -> Model:
-        """Return the scene that a recording holds as a model, without contact geometry and effects."""
+        """Return the model of a recording's scene, without contact geometry and effects."""
         return Model(Scene(recording.scene, source=recording.source))
 
     def spec(self, collidable: np.ndarray | None = None) -> mujoco.MjSpec:
@@ -76,7 +73,7 @@ class Model:
         return spec
 
     def finish(self, m: mujoco.MjModel) -> mujoco.MjModel:
-        """Let the effects set their fields of a model compiled from `spec`, in place, and return it."""
+        """Set the effects' fields of a model compiled from `spec`, in place, and return it."""
         if self.effects:
             write(m, self.effects)
             mujoco.mj_setConst(m, mujoco.MjData(m))
@@ -105,7 +102,7 @@ class Model:
         effect.check(base)
         same = (a.effect.target for a in self.effects if a.effect.name == effect.name)
         if any(set(target) & set(effect.target) or target == effect.target for target in same):
-            raise ModelError(f"the model has {effect.name} there already", found=list(effect.target))
+            raise ModelError(f"the model already has {effect.name} on a target", found=list(effect.target))
         added = AddedEffect(effect, checked_values(effect, base, values))
         return replace(self, effects=(*self.effects, added))
 

@@ -1,4 +1,4 @@
-"""Where a command writes: a run folder or a file that is not overwritten unasked, the settings beside the results."""
+"""Run folders: output is overwritten only on request, and settings are stored beside the results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECKPOINT = "checkpoint.npz"
 CHECKPOINTS = "checkpoint.*"
 """Files of the state of a fit or a training."""
 FREE = ("out", "resume", "overwrite", "engine", "recording", "model", "scene")
-"""Settings that an interrupted run need not repeat to the letter: paths, and what does not decide the result."""
+"""Settings that may differ when a run is continued: paths, and those without influence on the result."""
 INVOCATION: ContextVar[tuple[str, ...]] = ContextVar("INVOCATION", default=())
 """The command that is running and its arguments."""
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
@@ -45,7 +45,7 @@ def claim_file(path: Path, *, overwrite: bool) -> None:
 
 
 def check_training(path: Path) -> None:
-    """Check that a training is there, without importing what reads it.
+    """Check that a training exists, without importing the training package.
 
     Raises:
         TrainError: There is neither a run folder nor a checkpoint file.
@@ -58,7 +58,7 @@ def check_training(path: Path) -> None:
 def run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> Iterator[None]:
     """Make the folder of a run and empty it of an earlier run's results where that was asked.
 
-    A folder made here is taken away again when the run ends with a `ConcentError` before its first checkpoint.
+    A folder made here is removed when the run ends with a `ConcentError` before its first checkpoint.
 
     Raises:
         ConcentError: It holds a run and neither `overwrite` nor `resume` was asked for, or holds other things.
@@ -118,7 +118,7 @@ def write_settings(folder: Path, settings: Any) -> dict[str, Any]:
 
 
 def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[str] = FREE) -> None:
-    """Refuse settings that differ from those in a settings file in what decides the result, all that is not `free`."""
+    """Raise an error where settings other than those in `free` differ from a settings file."""
     try:
         stored = tomllib.loads(path.read_text())
     except (OSError, ValueError):
@@ -144,12 +144,12 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """Return the command that is running, as one would type it."""
+    """Return the current command line."""
     return shlex.join([*_program(), *INVOCATION.get()])
 
 
 def resuming_command() -> str:
-    """Return the command that goes on with the run that is running."""
+    """Return the command that continues the current run."""
     return _resuming([*_program(), *INVOCATION.get()])
 
 
@@ -161,7 +161,7 @@ def _program() -> list[str]:
 
 
 def _resuming(command: Sequence[str]) -> str:
-    """Return a command so changed that it goes on with what it began."""
+    """Return a command with ``--resume``, which continues its run."""
     return shlex.join([*(part for part in command if part not in ("--overwrite", "--resume")), "--resume"])
 
 
@@ -177,7 +177,7 @@ def versions() -> dict[str, str]:
 
 
 def plain(value: Any) -> Any:
-    """Return nested settings as TOML holds them: tables, lists, numbers, text; what is None is left out."""
+    """Return nested settings as TOML values: tables, lists, numbers, text; None is left out."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, Mapping):
@@ -188,9 +188,9 @@ def plain(value: Any) -> Any:
 
 
 def processes() -> tuple[int, int]:
-    """Return the number of this process among those that torchrun started on this host, and how many they are.
+    """Return the rank of this process on this host and the number of processes that torchrun started there.
 
-    Only the first of them talks.
+    Only rank 0 prints.
     """
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return 0, 1

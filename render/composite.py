@@ -131,7 +131,7 @@ class HybridCamera:
         if self.painter is not None:
             self.painter.begin(self.stage.worlds, which)
         if self._shadows is not None:
-            self._shadows.draw(which)
+            self._shadows.sample_lights(which)
 
     def shoot(
         self,

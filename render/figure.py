@@ -20,7 +20,7 @@ class FrameSelection:
     """Some frames of an episode, spread over it, however long it becomes."""
 
     def __init__(self, shares: Sequence[float] = (0.3, 0.8)) -> None:
-        """Say which frames are wanted, as shares of the episode."""
+        """Select frames by their positions in the episode, as shares of its length."""
         self._shares, self._every, self._count = tuple(shares), 1, 0
         self._kept: list[tuple[int, Layers]] = []
 
@@ -29,7 +29,7 @@ class FrameSelection:
         return self._count
 
     def add(self, layers: Layers, world: int = 0) -> None:
-        """Show it the next frame."""
+        """Add the next frame."""
         if self._count % self._every == 0:
             self._kept.append((self._count, layers.clone(world)))
             if len(self._kept) > KEPT:

@@ -1,7 +1,7 @@
 """Shadows of splats on the table: flattened along random directions of light, as an augmentation (paper, appendix E).
 
-The paper lets objects cast shadows on the plane z = 0 alone, under lights that are drawn at random. Here a light is a
-direction, drawn anew for each episode, and takes away a share of the light of what its shadow falls on. Shadows are
+The paper lets objects cast shadows on the plane z = 0 alone, under randomly sampled lights. Here a light is a
+direction, sampled for each episode, and takes away a share of the light of what its shadow falls on. Shadows are
 soft by a blur of the image.
 """
 
@@ -57,9 +57,9 @@ class Shadows:
         )  # fmt: skip
         self.directions = torch.zeros(worlds, cfg.lights, 3, device=self.rasteriser.device)
         self.strengths = torch.zeros(worlds, cfg.lights, device=self.rasteriser.device)
-        self.draw()
+        self.sample_lights()
 
-    def draw(self, which: torch.Tensor | None = None) -> None:
+    def sample_lights(self, which: torch.Tensor | None = None) -> None:
         """Sample new lights for all worlds or those of a mask (W,), as at the start of an episode."""
         shape = self.strengths.shape
         first, second, third = torch.rand(3, *shape, generator=self._generator)

@@ -28,9 +28,9 @@ from benchmarks.render.feature_distance import FeatureDistance, feature_distance
 from benchmarks.render.footage import EMPTY, HELD, footage
 from concent_warp.recording.recording import Recording
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
-from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow import sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
-from concent_warp.render.networks.pairs import ImagePairs, drawn_scene, pairs_of, to_signed
+from concent_warp.render.networks.pairs import ImagePairs, camera_scene, pairs_of, to_signed
 from concent_warp.render.networks.train import ENLARGE, NetworkTraining, RenderTraining, network_of
 from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.scene.scene import Scene
@@ -92,7 +92,7 @@ def painting(training: RenderTraining, camera: str) -> Draw:
         seen: torch.Tensor, previous: torch.Tensor, pose: torch.Tensor | None, steps: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
         with torch.autocast(training.device.type, torch.bfloat16, enabled=training.cfg.half):
-            drawn = draw(networks[camera], seen, previous, pose, steps=steps, generator=generator)
+            drawn = sample_images(networks[camera], seen, previous, pose, steps=steps, generator=generator)
             image = drawn if enlarge is None else enlarge(drawn)
         return ((image.float() + 1) / 2).clamp(0, 1), drawn
 
@@ -157,7 +157,7 @@ def objects_seen(held: ImagePairs, recording: Recording, device: str) -> torch.T
     from concent_warp.simulate.mujoco_engine import MujocoEngine
 
     scene = Scene(recording.scene)
-    model = drawn_scene(scene, [held.camera])
+    model = camera_scene(scene, [held.camera])
     stage = PosedWorlds(model, 1, device=device)
     eye = RawCamera(stage, [held.camera.name], (held.real.shape[2], held.real.shape[3]))
     bodies = [model.body(name).id for name in scene.objects()]

@@ -230,7 +230,7 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     from concent_warp.estimation.state_estimator import StateEstimator, StateEstimatorCfg
     from concent_warp.model import Model
     from concent_warp.render.cameras import Camera
-    from concent_warp.render.networks.pairs import drawn_scene
+    from concent_warp.render.networks.pairs import camera_scene
     from concent_warp.render.splats.splats import Splats
     from concent_warp.scene.scene import Scene
     from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -246,7 +246,7 @@ def prepared(held: Recording, splats: dict[str, Path], arguments: argparse.Names
     cameras = [Camera.of(name, held.demonstrations[0].image[name]) for name in CAMERAS]
     return {
         "scene": scene,
-        "model": drawn_scene(scene, cameras),
+        "model": camera_scene(scene, cameras),
         "states": states,
         "splats": {name: Splats.read(path, device=where) for name, path in splats.items()},
     }

@@ -27,7 +27,7 @@ from benchmarks.pages import machine
 from concent_warp.render.cameras import Camera
 from concent_warp.render.composite import HybridCamera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
-from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow import sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.super_resolution import SuperResolution
@@ -123,7 +123,7 @@ def painting(worlds: int, arguments: argparse.Namespace) -> Iterator[tuple[str, 
     def at_once() -> None:
         with torch.autocast(image.device.type, torch.bfloat16, enabled=made.half):
             for part in image.split(arguments.together):
-                draw(whole, part, part, None, steps=STEPS)
+                sample_images(whole, part, part, None, steps=STEPS)
 
     yield "256 at once", timed(at_once, arguments.device, arguments.least)
 

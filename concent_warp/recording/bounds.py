@@ -1,4 +1,4 @@
-"""How large a recording may be: what every reader checks before it loads anything."""
+"""Limits of the size of a recording, which every reader checks before it loads data."""
 
 from __future__ import annotations
 

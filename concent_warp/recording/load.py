@@ -1,4 +1,4 @@
-"""One door to all readers: the kind of a recording is told from its path."""
+"""Reading of recordings of any kind; the kind is determined from the path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was commanded and what was measured, with time stamps: the in-memory form of the recording file.
+"""Recordings in memory: commands and measurements with time stamps.
 
 Everything is SI (m, s, rad, kg, N), quaternions are wxyz, the angular velocity of a free body is in the body frame.
 Each channel has clock readings of its own; a value may be NaN (missing), a time may not.

@@ -13,23 +13,23 @@ from concent_warp.scene.scene import Scene
 BASE, WRIST = "base", "wrist"
 """Names of the two cameras of the paper's set-up."""
 BASE_OFFSET = (0.86, -0.5, 0.52)
-"""Where the base camera stands, seen from the middle of the objects [m]."""
+"""Position of the base camera relative to the centre of the objects [m]."""
 BASE_TARGET = (-0.02, 0.0, 0.13)
-"""What it looks at, seen from there too [m]."""
+"""Point that the base camera looks at, relative to the same centre [m]."""
 BASE_FOVY = 42.0
 """Vertical field of view of the base camera [degrees]."""
 WRIST_OFFSET = (0.08, 0.0, -0.05)
-"""Where the wrist camera sits, in the frame of the tool site [m]; the tool points along z."""
+"""Position of the wrist camera in the frame of the tool site [m]; the tool points along z."""
 WRIST_TARGET = (0.012, 0.0, 0.06)
-"""What it looks at, in the same frame [m]."""
+"""Point that the wrist camera looks at, in the same frame [m]."""
 WRIST_FOVY = 75.0
 """Vertical field of view of the wrist camera [degrees]."""
 
 
 def add_cameras(spec: mujoco.MjSpec, objects: Sequence[str], *, tool_site: str = "tcp") -> tuple[str, ...]:
-    """Add base and wrist camera to a spec where it has none of the name and can have one; return the names it has.
+    """Add the missing ones of base and wrist camera to a spec, and return the names of all its cameras.
 
-    The base camera wants objects to look at, the wrist camera the tool site.
+    The base camera requires objects, the wrist camera the tool site.
 
     Args:
         spec: The scene; it is changed.
@@ -65,10 +65,10 @@ def add_camera(
     """Add a camera to a body that looks at a point of the body's frame.
 
     Args:
-        body: What carries the camera.
+        body: Body that the camera is fixed to.
         name: Its name.
-        position: Where it sits [m], body frame.
-        target: What it looks at [m], body frame.
+        position: Position [m], body frame.
+        target: Point that the camera looks at [m], body frame.
         up: Direction that is upwards in the image, body frame.
         fovy: Vertical field of view [degrees].
     """
@@ -85,7 +85,7 @@ def with_cameras(scene: Scene, names: Sequence[str], *, tool_site: str = "tcp") 
     """Return a scene that has cameras of these names: the scene itself where it does, else with what can be added.
 
     Raises:
-        SceneError: It has no such camera, and none that can be added is called so.
+        SceneError: The scene has no camera of a name, and it is not one that can be added.
     """
     spec = scene.spec()
     have = [camera.name for camera in spec.cameras]

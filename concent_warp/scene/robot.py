@@ -1,6 +1,6 @@
 """The embedded robot: a 7-DoF arm with a parallel gripper, primitives only, after the Franka Emika Panda.
 
-Where the figures come from:
+Sources of the values:
 
 - kinematics (modified Denavit-Hartenberg), limits of position and torque: Franka Control Interface
   documentation, "Robot and interface specifications";
@@ -11,7 +11,7 @@ Where the figures come from:
   of the first four joints; the wrist's is lowered so that all joints lag their command by about 80 ms;
 - rotor inertias are not published; 0.1 kg m^2 a joint is an assumption shared with other MuJoCo models of this arm.
 
-The shapes are capsules and boxes drawn around the links: they look right and collide, and are nobody's measurement.
+The shapes are capsules and boxes around the links, for display and collision; their sizes are not measured.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ PAD = (0.0085, 0.004, 0.0095)
 
 @dataclass(frozen=True)
 class RobotCfg:
-    """Which robot stands in the scene, and how it is addressed."""
+    """Robot of the scene, and the names of its tool site and gripper actuators."""
 
     path: Path | None = None
     """MJCF of the robot; None is the embedded arm."""

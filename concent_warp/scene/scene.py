@@ -1,4 +1,4 @@
-"""A scene: bodies, joints, actuators and sensors, held as self-contained MJCF and handed out as `mujoco.MjSpec`."""
+"""A scene: bodies, joints, actuators and sensors as self-contained MJCF text; `Scene.spec` gives a `mujoco.MjSpec`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Scene:
 
     xml: str
     source: str = "<memory>"
-    """Where it came from, for messages."""
+    """File or description of the origin, for messages."""
 
     @staticmethod
     def from_mjcf(path: Path) -> Scene:
-        """Read an MJCF file, with its includes and meshes drawn into the text.
+        """Return the scene of an MJCF file, with includes and meshes written into the text.
 
         Raises `SceneError` where the file is missing or MuJoCo cannot compile it.
         """
@@ -45,7 +45,7 @@ class Scene:
 
     @staticmethod
     def from_spec(spec: mujoco.MjSpec, source: str = "<memory>") -> Scene:
-        """Hold a spec as text; meshes are written as inline vertices and faces."""
+        """Return the scene of a spec; meshes are written as inline vertices and faces."""
         return _standalone(spec.copy(), source)
 
     def spec(self) -> mujoco.MjSpec:
@@ -59,7 +59,7 @@ class Scene:
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The scene compiled as it stands, without contact geometry; not to be edited."""
+        """The compiled scene without contact geometry; not to be edited."""
         try:
             return self.spec().compile()
         except (ValueError, mujoco.FatalError) as error:
@@ -89,10 +89,10 @@ class Scene:
 
 
 def _standalone(spec: mujoco.MjSpec, source: str) -> Scene:
-    """Hold a spec as text and change it in doing so.
+    """Return the scene of a spec, which is changed.
 
-    A spec that was read from a file is not copied before: the copy would lack, without a word, the actuators and
-    sensors that refer to names which do not exist, where compiling the spec itself says so.
+    A spec read from a file is not copied: the copy silently lacks actuators and sensors that refer to missing names,
+    whereas compiling the spec itself raises an error.
     """
     for mesh in spec.meshes:
         _inline_mesh(spec, mesh)

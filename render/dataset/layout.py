@@ -45,7 +45,7 @@ class EpisodeLayout:
             raise RenderError("the rate of frames is not right", expected="a whole number of frames/s", found=self.rate)
         if not (self.cameras and self.state and self.action):
             found = f"{len(self.cameras)} cameras, {len(self.state)} numbers of state and {len(self.action)} of action"
-            raise RenderError("a data set wants images, a state and an action", found=found)
+            raise RenderError("a data set needs images, a state and an action", found=found)
         if height % 2 or width % 2 or height < 16 or width < 16:
             raise RenderError("images of this size make no video", expected="even, at least 16 x 16", found=self.size)
 
@@ -80,11 +80,11 @@ class EpisodeWriter(Protocol):
         ...
 
     def drop(self) -> None:
-        """Leave it out, now and when the data set is gone on with."""
+        """Exclude the episode, now and when the data set is continued."""
         ...
 
     def discard(self) -> None:
-        """Forget it: it is rendered anew when the data set is gone on with."""
+        """Discard the episode; it is rendered again when the data set is continued."""
         ...
 
 
@@ -179,7 +179,7 @@ def partial_of(path: Path) -> Path:
     return path.with_name(f".partial-{path.name}")
 
 
-def settle(path: Path) -> None:
+def publish_file(path: Path) -> None:
     """Give a file that was written under `partial_of` its name."""
     partial = partial_of(path)
     _sync(partial)
@@ -189,4 +189,4 @@ def settle(path: Path) -> None:
 def replace_text(path: Path, text: str) -> None:
     """Write a text file in one piece or not at all."""
     partial_of(path).write_text(text)
-    settle(path)
+    publish_file(path)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, replace_text, settle
+from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, publish_file, replace_text
 from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged, of_values
 from concent_warp.render.dataset.video import PIXELS, Codec, VideoWriter, join_videos
 
@@ -104,7 +104,7 @@ class LeRobotWriter:
             join_videos(
                 [self._staging.path(k) / f"{camera}.mp4" for k in keys], lengths, self.layout.rate, partial_of(out)
             )
-            settle(out)
+            publish_file(out)
         tasks, index = self.tasks(), int(self._episodes[-1]["dataset_to_index"]) if self._episodes else 0
         rows, tables, seconds = [], [], 0.0
         for key, note in zip(keys, notes, strict=True):
@@ -127,12 +127,12 @@ class LeRobotWriter:
             index, seconds = index + length, until
         out = self.folder / _file_path("data", where)
         pq.write_table(pa.concat_tables(tables), partial_of(out))
-        settle(out)
+        publish_file(out)
         self._write_tasks(tasks)
         # From here on the episodes belong to the data set.
         out = self.folder / _file_path("meta/episodes", where)
         pq.write_table(pa.Table.from_pylist(rows), partial_of(out))
-        settle(out)
+        publish_file(out)
         self._episodes += rows
         self._staging.forget(keys)
 
@@ -203,7 +203,7 @@ class LeRobotWriter:
         pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
         out = self.folder / "meta" / "tasks.parquet"
         pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), partial_of(out))
-        settle(out)
+        publish_file(out)
 
     def _write_meta(self) -> None:
         """Write what follows from the table of episodes: statistics of all, and the description."""

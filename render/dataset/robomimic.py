@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, settle
+from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, publish_file
 
 NAME = "dataset.hdf5"
 """The file in the data set's folder."""
@@ -69,7 +69,7 @@ class RobomimicWriter:
                     "env_kwargs": {"state": self.layout.state, "action": self.layout.action, "rate": self.layout.rate},
                 }
             )
-        settle(out)
+        publish_file(out)
         self._staging.forget(self._staging.numbers())
         return len(packed) + len(staged)
 

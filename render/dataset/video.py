@@ -49,7 +49,7 @@ class VideoWriter:
         self._container.mux(self._stream.encode(frame))
 
     def abandon(self) -> None:
-        """Close a file that nobody wants any more; it may have no frames."""
+        """Close a discarded file; it may have no frames."""
         from av.error import FFmpegError
 
         try:

@@ -54,8 +54,8 @@ class AugmentCfg:
     """Augmentation of the conditions, so that errors of generated images do not accumulate (paper: autoregressive)."""
 
     back: int = 5
-    """How many frames older than it is the previous image may be, at most; 1 for the very frame before. A network that
-    has seen such ones looks at the simulation for where the robot is."""
+    """How many frames older than it is the previous image may be, at most; 1 for the very frame before. A network
+    trained on these takes the robot's position from the simulated image."""
     blank: float = 0.3
     """Share of the previous images replaced by the mean image, the initial condition of an episode."""
     noise: float = 0.06

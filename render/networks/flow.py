@@ -38,7 +38,7 @@ def flow_loss(
 
 
 @torch.no_grad()
-def draw(
+def sample_images(
     network: FlowNetwork | torch.nn.Module,
     simulated: torch.Tensor,
     previous: torch.Tensor,
@@ -52,7 +52,7 @@ def draw(
     Args:
         network: A `FlowNetwork`.
         simulated: The simulation's images, shape (N, 3, S, S).
-        previous: The images drawn before, same shape.
+        previous: The previously sampled images, same shape.
         pose: Poses of the end-effector, shape (N, 9), where these are a condition.
         steps: Steps from noise to image.
         generator: Source of the noise, on the images' device.

@@ -10,7 +10,7 @@ import torch
 from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
-from concent_warp.render.networks.flow import draw
+from concent_warp.render.networks.flow import sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.super_resolution import SuperResolution, reduced
 from concent_warp.render.networks.train import CHECKPOINT, ENLARGE, load_checkpoint, network_of
@@ -107,9 +107,11 @@ class Painter:
             network = self.networks[name]
             pose = poses[c].to(self.device) if network.cfg.posed else None
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
-                drawn = draw(network, seen, self._previous[name], pose, steps=self.steps, generator=self._generator)
-                large = self.enlarge(drawn).float()
-            self._previous[name] = drawn
+                painted = sample_images(
+                    network, seen, self._previous[name], pose, steps=self.steps, generator=self._generator
+                )
+                large = self.enlarge(painted).float()
+            self._previous[name] = painted
             frames.append(((large + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1))
         return torch.stack(frames, dim=1)
 

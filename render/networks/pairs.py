@@ -48,7 +48,7 @@ class ImagePairs:
         return ImagePairs(self.camera, *(t.to(device) for t in tensors))
 
 
-def drawn_scene(scene: Scene, cameras: Sequence[Camera]) -> mujoco.MjModel:
+def camera_scene(scene: Scene, cameras: Sequence[Camera]) -> mujoco.MjModel:
     """Return a scene's model with cameras at their calibrated places."""
     spec = scene.spec()
     place_cameras(spec, cameras)
@@ -123,7 +123,7 @@ def _rendered(
     progress: Callable[[float], None] | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return images (N, 3, H, W) uint8 of states (N, nq) without the objects, and poses (N, 9) of the camera's body."""
-    model = drawn_scene(scene, [camera])
+    model = camera_scene(scene, [camera])
     stage = PosedWorlds(model, BATCH, device=device)
     eye = RawCamera(stage, [camera.name], size, leave_out=scene.objects())
     images = torch.zeros((len(qpos), 3, *size), dtype=torch.uint8)

@@ -1,6 +1,6 @@
 """Training of the networks that paint robot and background: a flow for each camera, one super-resolution for all.
 
-A training that was stopped goes on as if it had not: weights, their running mean, optimiser and generators are kept.
+Checkpoints hold weights, their running mean, optimiser and generators, so that a continued training is identical.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def test_a_model_is_not_overwritten_unasked_and_has_to_be_named(swing, tmp_path,
     assert add(swing, "joint_damping") == 2
     assert add(swing, "joint_damping", "-o", str(tmp_path / "m.xml")) == 2
     assert main(["add", "joint_damping", "--model", str(out), "-o", str(tmp_path / "n.toml")]) == 2
-    assert "has joint_damping there already" in capsys.readouterr().err
+    assert "already has joint_damping on a target" in capsys.readouterr().err
 
 
 def test_a_recording_that_the_model_cannot_follow_is_an_error(swing, tmp_path, capsys):

@@ -13,7 +13,7 @@ from concent_warp.render.networks.cfg import (
     RenderTrainCfg,
     SuperResolutionCfg,
 )
-from concent_warp.render.networks.flow import draw, flow_loss
+from concent_warp.render.networks.flow import flow_loss, sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import ImagePairs, _columns, _frames_before
@@ -58,7 +58,7 @@ def test_flow_of_a_perfect_network_ends_at_its_image():
             return image
 
     for steps in (1, 3, 7):
-        assert torch.allclose(draw(Knows(), image, image, None, steps=steps), image, atol=1e-6)
+        assert torch.allclose(sample_images(Knows(), image, image, None, steps=steps), image, atol=1e-6)
     assert float(flow_loss(Knows(), image, image, image, None)) == 0
 
 
@@ -73,7 +73,7 @@ def test_velocity_of_the_steps_is_that_of_the_straight_line():
             seen.append((float(time[0]), noised.clone()))
             return image
 
-    draw(Watches(), image, image, None, steps=4, generator=torch.Generator().manual_seed(3))
+    sample_images(Watches(), image, image, None, steps=4, generator=torch.Generator().manual_seed(3))
     for time, noised in seen:
         assert torch.allclose(noised, (1 - time) * noise + time * image, atol=1e-6)
 

@@ -64,7 +64,7 @@ def test_what_stands_before_the_table_hides_the_shadow_and_the_table_does_not():
 def test_lights_of_new_episodes_are_drawn_and_others_stay():
     shadows = Shadows([ball(50)], 16, 16, 4, generator=torch.Generator().manual_seed(3))
     before = shadows.directions.clone(), shadows.strengths.clone()
-    shadows.draw(torch.tensor([True, False, True, False]))
+    shadows.sample_lights(torch.tensor([True, False, True, False]))
     for kept, new in zip(before, (shadows.directions, shadows.strengths), strict=True):
         assert torch.equal(kept[1::2], new[1::2])
         assert (kept[::2] != new[::2]).any(dim=-1).all()

@@ -1,4 +1,4 @@
-"""Entries of an HDF5 file that nobody vouches for.
+"""Safe access to the entries of an untrusted HDF5 file.
 
 A file is data: nothing in it is executed, nothing outside it is opened (soft, external and virtual links are refused,
 external storage too), and the size of an array is checked before the array is read.
@@ -37,7 +37,7 @@ Entry = TypeVar("Entry", h5py.Group, h5py.Dataset)
 
 
 class SafeFile:
-    """Reads entries of one open file and keeps count of what it has promised to load."""
+    """Reads entries of one open file and counts the bytes that are to be loaded."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""What the HDF5 library does not check itself where it reads strings of variable length.
+"""Checks of global heaps, which the HDF5 library does not do before it reads strings of variable length.
 
 They lie in global heaps, the one part of the format in which damage is not noticed in time (seen with HDF5 2.0): an
 object of size 0 makes the library loop for ever, one that is too long makes it read beyond its memory, and a wrong

@@ -1,4 +1,4 @@
-"""Whether the clocks of a demonstration can be seconds that began together.
+"""Checks that the clocks of a demonstration are in seconds and have a common start.
 
 What is judged is chosen so that sound recordings pass: a channel says something about its clock only from
 `JUDGED_SAMPLES` samples on, slow commands are fine (a command is held), and a slow sensor among fast ones is fine.

@@ -1,4 +1,4 @@
-"""Whether the frames and the calibration of a camera can be right."""
+"""Checks of the frames and the calibration of a camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where in a recording something is wrong: the start of each message about it."""
+"""Location of an error in a recording, with which each message begins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a recording's MJCF may be given to MuJoCo: it must stand alone and be of a sane size."""
+"""Checks of a recording's MJCF text before it is compiled: self-contained and of limited size."""
 
 from __future__ import annotations
 

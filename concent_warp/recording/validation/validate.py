@@ -1,11 +1,11 @@
-"""What makes a recording valid: every reader and the writer ask this module, so no other code has to.
+"""Validation of recordings, called by every reader and writer.
 
 A recording is checked against its own scene: names and sizes against the compiled MJCF here, clocks in `clocks`,
-magnitudes that betray wrong units in `magnitudes`, cameras in `images`.
+magnitudes that indicate wrong units in `magnitudes`, cameras in `images`.
 
 Rules on missing values: a measurement may be NaN where it is missing, but not all of a channel; infinities are refused
 everywhere. A command may not be NaN at all: a command is held until the next sample, so a sample that is left out
-already says "as before", and a NaN would say that nobody knows what the actuator was told.
+means that the value is unchanged, and a NaN would leave the command undefined.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSens
 
 
 def validate(recording: Recording) -> None:
-    """Check a recording against its scene and against itself.
+    """Check that a recording is consistent and fits its scene.
 
     Raises:
         RecordingError: The first thing that is wrong, with file, demonstration, channel and row (counted from 0).
