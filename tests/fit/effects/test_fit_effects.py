@@ -84,7 +84,7 @@ def test_parameters_that_act_alike_are_named():
     recording = swung()
     model = model_with(recording, "mass", "inertia", "armature", "gravity_compensation", "actuator_gain")
     fitted = fit_effects(model, recording)
-    assert any("act so alike" in remark or "next to nothing" in remark for remark in fitted.remarks)
+    assert any("act so alike" in remark or "hardly determines" in remark for remark in fitted.remarks)
 
 
 def test_a_parameter_that_runs_to_its_bound_is_named():
