@@ -200,7 +200,7 @@ def track_points(
                 raise RecordingError(
                     f"body {body!r} cannot be tracked",
                     where=f"{where}, first frame",
-                    expected=f"at least {cfg.least} corners where the initial state has it",
+                    expected=f"at least {cfg.min_points} corners where the initial state has it",
                     found=int(tracker.alive.sum()),
                     fix="check the initial state, the camera's pose and the resolution",
                 )
