@@ -55,8 +55,8 @@ def test_every_verdict_is_explained():
 
 def test_figures_of_the_procedure_are_those_of_the_settings():
     cfg = DiagnoseCfg()
-    assert f"found on {cfg.null_samples} data sets" in PAGE
-    assert f"p ≤ {cfg.significance_level:g} that takes away at least {100 * cfg.min_gain:.0f} %" in PAGE
+    assert f"on {cfg.null_samples} data sets without an effect" in PAGE
+    assert f"p ≤ {cfg.significance_level:g}; at least {100 * cfg.min_gain:.0f} % of the error removed" in PAGE
     assert cfg.max_additions == 3
     assert "up to three times (`--additions`)" in PAGE
     assert {f.name for f in fields(cfg)} >= {"jobs", "seed", "window", "effects"}

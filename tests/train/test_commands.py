@@ -30,7 +30,7 @@ def task_of(*effects: AddedEffect) -> Task:
 
 
 @pytest.fixture(scope="module")
-def delay_and_lag() -> Task:
+def delayed_task() -> Task:
     return task_of(DELAY, LAG)
 
 
@@ -42,34 +42,34 @@ def offline(task: Task, values: tuple[np.ndarray, ...], world: int, ctrl: np.nda
     return held
 
 
-def test_commands_are_followed_as_the_effects_have_it(late):
+def test_commands_are_followed_as_the_effects_have_it(delayed_task):
     rng = np.random.default_rng(0)
-    values = sample_world_effects(late, WORLDS, 0, sample=True)
+    values = sample_world_effects(delayed_task, WORLDS, 0, sample=True)
     rows = (np.array([[0.0], [0.005], [0.0123], [0.062], [0.29]]), np.array([[0.0], [0.03], [0.001], [0.2], [0.05]]))
     parts = []
-    for added, row in zip(late.model.effects, rows, strict=True):
-        found = [added.effect.delay_and_lag(late.compiled, value) for value in row]
+    for added, row in zip(delayed_task.model.effects, rows, strict=True):
+        found = [added.effect.delay_and_lag(delayed_task.compiled, value) for value in row]
         parts.append(CommandDynamics(np.array([f[0] for f in found]), (np.array([f[1] for f in found]),)))
     following = CommandDynamics.combined(parts)
     assert following is not None
     assert len(values.command_dynamics) == 2
-    follower = CommandFilter(following, late.compiled.opt.timestep, DECIMATION, "cpu")
-    ctrl = rng.normal(size=(30, WORLDS, late.compiled.nu)).astype(np.float32)
+    follower = CommandFilter(following, delayed_task.compiled.opt.timestep, DECIMATION, "cpu")
+    ctrl = rng.normal(size=(30, WORLDS, delayed_task.compiled.nu)).astype(np.float32)
     follower.reset(torch.ones(WORLDS, dtype=torch.bool), torch.from_numpy(ctrl[0]))
     acted = []
     for command in ctrl:
         follower.apply(torch.from_numpy(command))
         acted.append(follower.acting.clone())
     for world in range(WORLDS):
-        expected = offline(late, rows, world, ctrl[:, world])
+        expected = offline(delayed_task, rows, world, ctrl[:, world])
         # The last step is interpolated with what is not yet commanded.
         np.testing.assert_allclose(torch.cat(acted)[:-1, world], expected[:-1], atol=2e-6)
 
 
-def test_worlds_that_begin_anew_forget_what_was_commanded(late):
-    lag = np.full((2, late.compiled.nu), 0.1)
+def test_worlds_that_begin_anew_forget_what_was_commanded(delayed_task):
+    lag = np.full((2, delayed_task.compiled.nu), 0.1)
     follower = CommandFilter(CommandDynamics(lag, (lag,)), 0.005, DECIMATION, "cpu")
-    old, new = torch.zeros(2, late.compiled.nu), torch.ones(2, late.compiled.nu)
+    old, new = torch.zeros(2, delayed_task.compiled.nu), torch.ones(2, delayed_task.compiled.nu)
     follower.reset(torch.tensor([True, True]), old)
     follower.apply(new)
     assert not follower.acting.any()
@@ -80,13 +80,13 @@ def test_worlds_that_begin_anew_forget_what_was_commanded(late):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
+def test_each_world_moves_by_its_own_delay_and_lag(delayed_task, engine):
     settings = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=DECIMATION)
-    physics = _make_physics(late, settings, device="cpu")
-    values = sample_world_effects(late, WORLDS, 0, sample=True).values
+    physics = _make_physics(delayed_task, settings, device="cpu")
+    values = sample_world_effects(delayed_task, WORLDS, 0, sample=True).values
     assert len(np.unique(values[0])) == WORLDS
-    physics.qpos[:] = torch.as_tensor(late.replay.qpos[0]).to(physics.qpos.dtype)
-    ctrl = np.tile(late.replay.ctrl[0], (8, 1))
+    physics.qpos[:] = torch.as_tensor(delayed_task.replay.qpos[0]).to(physics.qpos.dtype)
+    ctrl = np.tile(delayed_task.replay.ctrl[0], (8, 1))
     ctrl[1:4, :3] += 0.02
     ctrl[4:, :3] -= 0.01
     for k, command in enumerate(ctrl):
@@ -94,21 +94,21 @@ def test_each_world_moves_by_its_own_delay_and_lag(late, engine):
         if k == 0:
             physics.reset_commands(torch.ones(WORLDS, dtype=torch.bool))
         physics.advance()
-    expected = np.empty((WORLDS, late.compiled.nq))
+    expected = np.empty((WORLDS, delayed_task.compiled.nq))
     for world in range(WORLDS):
-        d = mujoco.MjData(late.compiled)
-        d.qpos[:] = late.replay.qpos[0]
-        for acting in offline(late, values, world, ctrl):
+        d = mujoco.MjData(delayed_task.compiled)
+        d.qpos[:] = delayed_task.replay.qpos[0]
+        for acting in offline(delayed_task, values, world, ctrl):
             d.ctrl[:] = acting
-            mujoco.mj_step(late.compiled, d)
+            mujoco.mj_step(delayed_task.compiled, d)
         expected[world] = d.qpos
-    assert np.ptp(expected[:, late.robot.qpos[0]]) > 1e-4
+    assert np.ptp(expected[:, delayed_task.robot.qpos[0]]) > 1e-4
     np.testing.assert_allclose(physics.qpos.numpy(), expected, rtol=0, atol=2e-6 if engine == "mujoco" else 2e-4)
 
 
-def test_saved_state_holds_what_was_commanded(late, states):
+def test_saved_state_holds_what_was_commanded(delayed_task, states):
     cfg = replace(SETTINGS, worlds=3, randomisation=RandomisationCfg(delay=(0.05, 0.1), lag=(0.0, 0.05)))
-    environment = make_environment(late, cfg, states, device="cpu")
+    environment = make_environment(delayed_task, cfg, states, device="cpu")
     act = torch.ones(3, environment.num_actions)
     environment.start_from([0, 1, 2])
     environment.step(act)
