@@ -11,6 +11,7 @@ A room is a folder of modules of the package. A circle is a set of modules that 
 from __future__ import annotations
 
 import ast
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,14 +83,9 @@ def rooms(root: Path) -> dict[Path, int]:
     return found
 
 
-def front_door(tree: ast.Module) -> int:
-    """Return how many names the package offers."""
-    for node in tree.body:
-        if isinstance(node, ast.AnnAssign | ast.Assign):
-            targets = [node.target] if isinstance(node, ast.AnnAssign) else node.targets
-            if any(isinstance(t, ast.Name) and t.id == "_HOMES" for t in targets) and isinstance(node.value, ast.Dict):
-                return sum(len(ast.literal_eval(value)) for value in node.value.values)
-    return 0
+def front_door(root: Path) -> int:
+    """Return how many names the package of a checkout offers."""
+    return len(runpy.run_path(str(root / "concent_warp" / "__init__.py")).get("__all__", ()))
 
 
 def main() -> None:
@@ -114,7 +110,7 @@ def main() -> None:
         ["modules in the largest", f"{sizes[largest]} (`{largest.relative_to(root)}`)"],
         ["circles of modules", str(len(circles(graph)))],
         ["circles of top-level rooms", str(len(circles(of_rooms)))],
-        ["names of the front door", str(front_door(trees["concent_warp"]))],
+        ["names of the front door", str(front_door(root))],
         ["public functions of modules", f"{public:,}"],
         ["words of the README", f"{len((root / 'README.md').read_text().split()):,}"],
     ]
