@@ -1,12 +1,13 @@
-"""Settings: their defaults are those that are written down, and what holds data cannot be changed by accident.
+"""Settings and constants are those that are written down, and what holds data cannot be changed by accident.
 
-A default that is changed on purpose is written down by ``python -m tests.test_settings``.
+One that is changed on purpose is written down by ``python -m tests.test_settings``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import json
 import pkgutil
 from collections.abc import Iterator
@@ -16,19 +17,38 @@ from typing import Any
 import concent_warp
 
 WRITTEN = Path(__file__).with_name("default_settings.json")
-CHANGED_IN_PLACE = {"Descent", "WorldLog", "ViewerControls", "PlyElement", "VariantResult"}
+WRITTEN_CONSTANTS = Path(__file__).with_name("default_constants.json")
+ELSEWHERE = ("kernels", "train", "render")
+"""Packages of the library whose folders lie beside that of the others."""
+CHANGED_IN_PLACE = {
+    "Descent",
+    "WorldLog",
+    "ViewerControls",
+    "PlyElement",
+    "VariantResult",
+    "ResetCandidate",
+    "Iteration",
+}
 """Dataclasses that hold a state, or that grow while they are filled."""
+
+
+def modules() -> Iterator[Any]:
+    """Yield the modules of the library, each once."""
+    paths = {"concent_warp.": list(concent_warp.__path__)}
+    for package in ELSEWHERE:
+        paths[f"concent_warp.{package}."] = list(importlib.import_module(f"concent_warp.{package}").__path__)
+    names = [found.name for prefix, path in paths.items() for found in pkgutil.walk_packages(path, prefix)]
+    for name in dict.fromkeys(names):
+        if not name.endswith("__main__"):
+            yield importlib.import_module(name)
 
 
 def dataclasses_of_the_library() -> Iterator[tuple[str, Any]]:
     """Yield "room.Class" and each dataclass of the library, in order of modules."""
-    for module in pkgutil.walk_packages(concent_warp.__path__, "concent_warp."):
-        if module.name.endswith("__main__"):
-            continue
-        found = importlib.import_module(module.name)
-        for name, kind in vars(found).items():
-            if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind.__module__ == module.name:
-                yield f"{module.name.split('.')[1]}.{name}", kind
+    for module in modules():
+        for name, kind in vars(module).items():
+            if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__:
+                yield f"{module.__name__.split('.')[1]}.{name}", kind
 
 
 def plain(value: Any) -> Any:
@@ -52,6 +72,52 @@ def defaults() -> dict[str, dict[str, Any]]:
     return found
 
 
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number or a tuple of numbers."""
+    if isinstance(value, tuple):
+        return bool(value) and all(map(is_number, value))
+    return isinstance(value, bool | int | float)
+
+
+def functions_of(kind: Any) -> Iterator[tuple[str, Any]]:
+    """Yield qualified name and function of what a module or a class defines, those of its classes as well."""
+    module = kind.__name__ if inspect.ismodule(kind) else kind.__module__
+    for value in list(vars(kind).values()):
+        function = getattr(value, "__func__", value)
+        if getattr(function, "__module__", None) != module:
+            continue
+        if inspect.isfunction(function):
+            yield function.__qualname__, function
+        elif inspect.isclass(function):
+            yield from functions_of(function)
+
+
+def constants() -> dict[str, Any]:
+    """Return the numbers among constants, default values of functions, and those of dataclasses other than settings."""
+    found: dict[str, Any] = {}
+    for module in modules():
+        room = module.__name__.removeprefix("concent_warp.")
+        if room.startswith("cli."):
+            continue
+        for name, value in vars(module).items():
+            if name.strip("_").isupper() and name != "TYPE_CHECKING" and is_number(value):
+                found[f"{room}.{name}"] = plain(value)
+        for name, function in functions_of(module):
+            if name.endswith("Cfg.__init__"):
+                continue
+            for parameter in inspect.signature(function).parameters.values():
+                if is_number(parameter.default):
+                    found[f"{room}.{name}({parameter.name})"] = plain(parameter.default)
+    return found
+
+
+def test_constants_and_default_values_are_those_that_are_written_down():
+    written, found = json.loads(WRITTEN_CONSTANTS.read_text()), constants()
+    assert len(set(written) & set(found)) > 300
+    different = {name: value for name, value in found.items() if written.get(name, value) != value}
+    assert not different, "if this is on purpose: python -m tests.test_settings"
+
+
 def test_default_settings_are_those_that_are_written_down():
     written, found = json.loads(WRITTEN.read_text()), defaults()
     assert len(found) > 30
@@ -72,3 +138,4 @@ def test_what_holds_data_is_frozen():
 
 if __name__ == "__main__":
     WRITTEN.write_text(json.dumps(defaults(), indent=1, sort_keys=True) + "\n")
+    WRITTEN_CONSTANTS.write_text(json.dumps(constants(), indent=1, sort_keys=True) + "\n")

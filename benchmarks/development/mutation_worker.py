@@ -103,6 +103,7 @@ class Recorder:
         self._calls = calls
         self.failed: str | None = None
         self.tests: dict[str, dict[str, Any]] = {}
+        self._collected: set[str] = set()
         self._fixtures: dict[Any, tuple[float, set[str]]] = {}
 
     def pytest_runtest_logreport(self, report: Any) -> None:
@@ -116,6 +117,15 @@ class Recorder:
         """Note a file that cannot be imported."""
         if report.failed and self.failed is None:
             self.failed = report.nodeid or "collection"
+
+    def pytest_collection_finish(self) -> None:
+        """Note what has run before the first test."""
+        self._collected = set() if self._calls is None else set(self._calls.found)
+
+    def imported(self) -> list[str]:
+        """Return what every test depends on: what has run before the first one, and the modules imported later."""
+        found = set() if self._calls is None else self._calls.found
+        return sorted(self._collected | {name for name in found if name.endswith("::<module>")})
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Generator[None, Any, None]:
@@ -157,7 +167,7 @@ def run(request: dict[str, Any], root: Path, answer: Path) -> None:
     code = pytest.main([*options, *request["tests"]], plugins=[recorder])
     result = {"outcome": "passed" if int(code) in (0, 5) else "failed", "failed": recorder.failed}
     if calls is not None:
-        result |= {"tests": recorder.tests, "imported": sorted(calls.found)}
+        result |= {"tests": recorder.tests, "imported": recorder.imported()}
     answer.write_text(json.dumps(result))
 
 
