@@ -92,8 +92,18 @@ def functions_of(kind: Any) -> Iterator[tuple[str, Any]]:
             yield from functions_of(function)
 
 
+def class_attributes(module: Any) -> Iterator[tuple[str, Any]]:
+    """Yield qualified name and value of the numbers that a module's classes declare, dataclasses left out."""
+    for name, kind in vars(module).items():
+        if inspect.isclass(kind) and kind.__module__ == module.__name__ and not dataclasses.is_dataclass(kind):
+            yield from ((f"{name}.{key}", v) for key, v in vars(kind).items() if key[0] != "_" and is_number(v))
+
+
 def constants() -> dict[str, Any]:
-    """Return the numbers among constants, default values of functions, and those of dataclasses other than settings."""
+    """Return the numbers among constants, attributes of classes, default values of functions and of dataclasses.
+
+    Those of settings are left out.
+    """
     found: dict[str, Any] = {}
     for module in modules():
         room = module.__name__.removeprefix("concent_warp.")
@@ -102,6 +112,8 @@ def constants() -> dict[str, Any]:
         for name, value in vars(module).items():
             if name.strip("_").isupper() and name != "TYPE_CHECKING" and is_number(value):
                 found[f"{room}.{name}"] = plain(value)
+        for name, value in class_attributes(module):
+            found[f"{room}.{name}"] = plain(value)
         for name, function in functions_of(module):
             if name.endswith("Cfg.__init__"):
                 continue
