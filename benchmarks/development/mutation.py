@@ -55,7 +55,7 @@ class Args:
     tests: tuple[str, ...] = ()
     """Test files and folders instead of those of all rooms."""
     budget: float = 20.0
-    """Time of the tests that a mutant is tried on, unchanged [s]; the quickest one is run in any case, as are `ALWAYS`."""
+    """Time of the tests that a mutant is tried on, unchanged [s]; the quickest one and `ALWAYS` are run in any case."""
     slowest: int = 60
     """Tests that take longer than this are left out [s]."""
     seconds: float | None = None
