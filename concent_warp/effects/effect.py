@@ -181,12 +181,11 @@ class Effect:
                 raise ModelError(f"{self.name} acts on the whole world", expected="no target", found=list(self.target))
             return
         known = _names(m, self.kind)
+        expected = f"{'bodies' if self.kind == 'body' else f'{self.kind}s'} among {known}"
         if unknown := [name for name in self.target if name not in known]:
-            raise ModelError(
-                f"{self.name} has an unknown target", expected=f"{self.kind}s among {known}", found=unknown
-            )
+            raise ModelError(f"{self.name} has an unknown target", expected=expected, found=unknown)
         if not self.target:
-            raise ModelError(f"{self.name} has no target", expected=f"{self.kind}s among {known}", found="none")
+            raise ModelError(f"{self.name} has no target", expected=expected, found="none")
         if unfit := [n for n, i in zip(self.target, self.ids(m), strict=True) if not self.applies_to(m, int(i))]:
             raise ModelError(f"{self.name} cannot act on these targets", expected=self.requirement, found=unfit)
 
