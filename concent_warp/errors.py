@@ -2,11 +2,42 @@
 
 from __future__ import annotations
 
+import unicodedata
+
+UNPRINTABLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
+"""Unicode categories of characters that steer a terminal or are not seen: control, format, surrogate, separators."""
+LONGEST_MESSAGE = 2000
+"""Characters of a message; of a longer one the middle is left out."""
+
+
+def printable(text: str) -> str:
+    r"""Return a text on one line, with escapes in place of characters that steer a terminal.
+
+    Example:
+        >>> from concent_warp.errors import printable
+        >>> printable("red" + chr(27) + "[31m")
+        'red\\x1b[31m'
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    line = " ".join(text.split("\n"))
+    shown = (ascii(c)[1:-1] if unicodedata.category(c) in UNPRINTABLE else c for c in line)
+    return "".join(shown)
+
+
+def _shortened(text: str) -> str:
+    """Return a message without its middle where it is very long."""
+    if len(text) <= LONGEST_MESSAGE:
+        return text
+    half = LONGEST_MESSAGE // 2 - 10
+    return f"{text[:half]} [...] {text[-half:]}"
+
 
 class ConcentError(ValueError):
     """An input or a setting that cannot be worked with.
 
-    The message is one sentence: where, what is wrong, what was expected and found, and what to do about it.
+    The message is one sentence: where, what is wrong, what was expected and found, and what to do about it. Control
+    characters in it, as in names that a file gives, are escaped.
     Subclasses name the kind of thing that is wrong, so that a library user can catch one kind.
 
     Example:
@@ -34,6 +65,7 @@ class ConcentError(ValueError):
             sentence += f", found {found}" if expected is not None else f"; found {found}"
         if fix is not None:
             sentence += f"; {fix}"
+        sentence = _shortened(printable(sentence))
         super().__init__(sentence if sentence.endswith((".", "?")) else sentence + ".")
 
 

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import SceneError
+from concent_warp.scene.read_mjcf import spec_from_file
 
 DH = (
     # a [m], d [m], alpha [rad]
@@ -109,12 +110,7 @@ class RobotCfg:
             return panda()
         if not self.path.is_file():
             raise SceneError("no such robot file", where=self.path, fix="check the path given with --robot")
-        try:
-            spec = mujoco.MjSpec.from_file(str(self.path))
-        except (ValueError, mujoco.FatalError) as error:
-            raise SceneError(
-                "MuJoCo cannot read this robot", where=self.path, found=" ".join(str(error).split())
-            ) from None
+        spec = spec_from_file(self.path)
         if spec.site(self.tcp_site) is None:
             sites = [site.name for site in spec.sites]
             raise SceneError(

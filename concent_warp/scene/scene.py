@@ -5,11 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 
 from concent_warp.errors import SceneError
+from concent_warp.scene.read_mjcf import compile_spec, readable, spec_from_file, spec_from_text
 
+if TYPE_CHECKING:
+    import trimesh
+
+MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
+"""Kinds of mesh files that a scene may name."""
 OBJECTS_TEXT = "concent_objects"
 """Name of the MJCF <text> element that lists the bodies to be given contact geometry."""
 
@@ -30,18 +38,17 @@ class Scene:
     """File or description of the origin, for messages."""
 
     @staticmethod
-    def from_mjcf(path: Path) -> Scene:
+    def from_mjcf(path: Path, *, warn_outside: bool = True) -> Scene:
         """Return the scene of an MJCF file, with includes and meshes written into the text.
 
-        Raises `SceneError` where the file is missing or MuJoCo cannot compile it.
+        Files that it reads from outside its folder are named in a warning, or refused without `warn_outside`.
+
+        Raises:
+            SceneError: The file is missing, MuJoCo cannot compile it, or it asks for more than `Limits` allow.
         """
         if not path.is_file():
             raise SceneError("no such MJCF file", where=path, fix="check the path given with --scene or --robot")
-        try:
-            spec = mujoco.MjSpec.from_file(str(path))
-            return _standalone(spec, str(path))
-        except (ValueError, mujoco.FatalError) as error:
-            raise SceneError("MuJoCo cannot read this MJCF", where=path, found=" ".join(str(error).split())) from None
+        return _standalone(spec_from_file(path, warn_outside=warn_outside), str(path))
 
     @staticmethod
     def from_spec(spec: mujoco.MjSpec, source: str = "<memory>") -> Scene:
@@ -50,22 +57,12 @@ class Scene:
 
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh spec that the caller may edit."""
-        try:
-            return mujoco.MjSpec.from_string(self.xml)
-        except (ValueError, mujoco.FatalError) as error:
-            raise SceneError(
-                "MuJoCo cannot read this MJCF", where=self.source, found=" ".join(str(error).split())
-            ) from None
+        return spec_from_text(self.xml, self.source)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled scene without contact geometry; not to be edited."""
-        try:
-            return self.spec().compile()
-        except (ValueError, mujoco.FatalError) as error:
-            raise SceneError(
-                "MuJoCo cannot compile this MJCF", where=self.source, found=" ".join(str(error).split())
-            ) from None
+        return compile_spec(self.spec(), self.source)
 
     def objects(self) -> tuple[str, ...]:
         """Return the names of the bodies that carry contact geometry.
@@ -94,23 +91,44 @@ def _standalone(spec: mujoco.MjSpec, source: str) -> Scene:
     A spec read from a file is not copied: the copy silently lacks actuators and sensors that refer to missing names,
     whereas compiling the spec itself raises an error.
     """
-    for mesh in spec.meshes:
-        _inline_mesh(spec, mesh)
-    spec.compile()
-    return Scene(spec.to_xml(), source)
+    with readable(source):
+        for mesh in spec.meshes:
+            _inline_mesh(spec, mesh)
+    compile_spec(spec, source)
+    with readable(source):
+        return Scene(spec.to_xml(), source)
 
 
 def _inline_mesh(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> None:
     """Replace a mesh file by its vertices and faces, so that the scene's text stands alone."""
     if not mesh.file:
         return
-    import trimesh
-
     path = Path(spec.modelfiledir) / (spec.meshdir or "") / mesh.file
     if not path.is_file():
         raise SceneError("the scene's mesh file is missing", where=path)
-    loaded = trimesh.load(path, force="mesh")
-    assert isinstance(loaded, trimesh.Trimesh)
+    loaded = _read_mesh(path)
     mesh.uservert = loaded.vertices.astype(float).ravel()
     mesh.userface = loaded.faces.astype(int).ravel()
     mesh.file = ""
+
+
+def _read_mesh(path: Path) -> trimesh.Trimesh:
+    """Return the triangles of a mesh file."""
+    import trimesh
+
+    if path.suffix.lower() not in MESHES:
+        raise SceneError(
+            "a mesh of the scene is of a kind that is not read",
+            where=path,
+            expected=f"one of {', '.join(MESHES)}",
+            found=path.suffix or "no suffix",
+            fix="export it as one of them",
+        )
+    try:
+        loaded = trimesh.load(path, force="mesh")
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise SceneError("a mesh of the scene cannot be read", where=path, found=found) from None
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces) or not np.isfinite(loaded.vertices).all():
+        raise SceneError("a mesh of the scene holds no triangles, or vertices that are not finite", where=path)
+    return loaded

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.bounds import MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
+from concent_warp.limits import limits, raising
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
@@ -84,7 +84,7 @@ def read_bam(path: Path | str, kp: float | None = None) -> Recording:
     if not path.exists():
         raise RecordingError("no such log or folder of logs", where=path, fix="check the path")
     paths = sorted(path.glob("*.json")) if path.is_dir() else [path]
-    if not 0 < len(paths) <= MAX_DEMONSTRATIONS:
+    if not 0 < len(paths) <= limits().demonstrations:
         raise RecordingError("no logs in the folder", where=path, expected=".json files", found=len(paths))
     logs = [(p, document, _setup_of(document, p)) for p in paths for document in [_read_document(p)]]
     gains = sorted({setup.kp for _, _, setup in logs})
@@ -178,14 +178,19 @@ def _column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:
 
 def _read_document(path: Path) -> dict[str, Any]:
     """Return the JSON document of a log, with its entries."""
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise RecordingError("the log is too large", where=path, expected=f"at most {MAX_FILE_BYTES} bytes")
+    if path.stat().st_size > limits().file_bytes:
+        raise RecordingError(
+            "the log is too large",
+            where=path,
+            expected=f"at most {limits().file_bytes} bytes",
+            fix=raising("file_bytes"),
+        )
     try:
         document = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RecordingError("not a JSON file", where=path, found=error) from None
     entries = document.get("entries") if isinstance(document, dict) else None
-    if not isinstance(entries, list) or not 2 <= len(entries) <= MAX_SAMPLES:
+    if not isinstance(entries, list) or not 2 <= len(entries) <= limits().samples:
         found = len(entries) if isinstance(entries, list) else type(entries).__name__
         raise RecordingError("not a log of a servo", where=path, expected="a list of at least 2 entries", found=found)
     return document

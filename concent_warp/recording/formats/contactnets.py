@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.bounds import MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
+from concent_warp.limits import limits
 from concent_warp.recording.naming import PREFIX, by_number
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
@@ -61,7 +61,7 @@ def read_contactnets(
     if not path.exists():
         raise RecordingError("no such toss or folder of tosses", where=path, fix="check the path")
     paths = sorted(path.glob("*.pt"), key=lambda p: by_number(p.stem))[:limit] if path.is_dir() else [path]
-    if not 0 < len(paths) <= MAX_DEMONSTRATIONS:
+    if not 0 < len(paths) <= limits().demonstrations:
         raise RecordingError("no tosses in the folder", where=path, expected=".pt files", found=len(paths))
     tosses = tuple(_toss(_read_rows(p), f"{PREFIX}{p.stem}", period) for p in paths)
     recording = Recording(_toss_scene(board_height), tosses, str(path))
@@ -121,9 +121,9 @@ def _read_rows(path: Path) -> np.ndarray:
     """Return the tensor of one toss, shape (T, 13)."""
     if not path.is_file():
         raise RecordingError("no such toss", where=path, expected="a .pt file", fix="check the path")
-    if not 0 < path.stat().st_size <= MAX_FILE_BYTES:
+    if not 0 < path.stat().st_size <= limits().file_bytes:
         raise RecordingError(
-            "not a toss", where=path, expected=f"1 to {MAX_FILE_BYTES} bytes", found=path.stat().st_size
+            "not a toss", where=path, expected=f"1 to {limits().file_bytes} bytes", found=path.stat().st_size
         )
     tensor = _load_tensor(path)
     import torch
@@ -132,7 +132,7 @@ def _read_rows(path: Path) -> np.ndarray:
         raise RecordingError("not a toss", where=path, expected="one tensor", found=type(tensor).__name__)
     shape = tuple(tensor.shape)
     plain = tensor.layout == torch.strided and tensor.device.type == "cpu" and tensor.is_floating_point()
-    if not plain or len(shape) != 2 or shape[1] != COLUMNS or not 2 <= shape[0] <= MAX_SAMPLES:
+    if not plain or len(shape) != 2 or shape[1] != COLUMNS or not 2 <= shape[0] <= limits().samples:
         raise RecordingError(
             "wrong shape of a toss", where=path, expected=f"(T, {COLUMNS}) floats", found=f"{shape} {tensor.dtype}"
         )

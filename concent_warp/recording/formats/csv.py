@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.errors import RecordingError, SceneError
-from concent_warp.recording.bounds import MAX_BYTES, MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_FILE_BYTES, MAX_SAMPLES
+from concent_warp.limits import limits, raising
 from concent_warp.recording.naming import PREFIX, by_number, name_of
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
@@ -49,8 +49,14 @@ def read_csv(folder: Path) -> Recording:
             expected=f"CSV files in {PREFIX}* folders only",
             fix="move them into the folder of their demonstration",
         )
-    if len(nested) > MAX_DEMONSTRATIONS:
-        raise RecordingError("too many demonstrations", where=folder, expected=MAX_DEMONSTRATIONS, found=len(nested))
+    if len(nested) > limits().demonstrations:
+        raise RecordingError(
+            "too many demonstrations",
+            where=folder,
+            expected=limits().demonstrations,
+            fix=raising("demonstrations"),
+            found=len(nested),
+        )
     for demonstration in nested:
         if (demonstration / SCENE).exists():
             raise RecordingError("a demonstration has a scene of its own", where=demonstration, fix=f"remove {SCENE}")
@@ -73,8 +79,13 @@ def _check_size(folder: Path) -> None:
     for path in folder.rglob("*.csv"):
         size = path.stat().st_size
         total += size
-        if size > MAX_FILE_BYTES or total > MAX_BYTES:
-            raise RecordingError("the CSV files are too large", where=path, expected=f"{MAX_FILE_BYTES} bytes a file")
+        if size > limits().file_bytes or total > limits().recording_bytes:
+            raise RecordingError(
+                "the CSV files are too large",
+                where=path,
+                expected=f"{limits().file_bytes} bytes a file",
+                fix=raising("file_bytes"),
+            )
 
 
 def _read_demonstration(folder: Path, name: str) -> Demonstration:
@@ -87,8 +98,14 @@ def _read_demonstration(folder: Path, name: str) -> Demonstration:
         raise RecordingError(
             "the folder has no CSV files", where=folder, expected="measured_<sensor>.csv or action_<actuator>.csv"
         )
-    if len(paths) > MAX_CHANNELS:
-        raise RecordingError("too many CSV files", where=folder, expected=f"at most {MAX_CHANNELS}", found=len(paths))
+    if len(paths) > limits().channels:
+        raise RecordingError(
+            "too many CSV files",
+            where=folder,
+            expected=f"at most {limits().channels}",
+            fix=raising("channels"),
+            found=len(paths),
+        )
     for path in paths:
         kind, _, channel = path.stem.partition("_")
         if path.name == INITIAL:
@@ -152,12 +169,15 @@ def _read_state(path: Path) -> dict[str, np.ndarray]:
 
 def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, each with its line number."""
+    most = limits().samples
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             for cells in reader:
-                if reader.line_num > MAX_SAMPLES:
-                    raise RecordingError("too many rows", where=path, expected=f"at most {MAX_SAMPLES}")
+                if reader.line_num > most:
+                    raise RecordingError(
+                        "too many rows", where=path, expected=f"at most {most}", fix=raising("samples")
+                    )
                 if cells:
                     yield reader.line_num, cells
     except (csv.Error, UnicodeDecodeError, OSError) as error:

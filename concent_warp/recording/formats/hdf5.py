@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from concent_warp.errors import RecordingError, SceneError
-from concent_warp.recording.bounds import MAX_CHANNELS, MAX_DEMONSTRATIONS, MAX_SCENE_BYTES
+from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.hdf5_access import SafeFile
 from concent_warp.recording.formats.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
@@ -155,9 +155,13 @@ class Reader(SafeFile):
         self.refuse_unknown(file, {"scene", "data"})
         scene = self.scene(file)
         data = self.group(file, "data")
-        if len(data) > MAX_DEMONSTRATIONS:
+        if len(data) > limits().demonstrations:
             raise self.error(
-                "too many demonstrations", "data", expected=f"at most {MAX_DEMONSTRATIONS}", found=len(data)
+                "too many demonstrations",
+                "data",
+                expected=f"at most {limits().demonstrations}",
+                fix=raising("demonstrations"),
+                found=len(data),
             )
         names = sorted(data.keys(), key=by_number)
         return Recording(scene, tuple(self.demonstration(self.group(data, n), n) for n in names), str(self.path))
@@ -171,7 +175,7 @@ class Reader(SafeFile):
                     "the scene must lie beside the recording", "attribute path", expected="a file name", found=beside
                 )
             try:
-                return Scene.from_mjcf(self.path.parent / beside).xml
+                return Scene.from_mjcf(self.path.parent / beside, warn_outside=False).xml
             except SceneError as error:
                 raise self.error("its scene cannot be read", "attribute path", found=str(error).rstrip(".")) from None
         if "scene" not in file:
@@ -182,8 +186,14 @@ class Reader(SafeFile):
             raise self.error(
                 "the scene is not text", "scene", expected="one string", found=f"{dataset.shape} {dataset.dtype}"
             )
-        if (kind.length or 0) > MAX_SCENE_BYTES:
-            raise self.error("the scene is too long", "scene", expected=f"{MAX_SCENE_BYTES} bytes", found=kind.length)
+        if (kind.length or 0) > limits().scene_bytes:
+            raise self.error(
+                "the scene is too long",
+                "scene",
+                expected=f"{limits().scene_bytes} bytes",
+                fix=raising("scene_bytes"),
+                found=kind.length,
+            )
         return self.decode(self.bounded(lambda: dataset[()], "scene"), "scene")
 
     def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
@@ -213,8 +223,14 @@ class Reader(SafeFile):
         if kind not in group:
             return {}
         parent = self.group(group, kind)
-        if len(parent) > MAX_CHANNELS:
-            raise self.error("too many channels", parent.name, expected=f"at most {MAX_CHANNELS}", found=len(parent))
+        if len(parent) > limits().channels:
+            raise self.error(
+                "too many channels",
+                parent.name,
+                expected=f"at most {limits().channels}",
+                fix=raising("channels"),
+                found=len(parent),
+            )
         return {name_of(str(name)): read(self.group(parent, str(name))) for name in parent}
 
     def channel(self, group: h5py.Group) -> Channel:

@@ -17,15 +17,8 @@ import h5py.h5z as h5z
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.bounds import (
-    MAX_BYTES,
-    MAX_CHANNELS,
-    MAX_CHUNK_BYTES,
-    MAX_INFLATION,
-    MAX_SAMPLES,
-    MAX_SCENE_BYTES,
-    MAX_TEXT_BYTES,
-)
+from concent_warp.limits import limits, raising
+from concent_warp.recording.bounds import MAX_INFLATION
 from concent_warp.recording.formats.hdf5_heap import memory_bound
 
 KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_LZF}
@@ -41,7 +34,7 @@ class SafeFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.left = MAX_BYTES
+        self.left = limits().recording_bytes
 
     def error(self, what: str, entry: str | None, **details: Any) -> RecordingError:
         """Return the error about an entry of the file."""
@@ -53,15 +46,23 @@ class SafeFile:
         entry = f"{group.name}/{name}"
         if dataset.dtype.kind not in KINDS[dtype] or (dtype is np.uint8 and dataset.dtype != np.uint8):
             raise self.error("wrong kind of data", entry, expected=np.dtype(dtype), found=dataset.dtype)
-        if dataset.shape is None or len(dataset.shape) not in range(1, 5) or dataset.shape[0] > MAX_SAMPLES:
+        if dataset.shape is None or len(dataset.shape) not in range(1, 5) or dataset.shape[0] > limits().samples:
             raise self.error(
-                "wrong shape", entry, expected=f"1 to 4 axes, at most {MAX_SAMPLES} samples", found=dataset.shape
+                "wrong shape",
+                entry,
+                expected=f"1 to 4 axes, at most {limits().samples} samples",
+                fix=raising("samples"),
+                found=dataset.shape,
             )
         count = math.prod(dataset.shape)
         self.left -= count * max(np.dtype(dtype).itemsize, dataset.dtype.itemsize)
         if self.left < 0:
             raise self.error(
-                "the recording is too large", entry, expected=f"at most {MAX_BYTES} bytes in all", found=dataset.shape
+                "the recording is too large",
+                entry,
+                expected=f"at most {limits().recording_bytes} bytes in all",
+                fix=raising("recording_bytes"),
+                found=dataset.shape,
             )
         stored, size = dataset.id.get_storage_size(), self.path.stat().st_size
         if stored > size or count * dataset.dtype.itemsize > MAX_INFLATION * stored:
@@ -80,9 +81,13 @@ class SafeFile:
         if dataset.external or dataset.is_virtual:
             raise self.error("its data lie in another file", entry, fix="write them into the recording")
         chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
-        if chunk > MAX_CHUNK_BYTES:
+        if chunk > limits().chunk_bytes:
             raise self.error(
-                "its chunks are too large", entry, expected=f"at most {MAX_CHUNK_BYTES} bytes", found=chunk
+                "its chunks are too large",
+                entry,
+                expected=f"at most {limits().chunk_bytes} bytes",
+                fix=raising("chunk_bytes"),
+                found=chunk,
             )
         filters = dataset.id.get_create_plist()
         codes = [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
@@ -110,7 +115,7 @@ class SafeFile:
 
     def refuse_unknown(self, group: h5py.Group, known: set[str]) -> None:
         """Refuse a group with entries that would be passed over in silence."""
-        unknown = [name for name, _ in zip(group, range(MAX_CHANNELS), strict=False) if name not in known][:5]
+        unknown = [name for name, _ in zip(group, range(limits().channels), strict=False) if name not in known][:5]
         if unknown:
             raise self.error("unknown entries", group.name, expected=f"only {sorted(known)}", found=unknown)
 
@@ -119,7 +124,7 @@ class SafeFile:
         if name not in item.attrs:
             return None
         identifier = item.attrs.get_id(name)
-        if identifier.get_storage_size() > MAX_TEXT_BYTES:
+        if identifier.get_storage_size() > limits().text_bytes:
             raise self.error("an attribute is too large", f"{item.name}, attribute {name}")
         if h5py.check_string_dtype(identifier.dtype) is None:
             return item.attrs[name]
@@ -128,10 +133,15 @@ class SafeFile:
     def bounded(self, read: Callable[[], Any], entry: str) -> Any:
         """Return what `read` reads, a string whose length is not known before."""
         try:
-            with memory_bound(2 * MAX_SCENE_BYTES):
+            with memory_bound(2 * limits().scene_bytes):
                 return read()
         except MemoryError:
-            raise self.error("the text is too long", entry, expected=f"at most {MAX_SCENE_BYTES} bytes") from None
+            raise self.error(
+                "the text is too long",
+                entry,
+                expected=f"at most {limits().scene_bytes} bytes",
+                fix=raising("scene_bytes"),
+            ) from None
 
     def text_attribute(self, item: h5py.Group, name: str) -> str | None:
         """Return a text attribute, or None."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from xml.etree import ElementTree
 
-from concent_warp.recording.bounds import MAX_SCENE_BYTES, MAX_SCENE_COPIES
+from concent_warp.limits import limits, raising
 from concent_warp.recording.validation.location import ErrorLocation
 
 FREE_TEXT = ("name", "class", "data")
@@ -18,8 +18,13 @@ def check_scene_text(text: str, place: ErrorLocation) -> None:
     Raises:
         RecordingError: With the element that is at fault.
     """
-    if len(text) > MAX_SCENE_BYTES:
-        raise place.error("the scene's MJCF is too long", expected=f"at most {MAX_SCENE_BYTES} bytes", found=len(text))
+    if len(text) > limits().scene_bytes:
+        raise place.error(
+            "the scene's MJCF is too long",
+            expected=f"at most {limits().scene_bytes} bytes",
+            fix=raising("scene_bytes"),
+            found=len(text),
+        )
     if not text.strip():
         raise place.error("the scene is empty", expected="MJCF text", fix="write the MJCF into the recording")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -48,9 +53,12 @@ def _check_element(element: ElementTree.Element, copies: int, place: ErrorLocati
             copies *= math.prod(max(int(n), 1) for n in element.get("count", "1").split())
         except ValueError:
             raise place.error(f"<{element.tag}> has no whole count", found=element.get("count")) from None
-        if copies > MAX_SCENE_COPIES:
+        if copies > limits().scene_copies:
             raise place.error(
-                f"<{element.tag}> asks for too many copies", expected=f"at most {MAX_SCENE_COPIES}", found=copies
+                f"<{element.tag}> asks for too many copies",
+                expected=f"at most {limits().scene_copies}",
+                fix=raising("scene_copies"),
+                found=copies,
             )
     for key, value in element.attrib.items():
         if key not in FREE_TEXT and _not_finite(value):

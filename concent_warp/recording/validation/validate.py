@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.recording.bounds import MAX_MAGNITUDE, MAX_SAMPLES
+from concent_warp.limits import limits, raising
+from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.recording.validation.clocks import check_clocks
@@ -175,8 +176,10 @@ def _check_time(time: np.ndarray, place: ErrorLocation) -> None:
     time = np.asarray(time)
     if time.ndim != 1 or time.dtype.kind not in "fiu":
         raise place.error("wrong shape of time", expected="(T,) numbers", found=f"{time.shape} {time.dtype}")
-    if not 0 < len(time) <= MAX_SAMPLES:
-        raise place.error("wrong number of samples", expected=f"1 to {MAX_SAMPLES}", found=len(time))
+    if not 0 < len(time) <= limits().samples:
+        raise place.error(
+            "wrong number of samples", expected=f"1 to {limits().samples}", fix=raising("samples"), found=len(time)
+        )
     if (bad := _first(~(np.abs(time) <= MAX_MAGNITUDE))) is not None:
         raise place.error("time is not finite", row=bad, expected="seconds", found=time[bad])
     if time[0] < 0:
