@@ -18,7 +18,7 @@ from concent_warp.limits import limits, raising
 
 PROGRAM = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from concent_warp.scene.trial_compile import child; child()"
+    "from concent_warp.scene.trial_process import compile_given; compile_given()"
 )
 """What the process runs; it finds the same packages as this one."""
 SAID = "the scene: "
@@ -85,31 +85,3 @@ def try_compile(source: str, *, path: Path | None = None, text: str | None = Non
         raise SceneError(
             "MuJoCo crashes when it compiles this scene", where=source, found=name, fix="simplify the MJCF"
         )
-
-
-def child() -> None:
-    """Compile the scene that the arguments of this process name, or that standard input holds."""
-    memory, name = int(sys.argv[2]), sys.argv[3]
-    from concent_warp.scene.scene import Scene
-
-    _bound_memory(memory)
-    try:
-        if name:
-            Scene.from_mjcf(Path(name))
-        else:
-            assert Scene(sys.stdin.read()).model.nbody
-    except SceneError as error:
-        print(SAID + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(1)
-
-
-def _bound_memory(extra: int) -> None:
-    """Let this process allocate at most `extra` bytes more, where the system has such a limit; leave no core file."""
-    try:
-        import resource
-    except ImportError:
-        return
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    usage = Path("/proc/self/statm")
-    used = int(usage.read_text().split()[0]) * resource.getpagesize() if usage.is_file() else 1 << 30
-    resource.setrlimit(resource.RLIMIT_AS, (used + extra, used + extra))
