@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from small_worlds import BALL, BLOCK, move, world
 
-from concent_warp.effects.library.geometry import ContactGeometryOffset
+from concent_warp.effects.library.geometry import FACES, ContactGeometryOffset, Offsets, _extent, _resized
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -142,3 +142,57 @@ def test_ball_with_all_faces_out_rests_higher():
     plain = move(world(BALL), 0.5, qpos=[0, 0, 0.05, 1, 0, 0, 0]).qpos[-1, 2]
     grown = move(world(BALL).add(EFFECT, [2 * MM] * 6), 0.5, qpos=[0, 0, 0.052, 1, 0, 0, 0]).qpos[-1, 2]
     assert grown - plain == pytest.approx(2 * MM, abs=2e-5)
+
+
+def test_points_between_faces_move_by_shares_and_those_at_a_face_with_it():
+    offsets = Offsets(np.array([-1.0, -2.0, 0.0]), np.array([1.0, 2.0, 0.0]), np.array([[1, 2, 3], [4, 5, 6]]) * 0.1)
+    middle = np.array([0.1 - 0.4, 0.2 - 0.5, 0.3 - 0.6]) / 2
+    np.testing.assert_allclose(offsets.at(np.zeros(3)), middle)
+    np.testing.assert_allclose(offsets.at(np.array([1.0, 9.0, 0.0])), [0.1, 0.2, middle[2]])
+    np.testing.assert_allclose(offsets.at(np.array([-1.0, -9.0, 0.0])), [-0.4, -0.5, middle[2]])
+    np.testing.assert_allclose(offsets.at(np.array([0.5, 0.0, 0.0]))[0], 0.75 * 0.1 - 0.25 * 0.4)
+    np.testing.assert_allclose(offsets.at(np.array([0.4, 1.5, 0.0]), 0.5), [0.9 * 0.1 - 0.1 * 0.4, 0.2, middle[2]])
+    np.testing.assert_allclose(offsets.at(np.array([0.9, 0.0, 0.0]), 1.0)[0], middle[0])
+    assert FACES == ("x+", "y+", "z+", "x-", "y-", "z-")
+
+
+def test_shapes_of_each_kind_grow_by_the_change_of_their_reach():
+    size, change, kind = np.array([0.1, 0.2, 0.3]), np.array([0.01, 0.03, 0.05]), mujoco.mjtGeom
+    grown = {k: _resized(int(k), size, change) - size for k in (kind.mjGEOM_SPHERE, kind.mjGEOM_BOX)}
+    np.testing.assert_allclose(grown[kind.mjGEOM_SPHERE], [0.03, 0, 0])
+    np.testing.assert_allclose(grown[kind.mjGEOM_BOX], change)
+    np.testing.assert_allclose(_resized(int(kind.mjGEOM_CYLINDER), size, change) - size, [0.02, 0.05, 0])
+    np.testing.assert_allclose(_resized(int(kind.mjGEOM_CAPSULE), size, change) - size, [0.02, 0.03, 0])
+    np.testing.assert_allclose(_resized(int(kind.mjGEOM_ELLIPSOID), size, change) - size, change)
+
+
+def test_a_shape_moves_by_what_its_ends_do_and_a_small_one_as_a_whole():
+    geoms = """<geom type="box" size=".1 .2 .3"/><geom type="box" size=".01 .01 .01" pos=".05 .1 .1"/>
+      <geom type="sphere" size=".06" pos=".02 0 0"/><geom type="box" size=".2 .1 .3" euler="0 0 90"/>
+      <geom type="cylinder" size=".1 .15" euler="90 0 0"/>"""
+    m = Model(Scene(f'<mujoco><worldbody><body name="t"><freejoint/>{geoms}</body></worldbody></mujoco>')).compile()
+    values = np.array([1.0, 2.0, 3.0, 0.5, -1.0, 4.0]) * 1e-3
+    offsets = Offsets.of(m, m.body("t").id, values)
+    np.testing.assert_allclose([offsets.low, offsets.high], [[-0.1, -0.2, -0.3], [0.1, 0.2, 0.3]])
+    center = (values[:3] - values[3:]) / 2
+    grown = (values[:3] + values[3:]) / 2
+    position, quaternion, size = offsets.moved(m, 0)
+    np.testing.assert_allclose(position, center)
+    np.testing.assert_allclose(size, np.array([0.1, 0.2, 0.3]) + grown)
+    np.testing.assert_array_equal(quaternion, [1, 0, 0, 0])
+    position, _, size = offsets.moved(m, 1)
+    np.testing.assert_allclose(position - [0.05, 0.1, 0.1], offsets.at(np.array([0.05, 0.1, 0.1]), 0.015))
+    np.testing.assert_allclose(size, 0.01)
+    position, _, size = offsets.moved(m, 2)
+    ends = [offsets.at(np.array([0.02, 0, 0]) + s * 0.06) for s in (1, -1)]
+    np.testing.assert_allclose(position - [0.02, 0, 0], (ends[0] + ends[1]) / 2)
+    assert size[0] == pytest.approx(0.06 + np.mean(ends[0] - ends[1]) / 2)
+    _, quaternion, size = offsets.moved(m, 3)
+    np.testing.assert_allclose(size, np.array([0.2, 0.1, 0.3]) + grown[[1, 0, 2]])
+    np.testing.assert_array_equal(quaternion, m.geom_quat[3])
+    _, _, size = offsets.moved(m, 4)
+    ends = [offsets.at(s * np.array([0.1, 0.15, 0.1])) for s in (1, -1)]
+    change = (ends[0] - ends[1]) / 2
+    np.testing.assert_allclose(size[:2], [0.1 + (change[0] + change[2]) / 2, 0.15 + change[1]])
+    np.testing.assert_allclose(_extent(m, 4), [0.1, 0.15, 0.1], atol=1e-9)
+    np.testing.assert_allclose(_extent(m, 2), [0.06] * 3)

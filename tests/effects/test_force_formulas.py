@@ -143,7 +143,7 @@ def pull(m: mujoco.MjModel, d: mujoco.MjData, body: int, strength: float, gap: f
     for g in np.flatnonzero(m.geom_bodyid == body):
         if not m.geom_contype[g]:
             continue
-        points, radius = points_of(m, g)
+        points, radius = points_of(m, int(g))
         turn = d.geom_xmat[g].reshape(3, 3)
         for point in d.geom_xpos[g] + points @ turn.T:
             normals = []

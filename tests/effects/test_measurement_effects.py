@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_worlds import BLOCK, PENDULUM, G, world
 
+from concent_warp.effects.effect import Effect
 from concent_warp.effects.library.measurement import FrameOffset, Latency, LengthScale, SensorBias, SensorGain, TimeBase
 
 HALF = np.pi / 2
@@ -69,3 +71,59 @@ def test_frame_leaves_gaps_as_gaps():
 )
 def test_bias_adds_and_gain_multiplies(effect, expected):
     np.testing.assert_allclose(reading(PENDULUM, effect("encoder"), [0.05], "encoder")[:, 0], expected)
+
+
+def seen(effect: Effect, values: list[float], xml: str, sensor: str) -> np.ndarray:
+    """Return what an effect reads of a body at (t, 2 t, 3), an orientation about x by t, or an angle t^2."""
+
+    def read(name: str, time: np.ndarray) -> np.ndarray:
+        if name == "position":
+            return np.stack([time, 2 * time, np.full_like(time, 3)], axis=1)
+        if name == "orientation":
+            return np.stack([np.cos(time / 2), np.sin(time / 2), 0 * time, 0 * time], axis=1)
+        return (time**2)[:, None]
+
+    return effect.measure(world(xml).compile(), read, np.array(values))(sensor, np.array([0.5, 1.0, 2.0]))
+
+
+T = np.array([0.5, 1.0, 2.0])
+
+
+def test_clocks_delays_scales_and_biases_change_the_reading_of_their_sensors_alone():
+    plain = seen(Latency("other"), [0.1], PENDULUM, "encoder")[:, 0]
+    np.testing.assert_array_equal(plain, T**2)
+    for effect, value, expected in (
+        (TimeBase, 0.25, (T / 1.25) ** 2),
+        (Latency, 0.25, (T - 0.25) ** 2),
+        (SensorBias, 0.25, T**2 + 0.25),
+        (SensorGain, 0.25, T**2 * 1.25),
+    ):
+        np.testing.assert_allclose(seen(effect("encoder"), [value], PENDULUM, "encoder")[:, 0], expected)
+        np.testing.assert_array_equal(seen(effect("other"), [value], PENDULUM, "encoder")[:, 0], plain)
+    position = np.stack([T, 2 * T, np.full(3, 3.0)], axis=1)
+    np.testing.assert_allclose(seen(LengthScale("position"), [0.25], BLOCK, "position"), 1.25 * position)
+    np.testing.assert_array_equal(seen(LengthScale("position"), [0.25], BLOCK, "orientation")[:, 2:], 0)
+
+
+def test_a_frame_turns_about_its_rotation_vector_and_shifts_then():
+    values = [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
+    turn = Rotation.from_rotvec(values[3:])
+    position = np.stack([T, 2 * T, np.full(3, 3.0)], axis=1)
+    both = FrameOffset("position", "orientation")
+    np.testing.assert_allclose(seen(both, values, BLOCK, "position"), turn.apply(position) + values[:3])
+    quaternions = seen(both, values, BLOCK, "orientation")
+    expected = turn * Rotation.from_rotvec(np.outer(T, [1, 0, 0]))
+    assert np.abs((quaternions * expected.as_quat(scalar_first=True)).sum(axis=1)) == pytest.approx(np.ones(3))
+    np.testing.assert_array_equal(seen(FrameOffset("orientation"), values, BLOCK, "position"), position)
+
+
+def test_a_frame_keeps_readings_that_are_no_orientation():
+    rows = np.array([[1.0, 0, 0, 0], [0, 0, 0, 0], [np.nan, 0, 0, 0], [0, 0, -1.0, 0]])
+    effect = FrameOffset("orientation")
+    read = effect.measure(world(BLOCK).compile(), lambda _s, _t: rows, np.array([0, 0, 0, 0, 0, np.pi]))
+    found = read("orientation", np.zeros(4))
+    np.testing.assert_allclose(np.abs(found[0]), [0, 0, 0, 1], atol=1e-12)
+    np.testing.assert_array_equal(found[1:3], rows[1:3])
+    np.testing.assert_allclose(np.abs(found[3]), [0, 1, 0, 0], atol=1e-12)
+    lost = effect.measure(world(BLOCK).compile(), lambda _s, _t: rows[1:3], np.full(6, 0.1))
+    np.testing.assert_array_equal(lost("orientation", np.zeros(2)), rows[1:3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -137,7 +138,7 @@ def test_values_are_given_by_name_or_in_order_and_others_are_null():
     tilt = GravityTilt()
     assert checked_values(tilt, m, None) == (0.0, 0.0)
     assert checked_values(tilt, m, {"y": 0.1}) == (0.0, 0.1)
-    assert checked_values(tilt, m, np.array([0.5, -0.5])) == (0.5, -0.5)
+    assert checked_values(tilt, m, [0.5, -0.5]) == (0.5, -0.5)
     infinite = effect_class("actuator_saturation")("drive")
     assert checked_values(infinite, m, [np.inf]) == (np.inf,)
     for values, words in (
@@ -304,13 +305,16 @@ def test_effects_prepare_an_mjcf_all_before_any_edits_it_and_write_in_their_orde
     done = []
 
     class Noted(JointDamping):
-        def prepare(self, _):
+        def prepare(self, spec):
+            del spec
             done.append(("prepare", self.target[0]))
 
-        def edit(self, _, values):
+        def edit(self, spec, values):
+            del spec
             done.append(("edit", self.target[0], values.tolist()))
 
-        def write(self, _, values):
+        def write(self, m, values):
+            del m
             done.append(("write", self.target[0], values.tolist()))
 
     added = [AddedEffect(Noted("a"), (1.0,)), AddedEffect(Noted("b"), (2.0,))]
@@ -334,11 +338,12 @@ def test_force_models_are_equal_where_they_are_of_one_class_and_act_on_the_same(
 
 def test_a_force_model_without_a_kernel_says_so():
     class Wind(ForceModel):
-        def apply(self, _, d, values):
+        def apply(self, m, d, values):
+            del m
             d.qfrc_applied[:] = values
 
     with pytest.raises(EngineError, match=r"Wind cannot run on MuJoCo-Warp.*use the mujoco engine"):
-        Wind().launch(None, None, None)
+        Wind().launch(*cast("tuple[Any, Any, Any]", (None, None, None)))
     m = world(PENDULUM).compile()
     d = mujoco.MjData(m)
     act = Wind().bound(m, d, np.array([2.0]))

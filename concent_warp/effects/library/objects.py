@@ -133,9 +133,9 @@ class Size(BodyEffect):
 
 
 def keep_inertia(body: mujoco.MjsBody, compiled: mujoco.MjModel) -> None:
-    """Set mass and inertia of a body to those it was compiled with, independent of its geoms."""
+    """Set mass and inertia of a body to those it was compiled with, however the MJCF gives them."""
     b = compiled.body(body.name).id
-    body.explicitinertial = True
+    body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
     body.mass, body.inertia = float(compiled.body_mass[b]), compiled.body_inertia[b]
     body.ipos, body.iquat = compiled.body_ipos[b], compiled.body_iquat[b]
 
