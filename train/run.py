@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from concent_warp.errors import TrainError
 from concent_warp.events.extract import extract
@@ -95,7 +97,7 @@ def train_run(
     report: Report | None = None,
     seconds: float | None = None,
     process: DistributedProcess | None = None,
-    begin_with: Path | None = None,
+    begin_with: Mapping[str, Any] | None = None,
 ) -> tuple[Trainer, Iteration | None]:
     """Train, and return the trainer and its last iteration.
 
@@ -108,7 +110,7 @@ def train_run(
         seconds: Time after which to stop [s].
         process: This process of a data-parallel training, within its group; a single process by default. Each rank
             simulates `run.cfg.environment.worlds` worlds.
-        begin_with: Checkpoint of the initial policy, unless a training is resumed.
+        begin_with: Checkpoint of the initial policy as `load_checkpoint` returns it, unless a training is resumed.
 
     Raises:
         TrainError: The folder's training was started with other settings, or the initial policy has another

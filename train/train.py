@@ -12,7 +12,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
-from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
+from concent_warp.train.learning.ppo import Iteration
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -83,6 +83,6 @@ def train(
             report=progress,
             seconds=seconds,
             process=process,
-            begin_with=None if begin_with is None else begin_with.folder / CHECKPOINT,
+            begin_with=None if begin_with is None else begin_with.weights,
         )
     return Policy(run, trainer.weights(), folder or Path())

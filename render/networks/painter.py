@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 
+from concent_warp.checkpoint_file import check_state
 from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
@@ -14,6 +16,8 @@ from concent_warp.render.networks.flow import sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.super_resolution import SuperResolution, reduced
 from concent_warp.render.networks.train import CHECKPOINT, ENLARGE, load_checkpoint, network_of
+
+Network = TypeVar("Network", bound=torch.nn.Module)
 
 
 class Painter:
@@ -55,18 +59,27 @@ class Painter:
             RenderError: There is nothing of the kind.
         """
         path = folder / CHECKPOINT if folder.is_dir() else folder
-        state = load_checkpoint(path, device)
-        cfg, sizes = state["cfg"], state["cfg"]["network"]
-        base = FlowNetworkCfg(**sizes)
+        state = load_checkpoint(path)
         networks, references, cameras = {}, {}, {}
-        for described, reference in zip(state["cameras"], state["references"], strict=True):
-            camera = Camera(**described)
-            network = FlowNetwork(network_of(base, camera))
-            network.load_state_dict(_averaged(state["trainings"][camera.name]["mean"]))
-            networks[camera.name], references[camera.name] = network.to(device).eval(), reference.to(device)
-            cameras[camera.name] = camera
-        enlarge = SuperResolution(SuperResolutionCfg(**cfg["super_resolution"]))
-        enlarge.load_state_dict(_averaged(state["trainings"][ENLARGE]["mean"]))
+        try:
+            cfg, trainings = state["cfg"], state["trainings"]
+            base = FlowNetworkCfg(**cfg["network"])
+            for described, reference in zip(state["cameras"], state["references"], strict=True):
+                camera = Camera(**described)
+                sizes = network_of(base, camera)
+                networks[camera.name] = _averaged(lambda sizes=sizes: FlowNetwork(sizes), trainings[camera.name], path)
+                if tuple(reference.shape) != (3, base.size, base.size):
+                    raise ValueError(f"a mean image of shape {tuple(reference.shape)}")
+                references[camera.name], cameras[camera.name] = reference.to(device), camera
+            enlarge = _averaged(
+                lambda: SuperResolution(SuperResolutionCfg(**cfg["super_resolution"])), trainings[ENLARGE], path
+            )
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            if isinstance(error, RenderError):
+                raise
+            found = " ".join(str(error).split())[:200] or type(error).__name__
+            raise RenderError("the networks cannot be read", where=path, found=found) from None
+        networks = {name: network.to(device).eval() for name, network in networks.items()}
         return Painter(networks, references, cameras, enlarge.to(device).eval(), steps=steps, seed=seed, half=half)
 
     def begin(self, worlds: int, which: torch.Tensor | None = None) -> None:
@@ -120,6 +133,16 @@ class Painter:
         return self._previous[camera]
 
 
-def _averaged(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the weights of the model that an `AveragedModel` keeps."""
-    return {name.removeprefix("module."): value for name, value in state.items() if name.startswith("module.")}
+def _averaged(make: Callable[[], Network], training: dict[str, Any], path: Path) -> Network:
+    """Return a network with the running means of the weights, which an `AveragedModel` keeps.
+
+    Raises:
+        RenderError: They are not those of such a network; its memory is not allocated then.
+    """
+    mean = {name.removeprefix("module."): v for name, v in training["mean"].items() if name.startswith("module.")}
+    with torch.device("meta"):
+        expected = make().state_dict()
+    check_state(mean, expected, "a network", where=path, error=RenderError)
+    network = make()
+    network.load_state_dict(mean)
+    return network

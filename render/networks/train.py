@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from concent_warp.checkpoint_file import read_checkpoint, write_checkpoint
 from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
@@ -204,9 +205,7 @@ class RenderTraining:
         }
         if self.device.type == "cuda":
             state["random of the device"] = torch.cuda.get_rng_state(self.device)
-        partial = self.folder / f".{CHECKPOINT}.partial"
-        torch.save(state, partial)
-        partial.replace(self.folder / CHECKPOINT)
+        write_checkpoint(self.folder / CHECKPOINT, state)
 
     def resume(self) -> None:
         """Restore the folder's checkpoint.
@@ -215,7 +214,7 @@ class RenderTraining:
             RenderError: It was begun with other settings, or of other cameras.
         """
         assert self.folder is not None
-        state = load_checkpoint(self.folder / CHECKPOINT, str(self.device))
+        state = load_checkpoint(self.folder / CHECKPOINT)
         before, now = _flat(state["cfg"]), _flat(asdict(self.cfg))
         differing = [n for n in sorted(before | now) if before.get(n) != now.get(n) and n not in FREE]
         names = [camera["name"] for camera in state["cameras"]]
@@ -255,22 +254,17 @@ def _small_pairs(pairs: ImagePairs, size: int) -> ImagePairs:
     return replace(pairs, real=less(pairs.real), simulated=less(pairs.simulated))
 
 
-def load_checkpoint(path: Path, device: str) -> dict[str, Any]:
-    """Read a checkpoint, as data and never as code.
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Return a checkpoint, with its tensors on the CPU.
 
     Raises:
-        RenderError: It is missing or no checkpoint of these networks.
+        RenderError: It is missing or no checkpoint of these networks, holds more than tensors and plain data, or has
+            weights that are not finite.
     """
-    if not path.is_file():
+    if not path.exists():
         raise RenderError("there are no trained networks", where=path, fix="train them with concent render-train")
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-        if not {"trainings", "cfg", "cameras", "references"} <= set(state):
-            raise KeyError("it holds no networks")
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RenderError("the networks cannot be read", where=path, found=reason[:200]) from None
-    return state
+    keys = ("trainings", "cfg", "cameras", "references")
+    return read_checkpoint(path, keys=keys, finite=("trainings", "references"), error=RenderError)
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

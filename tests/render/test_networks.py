@@ -137,7 +137,7 @@ def test_networks_that_are_not_there_or_broken_are_said_in_a_sentence(tmp_path):
     with pytest.raises(RenderError, match="no trained networks"):
         Painter.load(tmp_path)
     (tmp_path / "checkpoint.pt").write_bytes(b"no networks")
-    with pytest.raises(RenderError, match="cannot be read"):
+    with pytest.raises(RenderError, match="not a checkpoint"):
         Painter.load(tmp_path)
 
 

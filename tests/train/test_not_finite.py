@@ -137,6 +137,6 @@ def test_training_that_diverges_stops_and_keeps_its_last_checkpoint(task, states
 
     with pytest.raises(TrainError, match="losses or weights are not finite"):
         trainer.learn(spoil)
-    saved = torch.load(tmp_path / CHECKPOINT, weights_only=False)
+    saved = torch.load(tmp_path / CHECKPOINT, weights_only=True)
     assert 2 <= saved["iteration"] < 8
     assert all(torch.isfinite(weight).all() for weight in saved["actor_state_dict"].values())

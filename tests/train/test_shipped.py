@@ -71,14 +71,14 @@ def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_sma
         assert origin["steps"] > 0
         assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
         run = TrainingRun.load(FOLDER / name)
-        weights = torch.load(pretrained_checkpoint(name), weights_only=False)["actor_state_dict"]
+        weights = torch.load(pretrained_checkpoint(name), weights_only=True)["actor_state_dict"]
         assert weights["obs_normalizer._mean"].shape[1] == ObservationLayout.of(run.task()).size
 
 
 def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_path):
     assert main(["export", "--checkpoint", str(folder), "--as-pretrained", "--out", f"{tmp_path}/small"]) == 0
     small = tmp_path / "small"
-    whole = [torch.load(path / CHECKPOINT, weights_only=False) for path in (folder, small)]
+    whole = [torch.load(path / CHECKPOINT, weights_only=True) for path in (folder, small)]
     for name, value in whole[0]["actor_state_dict"].items():
         assert torch.equal(value, whole[1]["actor_state_dict"][name])
     assert (small / CHECKPOINT).stat().st_size < 0.6 * (folder / CHECKPOINT).stat().st_size

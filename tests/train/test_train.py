@@ -18,7 +18,7 @@ from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
-from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration
+from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, load_checkpoint
 from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
@@ -37,7 +37,7 @@ def made() -> TrainingRun:
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    return torch.load(folder / CHECKPOINT, weights_only=False)["actor_state_dict"]
+    return torch.load(folder / CHECKPOINT, weights_only=True)["actor_state_dict"]
 
 
 def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
@@ -100,7 +100,7 @@ def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
     hardly = replace(SHORT, iterations=1, learning_rate=1e-12, schedule="fixed")
     still = replace(made, cfg=replace(made.cfg, seed=1, ppo=hardly))
     same = []
-    for begin_with in (None, tmp_path / "first" / CHECKPOINT):
+    for begin_with in (None, load_checkpoint(tmp_path / "first" / CHECKPOINT)):
         trainer, _ = train_run(still, None, device="cpu", begin_with=begin_with)
         found = dict(trainer.algorithm.actor.named_parameters())
         same.append([torch.allclose(value, given[name], rtol=0, atol=1e-9) for name, value in found.items()])
@@ -108,7 +108,7 @@ def test_training_begins_with_a_policy_that_is_given(made, tmp_path):
     assert all(same[1])
     wider = replace(still, cfg=replace(still.cfg, ppo=replace(hardly, hidden=(32,))))
     with pytest.raises(TrainError, match="another architecture"):
-        train_run(wider, None, device="cpu", begin_with=tmp_path / "first" / CHECKPOINT)
+        train_run(wider, None, device="cpu", begin_with=load_checkpoint(tmp_path / "first" / CHECKPOINT))
 
 
 def test_what_is_no_policy_to_begin_with_is_refused_before_anything_is_written(tmp_path, capsys):

@@ -18,6 +18,7 @@ import warp as wp
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from concent_warp.checkpoint_file import check_state
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg
@@ -253,11 +254,12 @@ class Environment(VecEnv):
         """Set the state that `state` returned.
 
         Raises:
-            TrainError: It lacks a part of this environment's state.
+            TrainError: It lacks a part of this environment's state, or a part has another shape.
         """
         parts = self._state()
         if missing := sorted(set(parts) - set(state)):
             raise TrainError("the checkpoint lacks a part of the environment's state", expected=missing)
+        check_state(state, parts, "the environment of the checkpoint", where=None, error=TrainError)
         for name, value in parts.items():
             value.copy_(state[name])
         self.refresh()

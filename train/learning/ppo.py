@@ -6,7 +6,7 @@ import contextlib
 import io
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
+from concent_warp.checkpoint_file import check_state, read_checkpoint, write_checkpoint
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
@@ -248,49 +249,62 @@ class Trainer:
         if not self.process.is_rank_zero:
             return
         document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
-        path = self.folder / CHECKPOINT
-        partial = path.with_name(f".{path.name}.partial")
-        torch.save(document, partial)
-        partial.replace(path)
+        write_checkpoint(self.folder / CHECKPOINT, document)
 
-    def begin_with(self, path: Path) -> None:
+    def begin_with(self, weights: Mapping[str, Any], where: object = None) -> None:
         """Load the policy of a checkpoint, without value function, optimiser and environment.
+
+        Args:
+            weights: Checkpoint that `load_checkpoint` returned.
+            where: Its file, named in errors.
 
         Raises:
             TrainError: Its network has another architecture.
         """
-        try:
-            self.algorithm.load(load_checkpoint(path, self.device), {"actor": True}, True)
-        except RuntimeError as error:
-            raise TrainError(
-                "the policy's network has another architecture", where=path, found=str(error)[:200]
-            ) from None
+        state = self.algorithm.actor.state_dict()
+        check_state(weights["actor_state_dict"], state, "the policy's network", where=where, error=TrainError)
+        self.algorithm.load(dict(weights), {"actor": True}, True)
 
     def resume(self, path: Path) -> None:
         """Restore the training of a checkpoint; it continues as if it had not stopped.
 
         Raises:
-            TrainError: The checkpoint's network has another architecture, it has another number of ranks, or it holds a
-                policy alone.
+            TrainError: The checkpoint's network has another architecture, it has another number of ranks, it holds a
+                policy alone, or its parts do not belong to this training.
         """
-        document = load_checkpoint(path, self.device)
+        document = load_checkpoint(path)
         if "ranks" not in document:
             raise TrainError("the checkpoint holds a policy, but no training to resume", where=path)
-        if len(document["ranks"]) != self.process.world_size:
+        ranks, ppo = document["ranks"], self.algorithm
+        if not isinstance(ranks, list) or len(ranks) != self.process.world_size:
             raise TrainError(
                 "the training was started with another number of processes",
                 where=path,
-                expected=len(document["ranks"]),
+                expected=len(ranks) if isinstance(ranks, list) else "a list of them",
                 found=self.process.world_size,
             )
-        state = document["ranks"][self.process.rank]
+        for name, network in (("actor", ppo.actor), ("critic", ppo.critic)):
+            found = document.get(f"{name}_state_dict")
+            check_state(found, network.state_dict(), f"the checkpoint's {name}", where=path, error=TrainError)
         try:
-            self.algorithm.load(document, None, True)
-        except RuntimeError as error:
-            raise TrainError(
-                "the checkpoint's network has another architecture", where=path, found=str(error)[:200]
-            ) from None
-        self.algorithm.learning_rate = document["learning_rate"]
+            self._restore(document, ranks[self.process.rank])
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            if isinstance(error, TrainError):
+                raise
+            found = " ".join(str(error).split())[:200] or type(error).__name__
+            raise TrainError("the checkpoint holds no training like this one", where=path, found=found) from None
+
+    def _restore(self, document: dict[str, Any], state: dict[str, Any]) -> None:
+        """Restore networks and optimiser of a checkpoint, and the environment and generators of this rank."""
+        ppo = self.algorithm
+        ppo.load(document, None, True)
+        for group in ppo.optimizer.param_groups:
+            for weight in group["params"]:
+                for name in ("exp_avg", "exp_avg_sq"):
+                    moment = ppo.optimizer.state.get(weight, {}).get(name, weight)
+                    if moment.shape != weight.shape:
+                        raise ValueError(f"{name} of shape {tuple(moment.shape)} for weights {tuple(weight.shape)}")
+        ppo.learning_rate = float(document["learning_rate"])
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
         self.environment.restore(state["environment"])
         _restore_random_state(state["random"], self.device)
@@ -346,20 +360,23 @@ def network(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
     return settings
 
 
-def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint.
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Return the checkpoint of a training, with its tensors on the CPU.
 
     Raises:
-        TrainError: The file is missing or no checkpoint.
+        TrainError: The file is missing or no checkpoint, holds more than tensors and plain data, or has weights that
+            are not finite.
     """
-    if not path.is_file():
+    if not path.exists():
         raise TrainError("no such checkpoint", where=path, expected=f"a {CHECKPOINT} that concent train wrote")
-    try:
-        document = torch.load(path, map_location=device, weights_only=False)
-    except Exception as error:  # torch.load raises errors of several parsers
-        raise TrainError("not a checkpoint", where=path, found=f"{type(error).__name__}: {error}") from None
-    if not isinstance(document, dict) or "actor_state_dict" not in document:
-        raise TrainError("not a checkpoint of a training", where=path)
+    numbers = ("iteration", "steps", "seconds")
+    weights = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "learning_rate")
+    keys = ("actor_state_dict", *numbers)
+    document = read_checkpoint(path, keys=keys, finite=(*weights, *numbers), error=TrainError)
+    for name in numbers:
+        value = document[name]
+        if not isinstance(value, int | float if name == "seconds" else int) or value < 0:
+            raise TrainError(f"{name} of the checkpoint is no count", where=path, expected="at least 0", found=value)
     return document
 
 

@@ -18,7 +18,9 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import nn
 
+from concent_warp.checkpoint_file import check_state
 from concent_warp.errors import TrainError
+from concent_warp.files import write_bytes
 from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NORMAL, POINT
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.observation import ObservationLayout
@@ -52,10 +54,8 @@ def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str,
     task = run.task()
     described = _describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
     module = _policy_module(run.cfg, ObservationLayout.of(task).size, task.robot.actions, weights["actor_state_dict"])
-    partial = out.with_name(f".{out.name}.partial")
-    write = _write_onnx if out.suffix == ".onnx" else _write_torchscript
-    write(module, described, partial)
-    partial.replace(out)
+    to_bytes = _onnx if out.suffix == ".onnx" else _torchscript
+    write_bytes(out, to_bytes(module, described))
     return described
 
 
@@ -66,15 +66,13 @@ def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapp
     del settings["class_name"]
     actor = MLPModel(example, {"actor": ["policy"]}, "actor", actions, **settings)
     bound_observations(actor, cfg.ppo.max_observation)
-    try:
-        actor.load_state_dict(weights)
-    except RuntimeError as error:
-        raise TrainError("the checkpoint's network has another architecture", found=str(error)[:200]) from None
+    check_state(weights, actor.state_dict(), "the checkpoint's network", where=None, error=TrainError)
+    actor.load_state_dict(weights)
     return actor.as_jit().eval()
 
 
-def _write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> None:
-    """Write a policy as ONNX, with the weights inside, for batches of any size."""
+def _onnx(module: nn.Module, described: dict[str, Any]) -> bytes:
+    """Return a policy as ONNX, with the weights inside, for batches of any size."""
     import onnx
 
     example = torch.zeros(2, described["observation"]["size"])
@@ -94,15 +92,17 @@ def _write_onnx(module: nn.Module, described: dict[str, Any], path: Path) -> Non
     model = program.model_proto
     onnx.helper.set_model_props(model, {METADATA: json.dumps(described)})
     onnx.checker.check_model(model)
-    path.write_bytes(model.SerializeToString())
+    return model.SerializeToString()
 
 
-def _write_torchscript(module: nn.Module, described: dict[str, Any], path: Path) -> None:
-    """Write a policy as TorchScript."""
+def _torchscript(module: nn.Module, described: dict[str, Any]) -> bytes:
+    """Return a policy as TorchScript."""
+    content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         traced = torch.jit.trace(module, torch.zeros(2, described["observation"]["size"]))
-        torch.jit.save(traced, str(path), _extra_files={f"{METADATA}.json": json.dumps(described)})
+        torch.jit.save(traced, content, _extra_files={f"{METADATA}.json": json.dumps(described)})
+    return content.getvalue()
 
 
 def _describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:

@@ -63,7 +63,7 @@ class Policy:
     def act_in(self, environment: Environment) -> PolicyFunction:
         """Return the function from an environment's observations to actions, on the environment's device."""
         trainer = Trainer(environment, self.run.cfg)
-        trainer.algorithm.load(dict(self.weights), {"actor": True}, True)
+        trainer.begin_with(self.weights, self.folder)
         return trainer.policy()
 
     def scaled(self, action_scale: float = 1.0, setpoint_lead_scale: float = 1.0) -> Policy:

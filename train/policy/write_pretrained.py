@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from concent_warp.checkpoint_file import write_checkpoint
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
 from concent_warp.train.learning.ppo import CHECKPOINT
@@ -36,7 +37,6 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
         ConcentError: The folder exists and is not replaced.
     """
     import tomli_w
-    import torch
 
     if out.exists() and not (overwrite and (out / ORIGIN).is_file()):
         fix = "pass --overwrite" if (out / ORIGIN).is_file() else "choose another folder"
@@ -47,7 +47,7 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
     shutil.rmtree(partial, ignore_errors=True)
     replace(run, recording=replace(run.recording, demonstrations=(one,))).save(partial)
     kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
-    torch.save(kept, partial / CHECKPOINT)
+    write_checkpoint(partial / CHECKPOINT, kept)
     length = {"iterations": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
     origin = length | _origin_of(policy.folder / COMMAND)
     write_text(partial / ORIGIN, tomli_w.dumps(origin))
