@@ -1,6 +1,7 @@
 """Predictions against simulations with MuJoCo alone: initial states, commands with a history, what is kept."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -270,9 +271,8 @@ class Plain:
             "<mujoco><worldbody><body><joint type='slide'/><geom size='1'/></body></worldbody></mujoco>"
         )
         clock = np.array([3.0, 3.5, 4.0, 4.5, 5.0])
-        self.windows = [
-            type("Window", (), {"spread": np.array([0.1, 2.0]), "start": 3.0, "end": 3.0 + LONG, "clock": clock})()
-        ]
+        spread = np.array([0.1, 2.0])
+        self.windows = [SimpleNamespace(spread=spread, start=3.0, end=3.0 + LONG, clock=clock)]
         self.asked: list[Any] = []
 
     def courses(self, trials: Any, time: float) -> list[Course]:
