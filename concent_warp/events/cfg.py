@@ -2,12 +2,52 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
 
 from concent_warp.errors import EventsError
+
+
+@dataclass(frozen=True)
+class InsertionCfg:
+    """How the plane of the first contact of two objects is found, and what counts as beyond it.
+
+    "Empirical" values were set on simulated insertions with surfaces of spheres of 2 to 6 mm radius.
+    """
+
+    across_angle: float = 45.0
+    """Angle between a contact's normal and an axis from which on the contact is across the axis [deg]."""
+    opposing_angle: float = 60.0
+    """Angle between a contact's normal and the reverse of a motion below which the contact opposes the motion [deg].
+    Empirical: normals of spheres differ by up to this much from that of the surface."""
+    inner_share: float = 0.2
+    """Share of the normal force above which the surfaces that it acts on count as touched [-]. Empirical."""
+    plane_radius: float = 0.06
+    """Distance from the first contact within which spheres are fitted by its plane [m]: the size of a hand-held
+    object."""
+    plane_min_spheres: int = 6
+    """Least number of spheres that a plane is fitted to [-]: twice what determines it."""
+    plane_band: float = 0.0015
+    """Difference in height below which spheres are level [m]. Empirical: a fraction of their radius."""
+    plane_tilts: tuple[float, ...] = tuple(2.0 * k for k in range(1, 16))
+    """Tilts against the reverse of the motion that are tried, ascending [deg]."""
+    plane_flatness: float = 3.0
+    """Ratio of the second to the third singular value of a layer of spheres above which it determines a plane [-].
+    Empirical."""
+    grid: float = 0.001
+    """Size of the grid to which points that ever touch are thinned out [m]."""
+
+    def __post_init__(self) -> None:
+        if not self.plane_tilts:
+            raise EventsError("staging: plane_tilts is empty", expected="angles in degrees", found=self.plane_tilts)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if not all(0 <= v < np.inf for v in (value if isinstance(value, tuple) else (value,))):
+                raise EventsError(f"staging: {setting.name} is not right", expected="a number >= 0", found=value)
+        if self.grid == 0:
+            raise EventsError("staging: grid is not right", expected="a length above 0", found=self.grid)
 
 
 @dataclass(frozen=True)
@@ -43,12 +83,14 @@ class StagingCfg:
     target: Literal["settled", "transition"] = "settled"
     """Which configuration of a stage is its target event: the last steady one of the stage, before the object is
     released or the next stage begins, or the one at the transition (the literal reading of the paper)."""
+    insertion: InsertionCfg = field(default_factory=InsertionCfg)
+    """Contacts of objects with one another."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "target" and not 0 <= value < np.inf:
-                raise EventsError(f"staging: {field.name} is not right", expected="a number >= 0", found=value)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if setting.name not in ("target", "insertion") and not 0 <= value < np.inf:
+                raise EventsError(f"staging: {setting.name} is not right", expected="a number >= 0", found=value)
         if not 0 < self.share <= 1:
             raise EventsError("staging: share is not right", expected="a number above 0, at most 1", found=self.share)
         if self.target not in ("settled", "transition"):

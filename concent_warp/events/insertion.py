@@ -19,27 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from concent_warp.events.cfg import StagingCfg
+from concent_warp.events.cfg import InsertionCfg, StagingCfg
 from concent_warp.events.filter import debounce, runs, steps_of, windowed
 from concent_warp.events.onset import Onset
 from concent_warp.events.touches import BodyPoses, ReplayContacts
-
-ACROSS = float(np.cos(np.pi / 4))
-"""A normal is across an axis if it is more than 45 degrees from it."""
-OPPOSING = float(np.cos(np.pi / 3))
-"""A contact opposes a motion if its normal is within 60 degrees of the motion's reverse."""
-INNER_SHARE = 0.2
-"""Share of the normal force from which the surfaces that it acts on count as touched [-]."""
-PLANE_REACH = 0.06
-"""Spheres within this distance of the first contact are fitted by its plane [m]."""
-PLANE_LEAST = 6
-"""Least number of spheres that a plane is fitted to."""
-PLANE_BAND = 0.0015
-"""Spheres that differ by less than this in height are level [m]."""
-PLANE_TILTS = np.radians(np.arange(2, 31, 2))
-"""Tilts against the reverse of the motion that are tried [rad]."""
-GRAIN = 0.001
-"""Material points that ever touch are thinned out to a grid of this size [m]."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +61,18 @@ class PairContact:
     """Where b is [m]: its sphere centres, or if it has none the places where a touches it, shape (n, 3)."""
 
     @staticmethod
-    def of(rows: ReplayContacts, motion: BodyPoses, pair: tuple[int, int], spheres: np.ndarray) -> PairContact:
-        """Bring contacts of a pair of bodies into the frame of the second."""
+    def of(
+        rows: ReplayContacts, motion: BodyPoses, pair: tuple[int, int], spheres: np.ndarray, grid: float
+    ) -> PairContact:
+        """Return contacts of a pair of bodies in the frame of the second.
+
+        Args:
+            rows: The contacts.
+            motion: Poses.
+            pair: Ids of the bodies.
+            spheres: Sphere centres of the second [m], in its frame, shape (n, 3).
+            grid: Size of the grid to which touching points are thinned out [m].
+        """
         a, b = pair
         point = motion.into(b, rows.step, rows.point)
         origin, rotation = motion.relative(a, b)
@@ -88,11 +81,11 @@ class PairContact:
             normal=motion.turn_into(b, rows.step, rows.normal),
             force=rows.force,
             point=point,
-            feelers=_thinned(motion.into(a, rows.step, rows.point)),
+            feelers=_thinned(motion.into(a, rows.step, rows.point), grid),
             origin=origin,
             rotation=rotation,
             spheres=spheres,
-            layout=spheres if len(spheres) else _thinned(point),
+            layout=spheres if len(spheres) else _thinned(point, grid),
         )
 
     def mean(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,9 +100,9 @@ class PairContact:
         return (self.origin - plane.point) @ plane.normal + reach.min(axis=1)
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """Return points [m], shape (C, 3), one for each cell of a grid that holds any, shape (n, 3)."""
-    return np.unique(np.round(points / GRAIN), axis=0) * GRAIN
+def _thinned(points: np.ndarray, grid: float) -> np.ndarray:
+    """Return points [m], shape (C, 3), one for each cell of a grid [m] that has any, shape (n, 3)."""
+    return np.unique(np.round(points / grid), axis=0) * grid
 
 
 def object_onsets(
@@ -139,7 +132,7 @@ def object_onsets(
     rows = touches[touching[touches.step]]
     if not len(rows.step):
         return []
-    contact = PairContact.of(rows, motion, pair, spheres)
+    contact = PairContact.of(rows, motion, pair, spheres, cfg.insertion.grid)
     first = int(rows.step[0])
     plane = _first_plane(contact, touching, steps_of(cfg.window, motion.timestep), cfg)
     beyond, inside = _passage(contact, touching, plane, motion.timestep, cfg)
@@ -160,11 +153,11 @@ def _first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: St
     point, normal = contact.mean(contact.step < first + width)
     approach = _approach_direction(contact.origin, first, cfg.approach)
     ways = [-approach, _unit(contact.origin[first] - contact.origin[last], cfg.depth)]
-    opposed = [way for way in ways if way @ normal > OPPOSING]
+    opposed = [way for way in ways if way @ normal > np.cos(np.radians(cfg.insertion.opposing_angle))]
     if not opposed:
         return Plane(point, -approach if approach.any() else normal, barred=not approach.any())
     if len(contact.spheres):
-        normal = _fit_normal(contact.spheres, point, opposed[0])
+        normal = _fit_normal(contact.spheres, point, opposed[0], cfg.insertion)
     plane = Plane(point, normal, barred=True)
     return replace(plane, barred=not _surrounded(contact, plane, first, cfg.depth))
 
@@ -182,32 +175,33 @@ def _unit(vector: np.ndarray, least: float) -> np.ndarray:
     return vector / length if length > least else np.zeros(3)
 
 
-def _fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _fit_normal(spheres: np.ndarray, point: np.ndarray, normal: np.ndarray, cfg: InsertionCfg) -> np.ndarray:
     """Turn a direction (3,) into the normal of the layer of spheres (n, 3) that a contact at `point` (3,) is on.
 
     Of the directions around `normal`, the one is taken that has most spheres level with the touched one, the more of
     them the farther it is from `normal`, and turned into the normal of their plane of least squares. Where they are too
     few, or in a line, it stays as it is.
     """
-    near = spheres[np.linalg.norm(spheres - point, axis=1) < PLANE_REACH]
-    if len(near) < PLANE_LEAST:
+    near = spheres[np.linalg.norm(spheres - point, axis=1) < cfg.plane_radius]
+    if len(near) < cfg.plane_min_spheres:
         return normal
     from_touched = near - near[np.argmin(np.linalg.norm(near - point, axis=1))]
-    candidates = _cone(normal)
-    level = np.abs(from_touched @ candidates.T) < PLANE_BAND
+    tilts = np.radians(cfg.plane_tilts)
+    candidates = _cone(normal, tilts)
+    level = np.abs(from_touched @ candidates.T) < cfg.plane_band
     nearness = 2 * (candidates @ normal) ** 2 - 1  # cosine of twice the tilt
     layer = from_touched[level[:, np.argmax(level.sum(axis=0) * nearness)]]
-    if len(layer) < PLANE_LEAST:
+    if len(layer) < cfg.plane_min_spheres:
         return normal
     spread, axes = np.linalg.svd(layer - layer.mean(axis=0), full_matrices=False)[1:]
     turned = axes[2] * (1.0 if axes[2] @ normal > 0 else -1.0)
-    return turned if spread[1] > 3 * spread[2] and turned @ normal > np.cos(PLANE_TILTS[-1]) else normal
+    return turned if spread[1] > cfg.plane_flatness * spread[2] and turned @ normal > np.cos(tilts[-1]) else normal
 
 
-def _cone(axis: np.ndarray) -> np.ndarray:
-    """Return unit vectors around an axis (3,), the axis first, shape (n, 3)."""
+def _cone(axis: np.ndarray, tilts: np.ndarray) -> np.ndarray:
+    """Return unit vectors around an axis (3,) at some tilts [rad], the axis first, shape (n, 3)."""
     across = np.linalg.svd(axis[None])[2][1:]
-    tilt, turn = np.meshgrid(PLANE_TILTS, np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij")
+    tilt, turn = np.meshgrid(tilts, np.linspace(0, 2 * np.pi, 24, endpoint=False), indexing="ij")
     sideways = np.cos(turn)[..., None] * across[0] + np.sin(turn)[..., None] * across[1]
     vectors = np.cos(tilt)[..., None] * axis + np.sin(tilt)[..., None] * sideways
     return np.concatenate([axis[None], vectors.reshape(-1, 3)])
@@ -218,14 +212,14 @@ def _passage(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return when a is in contact beyond the plane, and when on inner surfaces for `persist`, shape (K,) bool each."""
     steps, width = len(touching), steps_of(cfg.window, timestep)
-    across = np.abs(contact.normal @ plane.normal) < ACROSS
+    across = np.abs(contact.normal @ plane.normal) < np.cos(np.radians(cfg.insertion.across_angle))
     deep = (contact.point - plane.point) @ plane.normal < -cfg.depth
     inner = across | deep if plane.barred else np.ones(len(contact.step), dtype=bool)
     beyond = touching & (contact.height(plane) < -cfg.depth) if plane.barred else touching.copy()
     on_inner = windowed(np.bincount(contact.step, contact.force * inner, minlength=steps), width)
     total = windowed(np.bincount(contact.step, contact.force, minlength=steps), width)
     now = np.bincount(contact.step, inner, minlength=steps) > 0
-    inside = beyond & now & (on_inner > INNER_SHARE * total)
+    inside = beyond & now & (on_inner > cfg.insertion.inner_share * total)
     return beyond, debounce(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
 
 
