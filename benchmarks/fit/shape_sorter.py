@@ -125,7 +125,7 @@ def run(args: Args, seed: int, start: Start, file: Path) -> None:
         },
         "loss_mm": [round(h["loss"] * 1e3, 4) for h in result.history],
     }
-    faces = Faces(model.geometry, scene, args.fit.evolution.face_length)
+    faces = Faces(model.geometry, scene, args.fit.evolution.face_length, args.fit.evolution.faces)
     for name, judged in (
         ("null", without_contact(scene)),
         ("exact", Model(scene)),

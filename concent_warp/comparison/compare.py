@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from concent_warp.comparison.bootstrap import BootstrapCfg
 from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, phases_by_body, stage_phases, tell_a_task
 from concent_warp.comparison.residuals import instrument_noise, residuals
@@ -43,6 +44,8 @@ class CompareCfg:
     """Demonstrations to compare on; all where empty."""
     seed: int = 0
     """Seed of the bootstrap."""
+    bootstrap: BootstrapCfg = field(default_factory=BootstrapCfg)
+    """Settings of the intervals of mean errors."""
     motion_phases: MotionPhaseCfg = field(default_factory=MotionPhaseCfg)
     """Settings of the phases of motion."""
     worst_spans: WorstSpanCfg = field(default_factory=WorstSpanCfg)
@@ -107,6 +110,7 @@ def compare(
         engine,
         phases=None if moving else stages,
         seed=cfg.seed,
+        bootstrap=cfg.bootstrap,
         motion_cfg=cfg.motion_phases,
         span_cfg=cfg.worst_spans,
         progress=progress,
@@ -125,23 +129,25 @@ def compare_replays(
     phases: Mapping[str, Sequence[StageLike]] | None = None,
     demonstrations: Sequence[str] | None = None,
     seed: int = 0,
+    bootstrap: BootstrapCfg | None = None,
     motion_cfg: MotionPhaseCfg | None = None,
     span_cfg: WorstSpanCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
     """Replay demonstrations in each model and compare what it predicts with what was measured.
 
-    Each model keeps its own time step, integrator and solver: they are part of it.
+    Each model keeps its own time step, integrator and solver.
 
     Args:
         models: One or more models by name, the baseline first.
         recording: What was commanded and measured.
         engine: Which engine simulates, see `make_engine`.
         phases: Contact stages by demonstration, as a contact event sequence has them; the same for every model. Where
-            there is none in any demonstration, times are not told apart. None takes the ways of moving in the replay
-            of the last model instead (`phases_by_body`).
+            there is none in any demonstration, time is not divided. None takes the phases of motion in the replay of
+            the last model instead (`phases_by_body`).
         demonstrations: Names of those to compare on; None takes all.
         seed: Seed of the bootstrap.
+        bootstrap: Settings of the intervals of mean errors.
         motion_cfg: Settings of the phases of motion.
         span_cfg: Settings of the search for spans of large error.
         progress: Called with the share done, 0..1.
@@ -195,6 +201,7 @@ def compare_replays(
         phases=spans,
         diverged=diverged,
         seed=seed,
+        bootstrap=bootstrap or BootstrapCfg(),
         worst_spans=rank_worst_spans(worst, span_cfg),
         span_cfg=span_cfg,
         staged=phases is not None,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.comparison.bootstrap import LEVEL, RULE, effective_count, mean_interval
+from concent_warp.comparison.bootstrap import BootstrapCfg, effective_count, mean_interval
 from concent_warp.comparison.html import comparison_html
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import FREE, Phase
@@ -103,6 +103,8 @@ class Comparison:
     """Time [s] at which a replay stopped being finite, by model and demonstration; absent where it stayed so."""
     seed: int = 0
     """Seed of the bootstrap."""
+    bootstrap: BootstrapCfg = field(default_factory=BootstrapCfg)
+    """Settings of the intervals."""
     worst_spans: tuple[WorstSpan, ...] = ()
     """Spans of time in which the last model fails worst, the worst first."""
     span_cfg: WorstSpanCfg = field(default_factory=WorstSpanCfg)
@@ -181,7 +183,7 @@ class Comparison:
             raise ModelError(f"no channel {channel!r} to summarise", expected=f"one of {list(self.channels)}")
         parts = [r.error[mask] for r, mask in found]
         pooled = np.concatenate(parts)
-        low, high = mean_interval(parts, self.seed)
+        low, high = mean_interval(parts, self.seed, self.bootstrap)
         noises = [(r.noise, mask.sum()) for r, mask in found if r.noise is not None]
         weight = sum(n for _, n in noises)
         sources: list[Source] = [r.source for r, _ in found if r.noise is not None]
@@ -222,7 +224,7 @@ class Comparison:
             parts = [b - a for a, b in zip(first, second, strict=True)]
             mean = _statistic(np.mean, np.concatenate(second)) - (base := _statistic(np.mean, np.concatenate(first)))
         finite = bool(np.isfinite(mean))
-        low, high = mean_interval(parts, self.seed) if finite else (mean, mean)
+        low, high = mean_interval(parts, self.seed, self.bootstrap) if finite else (mean, mean)
         share = mean / base if finite and base else np.nan
         return Difference(before, after, channel, summary.phase, summary.unit, float(mean), low, high, float(share))
 
@@ -268,7 +270,7 @@ class Comparison:
             ],
             "summaries": [asdict(self.summarise(m, c, p)) for c, p in rows for m in self.models],
             "differences": [d for c, p in rows if (d := self._difference_json(c, p))],
-            "interval": {"level": LEVEL, "rule": RULE, "seed": self.seed},
+            "interval": {"level": self.bootstrap.level, "rule": self.bootstrap.rule, "seed": self.seed},
         }
         return finite(document)
 

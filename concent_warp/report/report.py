@@ -10,7 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from concent_warp.comparison.bootstrap import RULE
 from concent_warp.comparison.result import Comparison, finite
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
@@ -104,9 +103,9 @@ def write_report(
         "geometry": _geometry_section(data, comparison, shown_models),
         "fit": _fit_section(fit),
         "tables_about": escape(
-            f"Mean error over time with its 95 % interval ({RULE}); RMS, 95th percentile, largest error, noise floor "
-            f"(RMS) and RMS error over it (x noise) of “{comparison.after}”. Green and red changes are those whose "
-            "interval excludes none."
+            f"Mean error over time with its 95 % interval ({comparison.bootstrap.rule}); RMS, 95th percentile, largest "
+            f"error, noise floor (RMS) and RMS error over it (x noise) of “{comparison.after}”. Green and red changes "
+            "are those whose interval excludes 0."
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),

@@ -2,13 +2,15 @@ import numpy as np
 import pytest
 
 from concent_warp.comparison.bootstrap import (
-    WHOLE,
+    BootstrapCfg,
     _autocorrelation_time,
     _block_length,
-    _drawn_demonstrations,
+    _resampled_demonstrations,
     effective_count,
     mean_interval,
 )
+
+WHOLE = BootstrapCfg.min_demonstrations
 
 
 def autoregressive(rng, n, keep):
@@ -56,7 +58,7 @@ def test_effective_count_of_independent_samples_is_near_their_number():
     assert 700 < effective_count(parts) <= 1000
 
 
-def test_with_many_demonstrations_whole_ones_are_drawn():
+def test_of_many_demonstrations_whole_ones_are_resampled():
     rng = np.random.default_rng(6)
     parts = [np.full(50, level) for level in rng.normal(10, 1, WHOLE)]
     low, high = mean_interval(parts)
@@ -68,8 +70,16 @@ def test_with_many_demonstrations_whole_ones_are_drawn():
 
 def test_demonstrations_count_by_their_samples():
     parts = [np.zeros(90), np.ones(10)]
-    means = _drawn_demonstrations(parts, np.random.default_rng(0))
+    means = _resampled_demonstrations(parts, np.random.default_rng(0), 2000)
     assert set(np.round(means, 6)) == {0.0, 0.1, 1.0}
+
+
+def test_level_and_least_number_of_samples_are_settings():
+    parts = [np.random.default_rng(8).normal(size=100)]
+    low, high = mean_interval(parts)
+    inner_low, inner_high = mean_interval(parts, cfg=BootstrapCfg(level=0.5))
+    assert low < inner_low < inner_high < high
+    assert np.isnan(mean_interval(parts, cfg=BootstrapCfg(min_samples=101))).all()
 
 
 def test_interval_is_the_same_on_every_call():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from concent_warp.fit.geometry.faces import Faces
+from concent_warp.fit.geometry.faces import FaceCfg, Faces
 from concent_warp.fit.geometry.objective import Candidates
+from concent_warp.fit.geometry.offset import OffsetCfg
 from concent_warp.fit.geometry.perturbation import Noise, Perturbation, smoothed
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
@@ -20,8 +21,11 @@ class EvolutionCfg:
     """Candidates a generation. On six seeds of the shape sorter that no page reports, 20 to 40 reached the same errors;
     the time of a fit grows with it."""
     sigma: float | None = None
-    """Standard deviation of a sphere's displacement in the first generation [m]. None takes a sixth of the starting
-    Chamfer distance (both directions together), at most `max_sigma`: far from the goal large steps, near it small."""
+    """Standard deviation of a sphere's displacement in the first generation [m]. None takes `sigma_share` of the
+    starting Chamfer distance (both directions together), at most `max_sigma`: large steps far from the goal, small ones
+    near it."""
+    sigma_share: float = 1 / 6
+    """That share of the Chamfer distance [-]. Empirical."""
     max_sigma: float = 3e-3
     """Largest standard deviation that is chosen by itself [m]."""
     sigma_decay: float = 0.975
@@ -41,6 +45,10 @@ class EvolutionCfg:
     """Share by which each generation takes the roughness out of the faces inside the mask; 0 for none."""
     face_length: float = 0.03
     """Length over which a face is flat [m]: its distance from the nominal surface varies linearly."""
+    faces: FaceCfg = field(default_factory=FaceCfg)
+    """Settings of the search for faces and of their flattening."""
+    offset: OffsetCfg = field(default_factory=OffsetCfg)
+    """Settings of the directions in which spheres move when their body grows."""
     antithetic: bool = True
     """Sample candidates in pairs of opposite displacement."""
     elite_share: float = 0.25
@@ -76,10 +84,6 @@ class EvolutionCfg:
         return np.array([sigma] * 3 + radius + friction)
 
 
-SIGMA_SHARE = 1 / 6
-"""Of the Chamfer distance, for the standard deviation of the first displacements."""
-
-
 class Evolution:
     """The estimate and how it moves. Displacements are relative to the starting geometry, shape (S, C).
 
@@ -101,7 +105,7 @@ class Evolution:
     def scale_to(self, distance: float) -> None:
         """Choose sigma by the Chamfer distance of the start [m], unless the settings give it."""
         if self.cfg.sigma is None and np.isfinite(distance):
-            self.sigma = min(SIGMA_SHARE * distance, self.cfg.max_sigma)
+            self.sigma = min(self.cfg.sigma_share * distance, self.cfg.max_sigma)
 
     @property
     def shrink(self) -> float:

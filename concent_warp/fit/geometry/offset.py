@@ -8,6 +8,8 @@ corner of a box is d (1, 1, 1).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -15,28 +17,37 @@ from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
-PROBES = 40_000
-"""Surface points looked at to find the faces that a sphere belongs to."""
-SLACK = 1e-3
-"""A sphere makes up the faces no farther from its centre than the nearest one plus this [m]."""
-RIDGE = 1e-3
-"""Regularisation of the least squares, relative to one: directions in which no face looks do not move."""
+
+@dataclass(frozen=True)
+class OffsetCfg:
+    """Settings of the directions in which spheres move when their body grows."""
+
+    probes: int = 40_000
+    """Sampled surface points among which the faces of a sphere are found [-]: about 1 mm apart on a hand-held
+    object."""
+    slack: float = 1e-3
+    """A sphere is on all faces no farther from its centre than the nearest one plus this [m]: the distance of
+    samples."""
+    ridge: float = 1e-3
+    """Regularisation of the least squares, relative to the eigenvalue 1 of a normal's outer product [-]: nothing
+    moves along directions without a face."""
 
 
-def offset_directions(geometry: ContactGeometry, scene: Scene) -> np.ndarray:
+def offset_directions(geometry: ContactGeometry, scene: Scene, cfg: OffsetCfg | None = None) -> np.ndarray:
     """Return the displacement of each sphere for a unit of growth of its body, shape (S, 3).
 
     It is the shortest x that satisfies ``n . x = 1`` in the least-squares sense for the normals n near the sphere: the
     normal itself on a face or a smooth surface, longer at edges and corners.
     """
+    cfg = cfg or OffsetCfg()
     result = np.zeros((len(geometry), 3))
     for body in geometry.bodies:
         rows = geometry.of(body)
-        points, normals = Surface.of_body(scene, body).sample(PROBES, np.random.default_rng(0))
+        points, normals = Surface.of_body(scene, body).sample(cfg.probes, np.random.default_rng(0))
         tree = KDTree(points)
         nearest, _ = tree.query(geometry.position[rows])
         for row, distance in zip(rows, np.atleast_1d(nearest), strict=True):
-            near = normals[tree.query_ball_point(geometry.position[row], float(distance) + SLACK)]
-            gram = near.T @ near / len(near) + RIDGE * np.eye(3)
+            near = normals[tree.query_ball_point(geometry.position[row], float(distance) + cfg.slack)]
+            gram = near.T @ near / len(near) + cfg.ridge * np.eye(3)
             result[row] = np.linalg.solve(gram, near.mean(axis=0))
     return result

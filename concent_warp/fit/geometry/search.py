@@ -147,8 +147,11 @@ class Search:
         assert model.geometry is not None
         self.model, self.segments, self.cfg = model, segments, cfg
         self.engine_name: EngineName = engine
-        growth = offset_directions(model.geometry, model.scene)
-        faces = Faces(model.geometry, model.scene, cfg.evolution.face_length) if cfg.evolution.flattens else None
+        strategy = cfg.evolution
+        growth = offset_directions(model.geometry, model.scene, strategy.offset)
+        faces = None
+        if strategy.flattens:
+            faces = Faces(model.geometry, model.scene, strategy.face_length, strategy.faces)
         self.evolution = Evolution(model.geometry, growth, cfg.evolution, faces)
         self.rng = np.random.default_rng(cfg.seed)
         self.robot = robot_bodies(model.scene.model)
