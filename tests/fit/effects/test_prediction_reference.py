@@ -30,6 +30,7 @@ from concent_warp.fit.effects.prediction import (
     SimulationRequest,
     turn,
 )
+from concent_warp.simulate.mujoco_engine import MujocoEngine
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
 NONE = np.zeros(0)
@@ -143,6 +144,18 @@ def test_a_simulation_is_asked_for_by_window_values_and_offset(recording, window
     assert all(prediction._key(other) != base for other in others)
     prediction.readers([SimulationRequest(0, np.array([0.1, v])) for v in (0.0, 0.1)])
     assert prediction.simulated == pytest.approx(windows[0].end - windows[0].start)
+
+
+def test_effects_reach_back_whole_steps_and_threads_are_those_asked_for(recording, windows):
+    delayed = effect_class("actuator_delay")("servo")
+    prediction = Prediction(drawing(recording), (delayed,), windows, threads=1)
+    m = prediction.compiled
+    assert prediction._before(m) == int(np.ceil(delayed.history / 0.005))
+    assert Prediction(drawing(recording), (), windows)._before(m) == 0
+    engine: Any = prediction._engine(prediction.start)[0]
+    assert engine.threads == 1
+    free: Any = Prediction(drawing(recording), (delayed,), windows)._engine(prediction.start)[0]
+    assert free.threads == MujocoEngine(drawing(recording)).threads
 
 
 def test_the_oldest_simulations_are_forgotten_first(recording, windows, monkeypatch):
