@@ -162,6 +162,9 @@ def test_what_the_recording_hardly_determines_is_remarked_by_prior_or_by_bounds(
     most = 2 * NORMAL * 0.5 * 10.0  # half the prior of scale 1
     assert remarks(fitted("a", 1.0, 1.0 + 0.999 * most)) == []
     assert remarks(fitted("a", 1.0, 1.0 + 1.001 * most)) == ["The recording hardly determines a."]
+    wider = (Parameter("a", "N", 0.0, -1e3, 1e3, 2.0),)
+    assert remarks(fitted("a", 1.0, 1.0 + 1.999 * most), priors=wider) == []
+    assert remarks(fitted("a", 1.0, 1.0 + 2.001 * most), priors=wider) == ["The recording hardly determines a."]
     narrow = (Parameter("a", "N", 0.0, 0.0, 4.0, 1.0),)
     assert remarks(fitted("a", 0.03, 4.0), priors=narrow) == ["The recording hardly determines a."]
     assert remarks(fitted("a", 0.05, 4.0), priors=narrow) == []
@@ -233,6 +236,8 @@ def test_a_fit_starts_from_the_value_that_lowers_the_cost_most_if_it_does_so_by_
     assert scanned(monkeypatch, [0.0], best_at_two, SCANNED[:1])[0] == [2.0]  # 4 * (9 - 1) / 2 = 16 lower
     picky = FitEffectsCfg(min_scan_gain=16.1)
     assert scanned(monkeypatch, [0.0], best_at_two, SCANNED[:1], picky)[0] == [0.0]
+    equal = FitEffectsCfg(min_scan_gain=16.0)
+    assert scanned(monkeypatch, [0.0], best_at_two, SCANNED[:1], equal)[0] == [0.0]
     lenient = FitEffectsCfg(min_scan_gain=15.9)
     assert scanned(monkeypatch, [0.0], best_at_two, SCANNED[:1], lenient)[0] == [2.0]
 
