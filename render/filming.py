@@ -93,7 +93,11 @@ class DatasetFilming:
             film.close()
             self._unfinished(key).replace(self._films / f"episode_{key:06d}.mp4")
         if keep:
-            episode.save(success=success)
+            try:
+                episode.save(success=success)
+            except OSError:  # as on a full disk
+                episode.discard()
+                raise
             self.kept += 1
         else:
             episode.drop()

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.limits import limits, raising
 from concent_warp.simulate.engine import Contacts, Engine, Rollout, Variants
 
 if TYPE_CHECKING:
@@ -20,8 +21,21 @@ UNIT_QUATERNION_SENSORS = (mujoco.mjtSensor.mjSENS_FRAMEQUAT, mujoco.mjtSensor.m
 
 
 def step_count(demonstration: Demonstration, timestep: float, duration: float | None = None) -> int:
-    """Return how many steps of `timestep` [s] cover the demonstration, or its first `duration` seconds."""
-    return int(np.ceil((demonstration.duration if duration is None else duration) / timestep - 1e-9))
+    """Return how many steps of `timestep` [s] cover the demonstration, or its first `duration` seconds.
+
+    Raises:
+        RecordingError: They are more than `Limits` allow.
+    """
+    steps = np.ceil((demonstration.duration if duration is None else duration) / timestep - 1e-9)
+    if not steps <= (most := limits().steps):
+        raise RecordingError(
+            "the replay takes too many steps",
+            where=demonstration.name,
+            expected=f"at most {most:,}",
+            found=f"{steps:,.0f} of {timestep:g} s",
+            fix=f"cut the recording or take a larger time step; {raising('steps')}",
+        )
+    return int(steps)
 
 
 def commands(model: mujoco.MjModel, demonstration: Demonstration, steps: int, start: float = 0.0) -> np.ndarray:

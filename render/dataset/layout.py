@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -84,7 +85,7 @@ class EpisodeWriter(Protocol):
         ...
 
     def discard(self) -> None:
-        """Discard the episode; it is rendered again when the data set is continued."""
+        """Discard the episode and what is on the disk of it; it is rendered again when the data set is continued."""
         ...
 
 
@@ -156,6 +157,10 @@ class Staging:
             _sync(path)
         partial.rename(self.path(key))
 
+    def discard(self, key: int) -> None:
+        """Take away the folder that `begin` returned."""
+        shutil.rmtree(self.folder / f"{key:06d}{PARTIAL}", ignore_errors=True)
+
     def drop(self, key: int) -> None:
         """Note that an episode is to be left out."""
         shutil.rmtree(self.folder / f"{key:06d}{PARTIAL}", ignore_errors=True)
@@ -173,20 +178,24 @@ def _sync(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def partial_of(path: Path) -> Path:
-    """Return the name under which a file is written before it is whole; its folder is made."""
+@contextmanager
+def published(path: Path) -> Iterator[Path]:
+    """Yield the name under which to write a file, with its suffix, and give it its own name when it is on the disk.
+
+    The folder is made. What was written is removed if writing fails.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    return path.with_name(f".partial-{path.name}")
-
-
-def publish_file(path: Path) -> None:
-    """Give a file that was written under `partial_of` its name."""
-    partial = partial_of(path)
-    _sync(partial)
-    partial.replace(path)
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        yield partial
+        _sync(partial)
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text file in one piece or not at all."""
-    partial_of(path).write_text(text)
-    publish_file(path)
+    with published(path) as partial:
+        partial.write_text(text)

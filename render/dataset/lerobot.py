@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, publish_file, replace_text
+from concent_warp.render.dataset.layout import EpisodeLayout, Staging, published, replace_text
 from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged, of_values
 from concent_warp.render.dataset.video import PIXELS, Codec, VideoWriter, join_videos
 
@@ -101,10 +101,9 @@ class LeRobotWriter:
         lengths = [note["length"] for note in notes]
         for camera in self.layout.cameras:
             out = self.folder / _video_path(camera, where)
-            join_videos(
-                [self._staging.path(k) / f"{camera}.mp4" for k in keys], lengths, self.layout.rate, partial_of(out)
-            )
-            publish_file(out)
+            videos = [self._staging.path(k) / f"{camera}.mp4" for k in keys]
+            with published(out) as partial:
+                join_videos(videos, lengths, self.layout.rate, partial)
         tasks, index = self.tasks(), int(self._episodes[-1]["dataset_to_index"]) if self._episodes else 0
         rows, tables, seconds = [], [], 0.0
         for key, note in zip(keys, notes, strict=True):
@@ -126,13 +125,13 @@ class LeRobotWriter:
             rows.append(row)
             index, seconds = index + length, until
         out = self.folder / _file_path("data", where)
-        pq.write_table(pa.concat_tables(tables), partial_of(out))
-        publish_file(out)
+        with published(out) as partial:
+            pq.write_table(pa.concat_tables(tables), partial)
         self._write_tasks(tasks)
         # From here on the episodes belong to the data set.
         out = self.folder / _file_path("meta/episodes", where)
-        pq.write_table(pa.Table.from_pylist(rows), partial_of(out))
-        publish_file(out)
+        with published(out) as partial:
+            pq.write_table(pa.Table.from_pylist(rows), partial)
         self._episodes += rows
         self._staging.forget(keys)
 
@@ -202,8 +201,8 @@ class LeRobotWriter:
         ]
         pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
         out = self.folder / "meta" / "tasks.parquet"
-        pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), partial_of(out))
-        publish_file(out)
+        with published(out) as partial:
+            pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), partial)
 
     def _write_meta(self) -> None:
         """Write what follows from the table of episodes: statistics of all, and the description."""
@@ -292,8 +291,9 @@ class LeRobotEpisode:
         self._writer.staged(self._key, dropped=True)
 
     def discard(self) -> None:
-        """See `EpisodeWriter.discard`; what is left is cleared away when the data set is opened again."""
+        """See `EpisodeWriter.discard`."""
         self._close()
+        self._writer._staging.discard(self._key)
 
     def _close(self) -> None:
         """Close the videos; those without frames have nothing to be closed with."""

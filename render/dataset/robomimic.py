@@ -15,7 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from concent_warp.render.dataset.layout import EpisodeLayout, Staging, partial_of, publish_file
+from concent_warp.hdf5_output import DiskFile, new_hdf5
+from concent_warp.render.dataset.layout import EpisodeLayout, Staging
 
 NAME = "dataset.hdf5"
 """The file in the data set's folder."""
@@ -51,7 +52,7 @@ class RobomimicWriter:
         """See `DatasetWriter.finish`; a file that is there is copied, so that it is whole at any time."""
         out, packed = self.folder / NAME, self._packed()
         staged = [key for key in self._staging.numbers() if key not in packed]
-        with h5py.File(partial_of(out), "w") as file:
+        with new_hdf5(out) as file:
             data: Any = file.create_group("data")
             if packed:
                 with h5py.File(out, "r") as before:
@@ -69,7 +70,6 @@ class RobomimicWriter:
                     "env_kwargs": {"state": self.layout.state, "action": self.layout.action, "rate": self.layout.rate},
                 }
             )
-        publish_file(out)
         self._staging.forget(self._staging.numbers())
         return len(packed) + len(staged)
 
@@ -94,7 +94,8 @@ class RobomimicEpisode:
         """Open the episode's file."""
         self._writer, self._key = writer, key
         height, width = writer.layout.size
-        self._file = h5py.File(writer._staging.begin(key) / EPISODE, "w")
+        self._disk = DiskFile(writer._staging.begin(key) / EPISODE)
+        self._file = h5py.File(self._disk, "w")
         self._group = self._file.create_group("demo")
         self._group.attrs["task"] = task
         frame = (1, height, width, 3)
@@ -115,6 +116,7 @@ class RobomimicEpisode:
             stored = self._images[camera]
             stored.resize(len(self._state) + 1, axis=0)
             stored[-1] = image
+        self._disk.check()
         self._state.append(np.asarray(state, dtype=np.float64))
         self._action.append(np.asarray(action, dtype=np.float64))
 
@@ -130,16 +132,23 @@ class RobomimicEpisode:
         self._group.create_dataset("rewards", data=last * success)
         self._group.create_dataset("dones", data=last.astype(np.int64))
         self._group.attrs["num_samples"] = len(self._state)
-        self._file.close()
+        self._close()
+        self._disk.check()
         self._writer._staging.commit(self._key)
         self._writer._done.add(self._key)
 
     def drop(self) -> None:
         """See `EpisodeWriter.drop`."""
-        self._file.close()
+        self._close()
         self._writer._staging.drop(self._key)
         self._writer._done.add(self._key)
 
     def discard(self) -> None:
-        """See `EpisodeWriter.discard`; what is left is cleared away when the data set is opened again."""
+        """See `EpisodeWriter.discard`."""
+        self._close()
+        self._writer._staging.discard(self._key)
+
+    def _close(self) -> None:
+        """Close the file; closing it twice is fine."""
         self._file.close()
+        self._disk.close()

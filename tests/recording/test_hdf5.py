@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
+from concent_warp import files
 from concent_warp.errors import RecordingError
-from concent_warp.recording.formats import hdf5
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
 
@@ -121,7 +121,7 @@ def test_a_write_that_fails_leaves_the_old_file(path, recording, monkeypatch):
     def full(*_):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(hdf5.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(RecordingError, match="cannot be written; found No space left"):
         write_hdf5(recording, path)
     assert path.read_bytes() == before
@@ -133,9 +133,10 @@ def test_a_killed_write_leaves_the_old_file(path):
     script = f"""
         import os, signal
         from pathlib import Path
+        from concent_warp import files
         from concent_warp.recording.formats import hdf5
         recording = hdf5.read_hdf5(Path({str(path)!r}))
-        hdf5.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
+        files.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
         hdf5.write_hdf5(recording, Path({str(path)!r}))
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], check=False)

@@ -5,7 +5,6 @@ Names of channels are filed as `naming` says. How entries are read without trust
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -13,9 +12,10 @@ from typing import TypeVar
 import h5py
 import numpy as np
 
-from concent_warp.errors import RecordingError, SceneError
+from concent_warp.errors import ConcentError, RecordingError, SceneError
+from concent_warp.hdf5_output import new_hdf5
 from concent_warp.limits import limits, raising
-from concent_warp.recording.formats.hdf5_access import SafeFile
+from concent_warp.recording.formats.hdf5_access import CHECKSUM, SafeFile, sign
 from concent_warp.recording.formats.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
 from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
@@ -73,25 +73,19 @@ def write_hdf5(recording: Recording, path: str | Path) -> None:
     validate(recording)
     if not path.parent.is_dir():
         raise RecordingError("the folder to write to does not exist", where=path.parent, fix="create it")
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
+        with new_hdf5(path) as file:
             _write_file(file, recording)
-        with partial.open("rb") as written:
-            os.fsync(written.fileno())
-        partial.replace(path)
-    except (OSError, RuntimeError) as error:
-        raise RecordingError(
-            "the recording cannot be written", where=path, found=" ".join(str(error).split())
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
+    except ConcentError as error:
+        raise RecordingError(str(error)) from None
+    except RuntimeError as error:
+        raise RecordingError("the recording cannot be written", where=path, found=error) from error
 
 
 def _write_file(file: h5py.File, recording: Recording) -> None:
     """Fill an open file."""
     file.attrs["format"], file.attrs["version"] = _text(FORMAT), VERSION
-    file.create_dataset("scene", data=_text(recording.scene))
+    sign(file.create_dataset("scene", data=_text(recording.scene)))
     data = file.create_group("data")
     for demonstration in recording.demonstrations:
         group = data.create_group(demonstration.name)
@@ -100,7 +94,7 @@ def _write_file(file: h5py.File, recording: Recording) -> None:
             group.attrs["success"] = bool(demonstration.success)
         for name, value in (("qpos", demonstration.qpos), ("qvel", demonstration.qvel)):
             if value is not None and len(value):
-                group.require_group("initial").create_dataset(name, data=np.asarray(value, dtype=float))
+                sign(group.require_group("initial").create_dataset(name, data=np.asarray(value, dtype=float)))
         for kind in ("action", "measured", "points", "image"):
             for name, stream in getattr(demonstration, kind).items():
                 _write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
@@ -152,9 +146,10 @@ class Reader(SafeFile):
         version = self.attribute(file, "version")
         if version is None or np.shape(version) != () or version != VERSION:
             raise self.error("unknown version of the format", "attribute version", expected=VERSION, found=version)
-        self.refuse_unknown(file, {"scene", "data"})
+        self.refuse_unknown(file, {"scene", "data"}, {"format", "version", "path"})
         scene = self.scene(file)
         data = self.group(file, "data")
+        self.check_attributes(data, set())
         if len(data) > limits().demonstrations:
             raise self.error(
                 "too many demonstrations",
@@ -164,7 +159,9 @@ class Reader(SafeFile):
                 found=len(data),
             )
         names = sorted(data.keys(), key=by_number)
-        return Recording(scene, tuple(self.demonstration(self.group(data, n), n) for n in names), str(self.path))
+        demonstrations = tuple(self.demonstration(self.group(data, n), n) for n in names)
+        self.warn_unread()
+        return Recording(scene, demonstrations, str(self.path))
 
     def scene(self, file: h5py.File) -> str:
         """Read the MJCF, from the file or from one beside it."""
@@ -194,11 +191,14 @@ class Reader(SafeFile):
                 fix=raising("scene_bytes"),
                 found=kind.length,
             )
-        return self.decode(self.bounded(lambda: dataset[()], "scene"), "scene")
+        self.check_attributes(dataset, {CHECKSUM})
+        stored = self.bounded(lambda: dataset[()], "scene")
+        self.check_sum(dataset, stored if isinstance(stored, bytes) else str(stored).encode())
+        return self.decode(stored, "scene")
 
     def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
         """Read one demonstration."""
-        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image"})
+        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image"}, {"task", "success"})
         success = self.attribute(group, "success")
         if success is not None and (np.shape(success) != () or success not in (0, 1)):
             raise self.error("success is not a truth value", group.name, expected="true or false", found=success)
@@ -235,7 +235,7 @@ class Reader(SafeFile):
 
     def channel(self, group: h5py.Group) -> Channel:
         """Read a commanded or measured channel."""
-        self.refuse_unknown(group, {"time", "value"})
+        self.refuse_unknown(group, {"time", "value"}, {"noise_std", "frame"})
         noise = self.attribute(group, "noise_std")
         if noise is not None and (np.shape(noise) != () or np.asarray(noise).dtype.kind not in "fiu"):
             raise self.error("noise_std is not a number", group.name, expected="one number", found=noise)
@@ -253,7 +253,7 @@ class Reader(SafeFile):
 
     def image(self, group: h5py.Group) -> ImageStream:
         """Read the frames of one camera."""
-        self.refuse_unknown(group, {"time", "rgb", "depth"})
+        self.refuse_unknown(group, {"time", "rgb", "depth"}, {"intrinsics", "pose", "body"})
         matrices = {name: self.attribute(group, name) for name in ("intrinsics", "pose")}
         for name, shape in (("intrinsics", (3, 3)), ("pose", (4, 4))):
             if np.shape(matrices[name]) != shape:

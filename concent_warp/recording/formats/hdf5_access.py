@@ -6,8 +6,13 @@ external storage too), and the size of an array is checked before the array is r
 
 from __future__ import annotations
 
+import difflib
+import hashlib
+import itertools
 import math
-from collections.abc import Callable
+import re
+import warnings
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +21,7 @@ import h5py.h5l as h5l
 import h5py.h5z as h5z
 import numpy as np
 
-from concent_warp.errors import RecordingError
+from concent_warp.errors import RecordingError, printable
 from concent_warp.limits import limits, raising
 from concent_warp.recording.bounds import MAX_INFLATION
 from concent_warp.recording.formats.hdf5_heap import memory_bound
@@ -26,6 +31,21 @@ KNOWN_FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, 
 KINDS = {float: "fiu", np.float32: "f", np.uint8: "u", bool: "b"}
 """Kinds of stored numbers that are read as a type."""
 
+CHECKSUM = "sha256"
+"""Attribute of a dataset that HDF5 itself stores without a checksum: the digest of its bytes, in hexadecimal digits."""
+ALL_ATTRIBUTES = (
+    "format", "version", "path", "task", "success", "noise_std", "frame", "intrinsics", "pose", "body", CHECKSUM,
+)  # fmt: skip
+"""Attributes that are read somewhere in a recording."""
+FOREIGN = re.compile(
+    r"CLASS|TITLE|VERSION|FLAVOR|NAME|DIMENSION_LIST|DIMENSION_LABELS|REFERENCE_LIST|_Netcdf.*|_NC.*|PYTABLES.*"
+)
+"""Attributes in which other libraries keep notes of their own."""
+SHOWN_ATTRIBUTES = 3
+"""Attributes that are not read which a warning names."""
+CLOSE_NAME = 0.75
+"""Similarity of names (`difflib`) from which on an unknown attribute is taken for a misspelt one."""
+
 Entry = TypeVar("Entry", h5py.Group, h5py.Dataset)
 
 
@@ -34,7 +54,11 @@ class SafeFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.left = limits().recording_bytes
+        most, size = limits(), path.stat().st_size
+        self.left = min(most.recording_bytes, max(most.unpacked_bytes, most.inflation * size))
+        self.bound = "recording_bytes" if self.left == most.recording_bytes else "unpacked_bytes"
+        self.most = self.left
+        self.unread: list[str] = []
 
     def error(self, what: str, entry: str | None, **details: Any) -> RecordingError:
         """Return the error about an entry of the file."""
@@ -60,8 +84,8 @@ class SafeFile:
             raise self.error(
                 "the recording is too large",
                 entry,
-                expected=f"at most {limits().recording_bytes} bytes in all",
-                fix=raising("recording_bytes"),
+                expected=f"at most {self.most} bytes in all once unpacked",
+                fix=raising(self.bound),
                 found=dataset.shape,
             )
         stored, size = dataset.id.get_storage_size(), self.path.stat().st_size
@@ -72,7 +96,22 @@ class SafeFile:
                 expected=f"data for {dataset.shape}",
                 found=f"{stored} bytes in a file of {size}",
             )
-        return dataset[()].astype(dtype, copy=False)
+        self.check_attributes(dataset, {CHECKSUM})
+        stored_values = dataset[()]
+        self.check_sum(dataset, stored_values)
+        return stored_values.astype(dtype, copy=False)
+
+    def check_sum(self, dataset: h5py.Dataset, content: bytes | np.ndarray) -> None:
+        """Check the bytes of a dataset against its checksum, where it has one."""
+        expected = self.text_attribute(dataset, CHECKSUM)
+        if expected is not None and expected != digest(content):
+            raise self.error(
+                "the data are damaged, or were changed without their checksum",
+                str(dataset.name),
+                expected=f"sha256 {expected[:12]}...",
+                found=f"{digest(content)[:12]}...",
+                fix=f"copy or record it again, or delete the attribute {CHECKSUM!r} if the change is meant",
+            )
 
     def dataset(self, group: h5py.Group, name: str) -> h5py.Dataset:
         """Return a dataset whose data lie in this file."""
@@ -113,13 +152,32 @@ class SafeFile:
             )
         return item
 
-    def refuse_unknown(self, group: h5py.Group, known: set[str]) -> None:
-        """Refuse a group with entries that would be passed over in silence."""
+    def check_attributes(self, item: h5py.Group | h5py.Dataset, known: set[str]) -> None:
+        """Refuse an attribute whose name is close to a known one, and note others that are not read."""
+        for name in itertools.islice(item.attrs.keys(), limits().channels):
+            if name in known or FOREIGN.fullmatch(name):
+                continue
+            near = difflib.get_close_matches(name.lower(), ALL_ATTRIBUTES, n=1, cutoff=CLOSE_NAME)
+            if near:
+                place = f"did you mean {near[0]!r}?" if near[0] in known else f"{near[0]!r} belongs to another entry"
+                raise self.error("unknown attribute", f"{item.name}, attribute {name[:80]}", fix=place)
+            self.unread.append(f"{item.name}, {name[:80]}")
+
+    def warn_unread(self) -> None:
+        """Warn of attributes that are not read."""
+        if self.unread:
+            named = "; ".join(self.unread[:SHOWN_ATTRIBUTES])
+            more = f"; and {len(self.unread) - SHOWN_ATTRIBUTES} more" if len(self.unread) > SHOWN_ATTRIBUTES else ""
+            warnings.warn(printable(f"{self.path}: attributes that are not read: {named}{more}"), stacklevel=4)
+
+    def refuse_unknown(self, group: h5py.Group, known: set[str], attributes: Collection[str] = ()) -> None:
+        """Refuse a group with entries or attributes that would be passed over in silence."""
+        self.check_attributes(group, set(attributes))
         unknown = [name for name, _ in zip(group, range(limits().channels), strict=False) if name not in known][:5]
         if unknown:
             raise self.error("unknown entries", group.name, expected=f"only {sorted(known)}", found=unknown)
 
-    def attribute(self, item: h5py.Group, name: str) -> Any:
+    def attribute(self, item: h5py.Group | h5py.Dataset, name: str) -> Any:
         """Return a small attribute, or None."""
         if name not in item.attrs:
             return None
@@ -143,7 +201,7 @@ class SafeFile:
                 fix=raising("scene_bytes"),
             ) from None
 
-    def text_attribute(self, item: h5py.Group, name: str) -> str | None:
+    def text_attribute(self, item: h5py.Group | h5py.Dataset, name: str) -> str | None:
         """Return a text attribute, or None."""
         value = self.attribute(item, name)
         return None if value is None else self.decode(value, f"{item.name}, attribute {name}")
@@ -158,3 +216,16 @@ class SafeFile:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
             raise self.error("not UTF-8 text", entry, found=error) from None
+
+
+def digest(content: bytes | np.ndarray) -> str:
+    """Return the SHA-256 of the bytes of a text, without trailing zeros, or of an array as it is stored."""
+    if isinstance(content, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(content).tobytes()).hexdigest()
+    return hashlib.sha256(content.rstrip(b"\0")).hexdigest()
+
+
+def sign(dataset: h5py.Dataset) -> None:
+    """Give a dataset the attribute with its checksum."""
+    encoded = digest(dataset[()]).encode()
+    dataset.attrs[CHECKSUM] = np.array(encoded, dtype=h5py.string_dtype("utf-8", len(encoded)))

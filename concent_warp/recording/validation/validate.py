@@ -85,6 +85,22 @@ def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, pl
         _check_time(stream.time, place.at(f"image/{name}"))
         check_image(stream, model, place.at(f"image/{name}"))
     check_clocks(demonstration, place)
+    _check_duration(demonstration, model.opt.timestep, place)
+
+
+def _check_duration(demonstration: Demonstration, timestep: float, place: ErrorLocation) -> None:
+    """Refuse a demonstration that lasts longer, or takes more steps [s] of its scene, than the limits allow."""
+    channels = {kind: getattr(demonstration, kind) for kind in ("action", "measured", "points", "image")}
+    ends = {f"{k}/{n}": float(s.time[-1]) for k, streams in channels.items() for n, s in streams.items()}
+    name = max(ends, key=lambda n: ends[n])
+    for limit, found, unit in (("duration", ends[name], "s"), ("steps", ends[name] / timestep, "steps of the scene")):
+        if found > (most := getattr(limits(), limit)):
+            raise place.at(name).error(
+                "the demonstration is too long to be simulated",
+                expected=f"at most {most:,.0f} {unit}",
+                found=f"a sample at {ends[name]:,.6g} s",
+                fix=f"check the time of the last sample; {raising(limit)}",
+            )
 
 
 def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation) -> None:

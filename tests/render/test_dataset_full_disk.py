@@ -1,0 +1,57 @@
+"""Data sets written to a disk that is full, for which a limit on the size of files stands in."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from small_dataset import LAYOUT, write
+
+from concent_warp.render.dataset.lerobot import LeRobotWriter
+from concent_warp.render.dataset.robomimic import RobomimicWriter
+
+SCRIPT = """
+    import resource, signal, sys
+    from pathlib import Path
+    sys.path.insert(0, sys.argv[4])
+    from small_dataset import LAYOUT, write
+    from concent_warp.errors import ConcentError
+    from concent_warp.render.dataset.lerobot import LeRobotWriter
+    from concent_warp.render.dataset.robomimic import RobomimicWriter
+    writer = {"lerobot": LeRobotWriter, "robomimic": RobomimicWriter}[sys.argv[2]](Path(sys.argv[1]), LAYOUT)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+    try:
+        write(writer, range(2, 4))
+        writer.finish()
+    except (ConcentError, OSError) as error:
+        print(type(error).__name__)
+        sys.exit(2)
+"""
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the content of the files of a data set that are not staged."""
+    found = [path for path in folder.rglob("*") if path.is_file() and ".staging" not in path.parts]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+@pytest.mark.parametrize("size", [0, 500, 2_000, 6_000])
+@pytest.mark.parametrize("kind", ["robomimic", "lerobot"])
+def test_a_full_disk_ends_in_an_error_and_the_data_set_can_be_continued(tmp_path, kind, size):
+    Writer = {"lerobot": LeRobotWriter, "robomimic": RobomimicWriter}[kind]
+    writer = Writer(tmp_path, LAYOUT)
+    write(writer, range(2))
+    assert writer.finish() == 2
+    before = files(tmp_path)
+    place = str(Path(__file__).parent)
+    command = [sys.executable, "-c", textwrap.dedent(SCRIPT), str(tmp_path), kind, str(size), place]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert {name: files(tmp_path)[name] for name in before} == before
+    assert not [path for path in tmp_path.rglob("*partial*") if ".staging" not in path.parts]
+    continued = Writer(tmp_path, LAYOUT)
+    write(continued, [key for key in range(4) if not continued.has(key)])
+    assert continued.finish() == 4
+    assert not list(tmp_path.rglob("*partial*"))
