@@ -18,8 +18,10 @@ from concent_warp.fit.effects.cross_validation import (
     cut_blocks,
     sign_flip_p,
 )
-from concent_warp.fit.effects.least_squares import PRIOR, Linear
+from concent_warp.fit.effects.least_squares import Linear
 from concent_warp.fit.effects.robust import cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
+
+PRIOR = 10.0
 
 
 def window(start: float, end: float, number: int = 0, clock: Any = None) -> Any:

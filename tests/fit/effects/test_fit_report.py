@@ -12,7 +12,6 @@ from concent_warp.errors import ModelError
 from concent_warp.fit.effects import fit as fitting
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.fit import (
-    NORMAL,
     ChannelError,
     FitEffectsCfg,
     FittedEffects,
@@ -28,10 +27,11 @@ from concent_warp.fit.effects.fit import (
 from concent_warp.fit.effects.initial_states import start_cost, start_step
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
 from concent_warp.fit.effects.least_squares import Fit, Linear
-from concent_warp.fit.effects.robust import HUBER, huber_limit, robust_noise_ratio
+from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from tests.fit.effects.test_fit_effects import model_with
 from tests.scenes.swinging import swung
 
+NORMAL, HUBER = 1.96, 4.0
 CFG = FitEffectsCfg()
 PARAMETERS = (
     Parameter("a", "N", 0.0, 0.0, 100.0, 1.0),
@@ -80,7 +80,6 @@ def test_intervals_combine_the_covariance_and_the_discretisation_error():
         assert q.low == pytest.approx(max(values[k] - reach, p.low))
         assert q.high == pytest.approx(min(values[k] + reach, p.high))
         assert not q.at_bound
-    assert NORMAL == 1.96
 
 
 def test_an_effect_of_two_parameters_has_one_discretisation_error_and_one_of_none_has_none():

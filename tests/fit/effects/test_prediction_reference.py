@@ -12,18 +12,12 @@ from scipy.spatial.transform import Rotation
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects import prediction as predicting
 from concent_warp.fit.effects.fading import (
-    AFTER,
-    FADED,
-    LONG,
-    WATCHED,
     ReferenceSimulation,
     _has_faded,
     is_long,
     residuals_near,
 )
 from concent_warp.fit.effects.prediction import (
-    BEYOND,
-    LOST,
     Course,
     Prediction,
     SensorReader,
@@ -33,6 +27,9 @@ from concent_warp.fit.effects.prediction import (
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
+AFTER, FADED, LONG = 1.0, 1e-3, 3.0
+WATCHED = (0.75, 0.85, 0.95, 1.0)
+BEYOND, LOST = 0.05, 1e3
 NONE = np.zeros(0)
 
 

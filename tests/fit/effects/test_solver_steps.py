@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from concent_warp.fit.effects import least_squares
-from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, Linear, Solver, _State, projected
+from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, Solver, _State, projected
 from concent_warp.fit.effects.robust import cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 from tests.fit.effects.synthetic import SPREAD, TRUTH, SyntheticPrediction
 
+PRIOR = 10.0
 ROWS = 14
 
 
@@ -322,7 +322,3 @@ def test_the_true_parameters_and_initial_states_are_found():
     np.testing.assert_allclose(np.array(fit.offsets) * SPREAD, offsets * SPREAD, atol=0.03)
     assert fit.simulated == given.simulated
     np.testing.assert_allclose(shares, (np.arange(len(shares)) + 1) / 10)
-
-
-def test_the_prior_is_as_wide_as_is_stated():
-    assert least_squares.PRIOR == 10.0

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError
-from concent_warp.fit.geometry import perturbation as noise_of
 from concent_warp.fit.geometry.checkpoint import Checkpoint
-from concent_warp.fit.geometry.evolution import SIGMA_SHARE, Evolution, EvolutionCfg
-from concent_warp.fit.geometry.perturbation import JITTER, Perturbation, rbf, smoothed
+from concent_warp.fit.geometry.evolution import Evolution, EvolutionCfg
+from concent_warp.fit.geometry.perturbation import Perturbation, rbf, smoothed
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 from tests.fit.conftest import HALF, corner_spheres
 
+JITTER = 1e-6
 GEOMETRY = corner_spheres(HALF)
 COUNT = len(GEOMETRY)
 GROWTH = np.sign(GEOMETRY.position)
@@ -81,7 +81,6 @@ def test_the_first_steps_are_a_share_of_the_distance_unless_they_are_given():
     fixed = evolution(sigma=5e-4)
     fixed.scale_to(6e-3)
     assert fixed.sigma == 5e-4
-    assert SIGMA_SHARE == 1 / 6
     assert evolution(sigma_decay=0.9).shrink == 1.0
     later = evolution(sigma_decay=0.9)
     later.generation = 3
@@ -229,7 +228,6 @@ def test_swelling_needs_a_growth_and_a_mask_may_hold_no_sphere_of_a_body():
     np.testing.assert_array_equal(plain, without)
     assert (plain[:, geometry.body == 0] == 0).all()
     assert (plain[:, mask] != 0).all()
-    assert noise_of.JITTER == 1e-6
 
 
 def test_smoothing_is_the_mean_over_the_kernel_of_the_same_body():

@@ -187,6 +187,7 @@ def test_faces_are_flattened_unless_the_distance_rises_by_a_tenth(swollen, segme
     assert search.asked == [[segment]]
     if kept:
         assert (found.loss, found.held_out) == (loss, held_out)
+        assert search.evolution.faces is not None
         flat = searching.flattened(rough.geometry, search.evolution.faces)
         np.testing.assert_array_equal(search.evolution.mean[:, :3], flat.position - rough.geometry.position)
     else:
