@@ -34,10 +34,8 @@ class Limits:
     text_bytes: int = 1 << 20
     """A text attribute, such as the task [bytes]."""
     file_bytes: int = 1 << 30
-    """One CSV file, one geometry, one mesh, or one ``.pt`` toss [bytes]; HDF5 files are bounded by what they declare
-    instead."""
-    document_bytes: int = 256 << 20
-    """One TOML or JSON file [bytes]; its text takes about ten times as much once read."""
+    """One CSV, JSON, TOML or geometry file, one mesh, or one ``.pt`` toss [bytes]; HDF5 files are bounded by what they
+    declare instead."""
     chunk_bytes: int = 256 << 20
     """One chunk of an HDF5 dataset, uncompressed: several frames of any camera [bytes]."""
     scene_bytes: int = 256 << 20

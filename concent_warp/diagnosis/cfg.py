@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
+from concent_warp.fit.effects.cfg import EffectSolverCfg
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class SearchCfg:
     quiet_quantile: float = 0.25
     """Quantile of the blocks' RMS residuals that bounds an estimated noise from below [-]. Empirical."""
     quiet_state_iterations: int = 3
-    """Iterations of the initial states in the fit from which that quantile is taken; 12 in other fits. Empirical."""
+    """Iterations of the initial states in the fit from which that quantile is taken. Empirical."""
     max_state_offset: float = 1.0
     """Largest fitted error of an initial state, in units of its standard deviation, up to which sensitivities are taken
     at the fitted states alone and not at the measured ones too: 1 sigma."""
@@ -206,6 +207,8 @@ class DiagnoseCfg:
     """Whether fits of friction, mass and contact stiffness may start from values found by gradients through Newton."""
     data: CheckDataCfg = field(default_factory=CheckDataCfg)
     """Check of the recording."""
+    fits: EffectSolverCfg = field(default_factory=EffectSolverCfg)
+    """Windows, simulations and least squares."""
     search: SearchCfg = field(default_factory=SearchCfg)
     """Search for one missing effect."""
     profile: ProfileLikelihoodCfg = field(default_factory=ProfileLikelihoodCfg)

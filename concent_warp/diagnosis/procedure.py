@@ -41,7 +41,6 @@ from concent_warp.effects.effect import Effect
 from concent_warp.estimation.noise import UNDERESTIMATE
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
-from concent_warp.fit.effects.initial_states import InitialStateCfg
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, observe
 from concent_warp.fit.effects.prediction import Prediction
@@ -106,31 +105,38 @@ class Procedure:
         Noise that is estimated and not stated is increased where the blocks that the model explains best show more:
         filtered readings have less noise between neighbours than over time.
         """
-        noise = channel_noises(self.model, self.recording)
+        noise = channel_noises(self.model, self.recording, self.cfg.fits.observation)
         recorded = [d.measured for d in self.recording.demonstrations]
         stated = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
         if stated >= set(noise):
-            return self._fitted_baseline(noise, InitialStateCfg.iterations)
+            return self._fitted_baseline(noise)
         search = self.cfg.search
         rough = self._fitted_baseline(noise, search.quiet_state_iterations)
         ratios = quiet_noise_ratios(rough, search.quiet_quantile)
         larger = {c: r for c, r in ratios.items() if c not in stated and r > UNDERESTIMATE}
-        return self._fitted_baseline(
-            {c: std * larger.get(c, 1.0) for c, std in noise.items()}, InitialStateCfg.iterations
-        )
+        return self._fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
 
-    def _fitted_baseline(self, noise: Mapping[str, float], state_iterations: int) -> FittedModel:
+    def _fitted_baseline(self, noise: Mapping[str, float], state_iterations: int | None = None) -> FittedModel:
         """Return the model as given, fitted to readings of some noise."""
-        self.noise = dict(noise)
+        self.noise, fits = dict(noise), self.cfg.fits
         windows = self._windows(self.model, self.cfg.window)
         self.runner.progress(0.03, "fitting the model as given")
-        check_finite(Prediction(self.model, (), windows, engine=self.engine), self.model.scene.source)
-        blocks = cut_blocks(windows)
-        return fit_baseline(self.model, windows, blocks, self.engine, state_iterations=state_iterations)
+        given = Prediction(self.model, (), windows, engine=self.engine, cfg=fits.prediction)
+        check_finite(given, self.model.scene.source)
+        blocks = cut_blocks(windows, fits.blocks)
+        return fit_baseline(self.model, windows, blocks, self.engine, state_iterations=state_iterations, cfg=fits)
 
     def _windows(self, model: Model, length: float | None) -> Sequence[Window]:
         """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None."""
-        return observe(model, self.recording, length=length, noise=self.noise, engine=self.engine, seed=self.cfg.seed)
+        return observe(
+            model,
+            self.recording,
+            length=length,
+            noise=self.noise,
+            engine=self.engine,
+            seed=self.cfg.seed,
+            cfg=self.cfg.fits.observation,
+        )
 
     def find_addition(self, base: FittedModel, step: int) -> tuple[FittedCandidate | None, tuple[Detectable, ...]]:
         """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all."""
@@ -247,7 +253,7 @@ class Procedure:
         groups = [found for found in self.hypotheses if len(found) > 1]
         if not groups:
             return None
-        cfg = replace(self.cfg.experiment, seed=self.cfg.seed)
+        cfg = replace(self.cfg.experiment, seed=self.cfg.seed, observation=self.cfg.fits.observation)
         return suggest_experiment(groups[0], self.recording, cfg, engine=self.engine)
 
     def _failures(self, given: FittedModel) -> tuple[Mapping[str, Any], ...]:

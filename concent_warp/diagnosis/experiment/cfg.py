@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from concent_warp.fit.effects.observation import ObservationCfg
+
 
 @dataclass(frozen=True)
 class MotionMenuCfg:
@@ -84,3 +86,5 @@ class SuggestExperimentCfg:
     """Seed of the perturbations that bound how long a motion can be predicted."""
     menu: MotionMenuCfg = field(default_factory=MotionMenuCfg)
     """The motions that may be suggested."""
+    observation: ObservationCfg = field(default_factory=ObservationCfg)
+    """Noise of readings and uncertainty of initial states; a diagnosis takes its own."""

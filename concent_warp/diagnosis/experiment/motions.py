@@ -17,7 +17,7 @@ import numpy as np
 from concent_warp.diagnosis.experiment.cfg import MotionMenuCfg
 from concent_warp.effects.select import POSES, free_bodies
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import ObservedRecording
+from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.simulate.replay import commands, initial_state
 
@@ -65,6 +65,8 @@ class RecordedRange:
     """Standard deviation of a component of each channel."""
     cfg: MotionMenuCfg = field(default_factory=MotionMenuCfg)
     """Settings of the motions."""
+    observation: ObservationCfg = field(default_factory=ObservationCfg)
+    """Noise of readings and uncertainty of initial states."""
 
     @cached_property
     def m(self) -> mujoco.MjModel:
@@ -74,7 +76,7 @@ class RecordedRange:
     @cached_property
     def source(self) -> ObservedRecording:
         """The recording as the model reads it."""
-        return ObservedRecording(self.model, self.recording, self.noise)
+        return ObservedRecording(self.model, self.recording, self.noise, self.observation)
 
     @cached_property
     def starts(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -73,7 +73,8 @@ def suggest_experiment(
     if len(chosen) < 2:
         return None
     first = next(iter(chosen.values()))
-    recorded = RecordedRange(first, recording, channel_noises(first, recording), cfg.menu)
+    noise = channel_noises(first, recording, cfg.observation)
+    recorded = RecordedRange(first, recording, noise, cfg.menu, cfg.observation)
     tilted = any(a.effect.name == "gravity_tilt" for model in chosen.values() for a in model.effects)
     menu = [*drive_motions(recorded, tilted), *body_motions(recorded, engine, tilted)]
     report, count = progress or _ignore, len(menu) + cfg.finalists
@@ -134,7 +135,7 @@ def _uncertain_start_separations(
     if whole is None:
         return None
     model = motion.change(recorded.model)
-    source = ObservedRecording(model, recorded.recording, recorded.noise)
+    source = ObservedRecording(model, recorded.recording, recorded.noise, cfg.observation)
     reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, cfg.seed)
     if (window := _future_window(recorded, motion, reach)) is None:
         return None
@@ -181,7 +182,7 @@ def _future_window(recorded: RecordedRange, motion: ProposedMotion, duration: fl
         return None
     measured = {r.channel: Channel(r.time, r.value, noise_std=r.std) for r in readings}
     d = Demonstration(motion.name, qpos=motion.qpos, qvel=motion.qvel, action=motion.action, measured=measured)
-    spread = start_spread(m, {c: recorded.noise[c] for c in channels})
+    spread = start_spread(m, {c: recorded.noise[c] for c in channels}, recorded.observation)
     clocks = np.concatenate(clock)
     return Window(d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks)
 

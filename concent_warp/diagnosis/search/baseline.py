@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
-from concent_warp.fit.effects.initial_states import InitialStateCfg
 from concent_warp.fit.effects.least_squares import Fit, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
@@ -24,7 +24,8 @@ def fit_baseline(
     blocks: Blocks,
     engine: EngineName = "mujoco",
     *,
-    state_iterations: int = InitialStateCfg.iterations,
+    state_iterations: int | None = None,
+    cfg: EffectSolverCfg | None = None,
 ) -> FittedModel:
     """Fit a model's own parameters and the initial states of all windows.
 
@@ -33,29 +34,33 @@ def fit_baseline(
         windows: The measured windows.
         blocks: Blocks of time of the windows' residuals.
         engine: Which engine simulates.
-        state_iterations: Most iterations of the initial states; with fewer than by default parameters get no second
-            fit.
+        state_iterations: Most iterations of the initial states; with fewer than by default, as the settings have it,
+            parameters get no second fit.
+        cfg: Settings.
     """
-    solver = Solver(Prediction(model, (), windows, engine=engine))
+    cfg = cfg or EffectSolverCfg()
+    enough = cfg.least_squares.initial_states.iterations
+    state_iterations = enough if state_iterations is None else state_iterations
+    solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
     measured = [np.zeros(len(w.spread)) for w in windows]
     fit = solver.fit(None, *solver.fit_initial_states(solver.p.start, measured, state_iterations))
-    if len(fit.values) and state_iterations >= InitialStateCfg.iterations:
+    if len(fit.values) and state_iterations >= enough:
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
-    return _fitted_model(model, windows, blocks, fit, engine)
+    return _fitted_model(model, windows, blocks, fit, engine, cfg)
 
 
 def refit_without_effect(last: FittedModel, effect: int) -> FittedModel:
     """Return the fitted model without one of its effects, by its index, all that is left fitted again."""
     model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
-    solver = Solver(Prediction(model, (), last.windows, engine=last.engine))
+    solver = replace(last, model=model).solver()
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
-    return _fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine)
+    return _fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
 
 
 def add_candidate(base: FittedModel, added: FittedCandidate) -> FittedModel:
     """Return the baseline with the effect of a fitted candidate."""
-    return _fitted_model(added.model, base.windows, base.blocks, added.fit, base.engine)
+    return _fitted_model(added.model, base.windows, base.blocks, added.fit, base.engine, base.cfg)
 
 
 def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> FittedModel:
@@ -63,9 +68,9 @@ def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> F
 
     A fit may end in a local minimum of an initial state; a rival that only left such a minimum has explained nothing.
     """
-    solver = Solver(Prediction(base.model, (), base.windows, engine=base.engine))
+    solver = base.solver()
     fit = solver.improve_initial_states(base.fit, [c.fit.offsets for c in rivals])
-    found = _fitted_model(base.model, base.windows, base.blocks, fit, base.engine)
+    found = _fitted_model(base.model, base.windows, base.blocks, fit, base.engine, base.cfg)
     return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 
 
@@ -84,9 +89,12 @@ def quiet_noise_ratios(base: FittedModel, quantile: float) -> dict[str, float]:
     return {channel: float(np.quantile(values, quantile)) for channel, values in blocks.items()}
 
 
-def _fitted_model(model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName) -> FittedModel:
+def _fitted_model(
+    model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName, cfg: EffectSolverCfg
+) -> FittedModel:
     """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
-    pieces = tuple(projected(fit))
-    limit = huber_limit([piece.residual for piece in pieces])
-    errors = HeldOut(block_sums(pieces, blocks, limit), blocks).own()
-    return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine)
+    settings = cfg.least_squares
+    pieces = tuple(projected(fit, settings.robust))
+    limit = huber_limit([piece.residual for piece in pieces], settings.robust)
+    errors = HeldOut(block_sums(pieces, blocks, limit), blocks, settings.prior).own()
+    return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine, cfg)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.effects.effect import Effect
-from concent_warp.fit.effects.cross_validation import Blocks, Sums
-from concent_warp.fit.effects.least_squares import Fit, Linear
+from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
+from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import robust_noise_ratio
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
@@ -31,16 +34,34 @@ class FittedModel:
     errors: np.ndarray
     """Held-out error of each block, shape (B,)."""
     engine: EngineName = "mujoco"
+    cfg: EffectSolverCfg = field(default_factory=EffectSolverCfg)
+    """Settings of this fit and of those of candidates."""
 
     @property
     def ratio(self) -> float:
         """Robust RMS residual over the noise [-]: 1 where the model explains all but noise."""
-        return robust_noise_ratio([piece.residual for piece in self.pieces])
+        return robust_noise_ratio([piece.residual for piece in self.pieces], self.cfg.least_squares.robust)
 
     @property
     def noise_ratio(self) -> float:
         """Root mean square residual over the noise [-], "x noise"."""
         return noise_ratio(np.concatenate([piece.residual for piece in self.pieces]))
+
+    def prediction(self, *effects: Effect, windows: Sequence[Window] = ()) -> Prediction:
+        """Return the prediction of the model with some more effects, for its own windows or others."""
+        return Prediction(self.model, effects, windows or self.windows, engine=self.engine, cfg=self.cfg.prediction)
+
+    def solver(self, *effects: Effect, windows: Sequence[Window] = ()) -> Solver:
+        """Return the solver for the model with some more effects, for its own windows or others."""
+        return Solver(self.prediction(*effects, windows=windows), self.cfg.least_squares)
+
+    def held_out(self, pieces: Sequence[Linear]) -> HeldOut:
+        """Return the held-out errors of residuals and sensitivities by window, over the model's blocks."""
+        return HeldOut(block_sums(pieces, self.blocks, self.limit), self.blocks, self.cfg.least_squares.prior)
+
+    def projected(self, fit: Fit) -> list[Linear]:
+        """Return residuals and sensitivities of a fit with the initial states eliminated, window by window."""
+        return projected(fit, self.cfg.least_squares.robust)
 
 
 @dataclass(frozen=True)

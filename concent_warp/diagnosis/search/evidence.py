@@ -14,7 +14,6 @@ from concent_warp.diagnosis.search.null_distribution import null_p_value
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
-from concent_warp.fit.effects.prediction import Prediction
 
 
 def assess(
@@ -71,10 +70,12 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
 
     The error of the formula itself is included, see `discretisation_errors`.
     """
-    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    std = np.sqrt(np.diag(covariance(c.sums, base.blocks))) if c.std is None else c.std
+    prediction = base.prediction(c.effect)
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior))) if c.std is None else c.std
     fresh = range(prediction.owned, len(prediction.parameters))
-    formula = discretisation_errors([prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :])
+    formula = discretisation_errors(
+        [prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :], base.cfg.discretisation_error
+    )
     found = []
     for k in fresh:
         p, value = prediction.parameters[k], float(c.fit.values[k])
@@ -142,7 +143,7 @@ def _plausibility(base: FittedModel, c: FittedCandidate, f: Finding) -> float:
     Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
     a Cauchy prior of sizes, and the effect's rarity.
     """
-    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
+    prediction = base.prediction(c.effect)
     scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
     away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
     fit = -_log_errors(base, c) - len(scale) * np.log(base.blocks.count)
@@ -159,7 +160,7 @@ def detectable_size(base: FittedModel, s: ScreenedCandidate, share: float) -> De
         s: The candidate.
         share: Share of the held-out error that an effect must remove [-].
     """
-    prediction = Prediction(base.model, (s.effect,), base.windows, engine=base.engine)
+    prediction = base.prediction(s.effect)
     normal = sum(piece.jacobian.T @ piece.jacobian for piece in s.pieces)
     needed = max(share, 0.0) * base.errors.sum()
     best = None

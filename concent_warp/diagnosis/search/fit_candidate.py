@@ -8,25 +8,22 @@ from dataclasses import replace
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
-from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
-from concent_warp.fit.effects.least_squares import Fit, Solver, projected
+from concent_warp.fit.effects.least_squares import Fit, Solver
 from concent_warp.fit.effects.observation import Window
-from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import robust_noise_ratio
 
 
 def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window] = ()) -> Solver:
     """Return the solver of the baseline with one effect more; over other windows where some are given."""
-    return Solver(Prediction(base.model, (effect,), windows or base.windows, engine=base.engine))
+    return base.solver(effect, windows=windows or ())
 
 
 def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit) -> FittedCandidate:
     """Return a fit of a candidate with its residuals and held-out errors."""
-    pieces = tuple(projected(fit))
-    sums = block_sums(pieces, base.blocks, base.limit)
-    errors = HeldOut(sums, base.blocks).own()
-    ratio = robust_noise_ratio([piece.residual for piece in pieces])
-    return FittedCandidate(effect, solver.p.model(fit.values), fit, sums, pieces, errors, ratio)
+    pieces = tuple(base.projected(fit))
+    held_out = base.held_out(pieces)
+    ratio = robust_noise_ratio([piece.residual for piece in pieces], base.cfg.least_squares.robust)
+    return FittedCandidate(effect, solver.p.model(fit.values), fit, held_out.sums, pieces, held_out.own(), ratio)
 
 
 def fit_candidate(base: FittedModel, screened: ScreenedCandidate) -> FittedCandidate:

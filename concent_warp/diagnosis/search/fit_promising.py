@@ -20,7 +20,6 @@ from concent_warp.diagnosis.search.fit_candidate import (
     restart_candidate,
 )
 from concent_warp.diagnosis.tasks import TaskRunner
-from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 from concent_warp.fit.effects.observation import Window
 
 BATCH_SPAN = 0.15
@@ -75,7 +74,7 @@ class CandidateFits:
             expected: Gain that each candidate may have, shape (candidates,).
         """
         base, search = self.base, self.search
-        for _ in range(search.max_rounds if len(base.windows) <= LeastSquaresCfg.max_polished_windows else 1):
+        for _ in range(search.max_rounds if len(base.windows) <= base.cfg.least_squares.max_polished_windows else 1):
             before, best = list(self.fits), self._best()
             k_best, least = self.fits.index(best), search.close_min_gain * best.share(base)
             close = [k for k, c in enumerate(self.fits) if c is not best and expected[k] > least]

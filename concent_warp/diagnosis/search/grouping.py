@@ -12,7 +12,6 @@ from concent_warp.diagnosis.search.evidence import indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import polish_candidate
 from concent_warp.diagnosis.search.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.tasks import TaskRunner
-from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 
 
 def group_indistinguishable(
@@ -44,7 +43,7 @@ def group_indistinguishable(
     near = indistinguishable(base, accepted, search, slack=search.near_equal_factor)
     if (
         len(near) > len(indistinguishable(base, accepted, search))
-        and len(base.windows) <= LeastSquaresCfg.max_polished_windows
+        and len(base.windows) <= base.cfg.least_squares.max_polished_windows
     ):
         first, rest = near[: search.profiled], near[search.profiled :]
         near = [with_evidence(refine_by_profile(base, c, runner, cfg.profile)) for c, _ in first] + rest

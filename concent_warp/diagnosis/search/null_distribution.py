@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
-from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.robust import huber_weight
 
 
@@ -31,11 +30,11 @@ def max_gain_under_null(
     square = np.zeros(base.blocks.count)
     for piece, w, rows in zip(base.pieces, weight, base.blocks.of_row, strict=True):
         square += np.bincount(rows, (piece.residual * w) ** 2, minlength=base.blocks.count)
-    own = HeldOut(block_sums(base.pieces, base.blocks, base.limit), base.blocks)
+    own = base.held_out(base.pieces)
     before = own.errors(signs[..., None] * own.sums.slope, square).sum(axis=1)
     best = np.full(samples, -np.inf)
     for s in screened:
-        held = HeldOut(block_sums(s.pieces, base.blocks, base.limit), base.blocks)
+        held = base.held_out(s.pieces)
         after = held.errors(signs[..., None] * held.sums.slope, square).sum(axis=1)
         best = np.maximum(best, (before - after) / np.maximum(before, 1e-12))
     return best

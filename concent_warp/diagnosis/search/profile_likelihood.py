@@ -20,7 +20,6 @@ from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.search.fit_candidate import candidate_solver, fitted_candidate
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.intervals import covariance
-from concent_warp.fit.effects.prediction import Prediction
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def profile_point(
     base: FittedModel, c: FittedCandidate, parameter: int, distance: float, cfg: ProfileLikelihoodCfg
 ) -> ProfilePoint:
     """Evaluate the cost at a signed distance [standard deviations] along the profile of a parameter."""
-    solver, known = candidate_solver(base, c.effect), covariance(c.sums, base.blocks)
+    solver, known = candidate_solver(base, c.effect), covariance(c.sums, base.blocks, base.cfg.least_squares.prior)
     move = distance * known[parameter] / np.sqrt(known[parameter, parameter])
     move = np.where(np.isfinite(c.fit.values), move, 0.0)
     values = solver.inside(c.fit.values + move * solver.scale)
@@ -103,8 +102,8 @@ def _next_distances(
 
     Both sides of each parameter at first; then farther on the sides where the cost has not risen enough.
     """
-    prediction = Prediction(base.model, (c.effect,), base.windows, engine=base.engine)
-    std = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    prediction = base.prediction(c.effect)
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior)))
     found = []
     for k in range(prediction.owned, len(prediction.parameters)):
         p, value = prediction.parameters[k], c.fit.values[k]
@@ -164,7 +163,7 @@ def _standard_deviations(
     Those of the linear fit, increased by the flatter curvature of the profile, by the offset of its minimum and by its
     roughness.
     """
-    std = np.sqrt(np.diag(covariance(c.sums, base.blocks)))
+    std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior)))
     for k in {s.parameter for s in points}:
         rough = _roughness(c, points, k, cfg)
         ends = [s for side in (-1, 1) if (s := _farthest(points, k, side)) is not None]

@@ -10,9 +10,7 @@ import numpy as np
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
-from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
-from concent_warp.fit.effects.least_squares import Linear, Solver, projected
-from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.least_squares import Linear, Solver
 from concent_warp.fit.effects.robust import cauchy_weight, huber
 
 
@@ -28,18 +26,20 @@ def screen(base: FittedModel, effect: Effect, cfg: SearchCfg | None = None) -> S
         cfg: Settings.
     """
     cfg = cfg or SearchCfg()
-    solver = Solver(Prediction(base.model, (effect,), base.windows, engine=base.engine))
+    solver = base.solver(effect)
     values = solver.p.start.copy()
     # Sensitivities need finite values where the null value is infinite, as that of a limit is.
     at = np.where(np.isfinite(values), values, solver.scale)
     # The residual is the baseline's own; at a start off the null value it is another.
-    pieces = with_residuals(projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces)
+    pieces = with_residuals(
+        base.projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces
+    )
     gain = _linear_gain(base, pieces, base.pieces, base.errors)
     if max(float(np.abs(o).max()) for o in base.fit.offsets) > cfg.max_state_offset:
         zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
-        measured = projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
+        measured = base.projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in measured]
-        before = HeldOut(block_sums(plain, base.blocks, base.limit), base.blocks).own()
+        before = base.held_out(plain).own()
         gain = max(gain, _linear_gain(base, measured, plain, before))
     scanned_gain, start = _scan(solver, base, values)
     return ScreenedCandidate(effect, gain, scanned_gain, start, pieces)
@@ -64,7 +64,7 @@ def projected_residuals(
     residuals = solver.p.residuals(solver.trials(values, offsets))
     found = []
     for r, a, o in zip(residuals, base.fit.starts, offsets, strict=True):
-        near = cauchy_weight(o)
+        near = cauchy_weight(o, base.cfg.least_squares.robust)
         inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
         found.append(r - a @ inner)
     return found
@@ -77,7 +77,7 @@ def robust_sum(base: FittedModel, residuals: Sequence[np.ndarray]) -> float:
 
 def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Linear], before: np.ndarray) -> float:
     """Return the share of the held-out error that a linear step along the sensitivities removes."""
-    errors = HeldOut(block_sums(with_residuals(pieces, plain), base.blocks, base.limit), base.blocks).own()
+    errors = base.held_out(with_residuals(pieces, plain)).own()
     return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
 
 

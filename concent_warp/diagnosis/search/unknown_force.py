@@ -26,8 +26,7 @@ from concent_warp.diagnosis.search.screening import screen, with_residuals
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, free_bodies, name, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
-from concent_warp.fit.effects.cross_validation import FOLDS, HeldOut, block_sums, sign_flip_p
-from concent_warp.fit.effects.least_squares import PRIOR
+from concent_warp.fit.effects.cross_validation import sign_flip_p
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands
@@ -106,7 +105,7 @@ def _best_force(
 def _held_out(base: FittedModel, s: ScreenedCandidate) -> np.ndarray:
     """Return the held-out error of each block, shape (B,), after a linear step with the sensitivities."""
     pieces = with_residuals(s.pieces, base.pieces)
-    return HeldOut(block_sums(pieces, base.blocks, base.limit), base.blocks).own()
+    return base.held_out(pieces).own()
 
 
 def _with_interleaved_folds(base: FittedModel) -> FittedModel:
@@ -115,9 +114,9 @@ def _with_interleaved_folds(base: FittedModel) -> FittedModel:
     A force of no known form predicts nothing at positions that were not visited, and few throws visit the same ones.
     """
     count = base.blocks.count
-    blocks = replace(base.blocks, fold=np.arange(count) % min(FOLDS, count))
-    errors = HeldOut(block_sums(base.pieces, blocks, base.limit), blocks).own()
-    return replace(base, blocks=blocks, errors=errors)
+    blocks = replace(base.blocks, fold=np.arange(count) % min(base.cfg.blocks.folds, count))
+    interleaved = replace(base, blocks=blocks)
+    return replace(interleaved, errors=interleaved.held_out(base.pieces).own())
 
 
 def _with_prior(base: FittedModel, s: ScreenedCandidate, share: float) -> ScreenedCandidate:
@@ -126,7 +125,7 @@ def _with_prior(base: FittedModel, s: ScreenedCandidate, share: float) -> Screen
     square = np.sum([(piece.jacobian[:, own:] ** 2).sum(axis=0) for piece in s.pieces], axis=0)
     seen = square > 1e-9 * max(float(np.max(square)), 1e-30)
     each = share * base.errors.sum() / max(int(seen.sum()), 1)
-    factor = np.where(seen, np.sqrt(each / np.maximum(square, 1e-30)) / PRIOR, 0.0)
+    factor = np.where(seen, np.sqrt(each / np.maximum(square, 1e-30)) / base.cfg.least_squares.prior, 0.0)
     scale = np.concatenate([np.ones(own), factor])
     return replace(s, pieces=tuple(replace(piece, jacobian=piece.jacobian * scale) for piece in s.pieces))
 

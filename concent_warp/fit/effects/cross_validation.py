@@ -20,18 +20,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from concent_warp.fit.effects.least_squares import PRIOR, Linear
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Linear
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.robust import huber_weight
 
-FOLDS = 5
-"""Folds of the cross-validation [-]."""
-FEWEST_BLOCKS = 12
-"""Least blocks that a recording is cut into [-], at the cost of shorter blocks."""
-MOST_BLOCKS = 60
-"""Most blocks [-]."""
-SHORTEST = 0.1
-"""Shortest block [s], unless there are fewer than `FEWEST_BLOCKS`."""
+
+@dataclass(frozen=True)
+class BlockCfg:
+    """How a recording is cut into blocks and folds."""
+
+    folds: int = 5
+    """Folds of the cross-validation [-]: the usual 5 to 10 (Hastie, Tibshirani and Friedman, "The Elements of
+    Statistical Learning", 2009, section 7.10)."""
+    min_blocks: int = 12
+    """Least blocks that a recording is cut into [-], at the cost of shorter blocks: the smallest p-value of a sign-flip
+    test is then 1 / 4096."""
+    max_blocks: int = 60
+    """Most blocks [-]."""
+    min_length: float = 0.1
+    """Shortest block [s], unless there are fewer than `min_blocks`: residuals are correlated over shorter times."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +62,17 @@ class Blocks:
         return len(self.fold)
 
 
-def cut_blocks(windows: Sequence[Window], folds: int = FOLDS) -> Blocks:
-    """Cut windows into blocks of about the same length, and deal them to folds.
+def cut_blocks(windows: Sequence[Window], cfg: BlockCfg | None = None) -> Blocks:
+    """Return windows cut into blocks of about the same length, and assigned to folds.
 
     Folds are whole demonstrations where there are at least as many as folds; else blocks in turn, so that every phase
     of a motion is in each.
     """
+    cfg = cfg or BlockCfg()
     total = sum(w.end - w.start for w in windows)
-    length = max(total / MOST_BLOCKS, SHORTEST)
-    if total / length < FEWEST_BLOCKS:
-        length = total / FEWEST_BLOCKS
+    length = max(total / cfg.max_blocks, cfg.min_length)
+    if total / length < cfg.min_blocks:
+        length = total / cfg.min_blocks
     of_row, demonstration, starts, ends = [], [], [], []
     for w in windows:
         parts = max(round((w.end - w.start) / length), 1)
@@ -77,7 +85,7 @@ def cut_blocks(windows: Sequence[Window], folds: int = FOLDS) -> Blocks:
             ends.append(w.start + (k + 1) * width)
     numbers = np.array(demonstration)
     known, place = np.unique(numbers, return_inverse=True)
-    fold = place % folds if len(known) >= folds else np.arange(len(starts)) % folds
+    fold = place % cfg.folds if len(known) >= cfg.folds else np.arange(len(starts)) % cfg.folds
     return Blocks(tuple(of_row), fold, numbers, np.array(starts), np.array(ends))
 
 
@@ -112,12 +120,13 @@ def block_sums(linear: Sequence[Linear], blocks: Blocks, limit: float) -> Sums:
 class HeldOut:
     """Held-out errors of one candidate, for its own residuals or for others."""
 
-    def __init__(self, sums: Sums, blocks: Blocks) -> None:
+    def __init__(self, sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior) -> None:
+        """Prepare the fits without each fold; `prior` is `LeastSquaresCfg.prior`."""
         self.sums, self.blocks = sums, blocks
         size = sums.slope.shape[1]
         self._inverse = []
         for f in range(int(blocks.fold.max()) + 1):
-            kept = sums.normal[blocks.fold != f].sum(axis=0) + np.eye(size) / PRIOR**2
+            kept = sums.normal[blocks.fold != f].sum(axis=0) + np.eye(size) / prior**2
             self._inverse.append(np.linalg.pinv(kept, hermitian=True))
 
     def errors(self, slope: np.ndarray, square: np.ndarray) -> np.ndarray:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.errors import ModelError
+from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
-from concent_warp.fit.effects.least_squares import PRIOR, Fit, LeastSquaresCfg, Linear, Solver, projected
+from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
@@ -69,7 +70,7 @@ class FittedEffects:
 
 
 @dataclass(frozen=True)
-class FitEffectsCfg:
+class FitEffectsCfg(EffectSolverCfg):
     """Settings of a fit of effect parameters.
 
     Example:
@@ -80,8 +81,6 @@ class FitEffectsCfg:
 
     window: float | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
-    least_squares: LeastSquaresCfg = field(default_factory=LeastSquaresCfg)
-    """Settings of the least squares."""
     seed: int = 0
     """Seed of the disturbances that determine how long windows may be."""
     undetermined_share: float = 0.5
@@ -136,8 +135,9 @@ def fit_effects(
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
     report = progress or _silent
     report(0.0, "cutting windows")
-    windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed)
-    solver = Solver(Prediction(model, (), windows, engine=engine), cfg.least_squares)
+    windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed, cfg=cfg.observation)
+    robust = cfg.least_squares.robust
+    solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
     check_finite(solver.p, model.scene.source)
     report(0.1, "initial states")
     start = solver.p.start
@@ -148,13 +148,13 @@ def fit_effects(
     fit = solver.fit(chosen, offsets, starts, lambda share: report(0.3 + 0.5 * share, "fitting"))
     report(0.8, "fitting again")
     fit = solver.polish(fit)
-    linear = projected(fit)
+    linear = projected(fit, robust)
     found = [window_linear.residual for window_linear in linear]
     report(1.0, "done")
     parameters, correlation = _fitted_parameters(solver, fit, linear, windows, cfg)
     remarks = _remarks(solver, fit, parameters, correlation, cfg)
     before, after = noise_ratio(np.concatenate(given)), noise_ratio(np.concatenate(found))
-    if robust_noise_ratio(found) > max(robust_noise_ratio(given), cfg.noise_ratio):
+    if robust_noise_ratio(found, robust) > max(robust_noise_ratio(given, robust), cfg.noise_ratio):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
@@ -199,8 +199,9 @@ def _residuals_at(
 ) -> list[np.ndarray]:
     """Return the residuals at some values with the initial states eliminated, one (n,) a window."""
     residuals = solver.p.residuals(solver.trials(values, offsets))
-    limit = huber_limit(residuals)
-    return [r + a @ start_step(r, a, o, limit, 0.0) for r, a, o in zip(residuals, starts, offsets, strict=True)]
+    robust = solver.cfg.robust
+    limit = huber_limit(residuals, robust)
+    return [r + a @ start_step(r, a, o, limit, 0.0, robust) for r, a, o in zip(residuals, starts, offsets, strict=True)]
 
 
 def _best_start(
@@ -218,8 +219,8 @@ def _best_start(
     if len(trials) == 1:
         return trials[0]
     residuals = [_residuals_at(solver, values, offsets, starts) for values in trials]
-    limit = huber_limit(residuals[0])
-    costs = [sum(start_cost(r, np.zeros(1), limit) for r in of_trial) for of_trial in residuals]
+    limit = huber_limit(residuals[0], solver.cfg.robust)
+    costs = [sum(start_cost(r, np.zeros(1), limit, solver.cfg.robust) for r in of_trial) for of_trial in residuals]
     best = int(np.argmin(costs))
     return trials[best] if costs[best] < costs[0] - cfg.min_scan_gain else trials[0]
 
@@ -231,20 +232,22 @@ def _fitted_parameters(
 
     The intervals combine the covariance of the linear fit with `discretisation_errors`.
     """
-    blocks = cut_blocks(windows)
-    limit = huber_limit([window_linear.residual for window_linear in linear])
-    covered = covariance(block_sums(linear, blocks, limit), blocks)
+    settings, blocks = cfg.least_squares, cut_blocks(windows, cfg.blocks)
+    limit = huber_limit([window_linear.residual for window_linear in linear], settings.robust)
+    covered = covariance(block_sums(linear, blocks, limit), blocks, settings.prior)
     std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
     force_model = np.zeros(len(std))
     for part in solver.p.split:
         if part.stop > part.start:
-            force_model[part] = discretisation_errors(solver.p.parameters[part], fit.values[part])
+            force_model[part] = discretisation_errors(
+                solver.p.parameters[part], fit.values[part], cfg.discretisation_error
+            )
     reaches = NORMAL * np.hypot(std * solver.scale, force_model)
     found = []
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)
         low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
-        undetermined = high - low > 2 * NORMAL * cfg.undetermined_share * PRIOR * q.scale
+        undetermined = high - low > 2 * NORMAL * cfg.undetermined_share * cfg.least_squares.prior * q.scale
         if np.isinf(q.null) and (high >= q.high or undetermined):  # a limit that is never reached counts as absent
             high = q.null
         at_bound = value in (q.low, q.high) and q.null not in (value, high)
@@ -264,7 +267,7 @@ def _remarks(
         if q.at_bound:
             found.append(f"{q.name} ended on its bound, {q.value:g} {q.unit}: what is missing may be something else.")
         width = q.high - q.low
-        if width > 2 * NORMAL * cfg.undetermined_share * PRIOR * prior.scale or width >= 0.99 * (
+        if width > 2 * NORMAL * cfg.undetermined_share * cfg.least_squares.prior * prior.scale or width >= 0.99 * (
             prior.high - prior.low
         ):
             unknown.add(k)

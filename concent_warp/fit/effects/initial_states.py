@@ -8,13 +8,13 @@ restarts are tried as well.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from concent_warp.fit.effects.fading import ReferenceSimulation, is_long, residuals_near
+from concent_warp.fit.effects.fading import FadingCfg, ReferenceSimulation, is_long, residuals_near
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.fit.effects.robust import cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
+from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class InitialStateCfg:
     """States sampled about the measured one, of which the likeliest restarts an outlying window; 0 for none."""
     restart_spreads: tuple[float, ...] = (0.5, 1.0, 2.0)
     """Spreads of these samples, used in turn, in units of the state's spread [-]."""
+    fading: FadingCfg = field(default_factory=FadingCfg)
+    """When errors of an initial state count as faded."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,15 @@ class _FiniteDifferences:
 class InitialStateSearch:
     """Fits the initial states of the windows of a prediction."""
 
-    def __init__(self, prediction: Prediction, cfg: InitialStateCfg | None = None) -> None:
+    def __init__(
+        self, prediction: Prediction, cfg: InitialStateCfg | None = None, robust: RobustLossCfg | None = None
+    ) -> None:
         """Prepare to fit those of `prediction`."""
-        self.p, self.cfg = prediction, cfg or InitialStateCfg()
+        self.p, self.cfg, self.robust = prediction, cfg or InitialStateCfg(), robust or RobustLossCfg()
         self.steps = [np.full(len(w.spread), self.cfg.first_step) for w in prediction.windows]
-        self.fading = [np.full(len(w.spread), is_long(prediction, i)) for i, w in enumerate(prediction.windows)]
+        self.fading = [
+            np.full(len(w.spread), is_long(prediction, i, self.cfg.fading)) for i, w in enumerate(prediction.windows)
+        ]
         """Components of each window's initial state whose errors have faded so far."""
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[SimulationRequest]:
@@ -95,7 +101,8 @@ class InitialStateSearch:
             moved.append(offsets[w] + np.diag(self.steps[w]))
             trials += [SimulationRequest(w, values, row * self.p.windows[w].spread) for row in moved[-1]]
             may_fade += self.fading[w].tolist()
-        found, faded = residuals_near(self.p, self.references(values, offsets, residuals, windows), trials, may_fade)
+        references = self.references(values, offsets, residuals, windows)
+        found, faded = residuals_near(self.p, references, trials, may_fade, self.cfg.fading)
         differences, at = [], 0
         for w, offset in zip(windows, moved, strict=True):
             seen = found[at : at + len(offset)]
@@ -144,12 +151,12 @@ class InitialStateSearch:
             else []
         )
         if outlying and self.cfg.restart_samples:
-            found, limit = dict(starts), huber_limit(residuals)
+            found, limit = dict(starts), huber_limit(residuals, self.robust)
             begin, there = self._restarts(values, offsets, residuals, outlying, limit, rng)
-            beaten = {w: start_cost(residuals[w], offsets[w], limit) for w in outlying}
+            beaten = {w: start_cost(residuals[w], offsets[w], limit, self.robust) for w in outlying}
             self._iterate(values, begin, there, found, outlying, iterations, rng, beaten)
             for w in outlying:
-                if start_cost(there[w], begin[w], limit) < beaten[w]:
+                if start_cost(there[w], begin[w], limit, self.robust) < beaten[w]:
                     offsets[w], residuals[w], starts[w] = begin[w], there[w], found[w]
         return offsets, starts, residuals
 
@@ -175,7 +182,7 @@ class InitialStateSearch:
         seen = self.p.residuals(rows)
         for k, w in enumerate(windows):
             mine = seen[k * count : (k + 1) * count]
-            best = int(np.argmin([start_cost(r, o, limit) for r, o in zip(mine, samples[k], strict=True)]))
+            best = int(np.argmin([start_cost(r, o, limit, self.robust) for r, o in zip(mine, samples[k], strict=True)]))
             begin[w], there[w] = samples[k][best], mine[best]
         return begin, there
 
@@ -196,27 +203,27 @@ class InitialStateSearch:
         outlying = cfg.outlier_ratio * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
         for _ in range(iterations):
             differences = self.finite_differences(values, offsets, residuals, remaining)
-            limit = huber_limit(residuals)
+            limit = huber_limit(residuals, self.robust)
             tried, rows, may_fade = [], [], []
             for w, difference in zip(remaining, differences, strict=True):
                 there = [
-                    offsets[w] + start_step(residuals[w], difference.columns, offsets[w], limit, d)
+                    offsets[w] + start_step(residuals[w], difference.columns, offsets[w], limit, d, self.robust)
                     for d in cfg.dampings
                 ]
                 if np.mean(residuals[w] ** 2) > outlying**2:
-                    there += _samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng, cfg)
+                    there += self._samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng)
                 tried.append(there)
                 rows += [SimulationRequest(w, values, o * self.p.windows[w].spread) for o in there]
                 may_fade += [bool(self.fading[w].all())] * len(there)
             references = self.references(values, offsets, residuals, remaining)
-            (found, _), moving, at = residuals_near(self.p, references, rows, may_fade), [], 0
+            (found, _), moving, at = residuals_near(self.p, references, rows, may_fade, cfg.fading), [], 0
             for k, (w, difference) in enumerate(zip(remaining, differences, strict=True)):
                 starts[w] = difference.columns
                 there = [*tried[k], *difference.offsets]
                 seen = [*found[at : at + len(tried[k])], *difference.residuals]
                 at += len(tried[k])
-                cost = start_cost(residuals[w], offsets[w], limit)
-                costs = [start_cost(r, o, limit) for r, o in zip(seen, there, strict=True)]
+                cost = start_cost(residuals[w], offsets[w], limit, self.robust)
+                costs = [start_cost(r, o, limit, self.robust) for r, o in zip(seen, there, strict=True)]
                 best = int(np.argmin(costs))
                 if costs[best] < cost:
                     offsets[w], residuals[w] = there[best], seen[best]
@@ -233,38 +240,45 @@ class InitialStateSearch:
             if not remaining:
                 break
 
+    def _samples_about(
+        self,
+        residual: np.ndarray,
+        start: np.ndarray,
+        offset: np.ndarray,
+        step: np.ndarray,
+        limit: float,
+        rng: np.random.Generator,
+    ) -> list[np.ndarray]:
+        """Return initial states sampled about one and about where a step leads, farthest where residuals depend least.
 
-def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float) -> float:
+        With discrete time steps the cost of an impact has many local minima; derivatives do not lead from one to the
+        next.
+        """
+        weighted = start.T * huber_weight(residual, limit)
+        factor = np.linalg.cholesky(weighted @ start + np.diag(cauchy_weight(offset, self.robust)))
+        return [
+            centre + size * np.linalg.solve(factor.T, rng.normal(size=len(offset)))
+            for size in self.cfg.sample_spreads
+            for centre in (offset, step)
+        ]
+
+
+def start_cost(residual: np.ndarray, offset: np.ndarray, limit: float, cfg: RobustLossCfg | None = None) -> float:
     """Return the cost of one window with the prior of its initial state."""
-    return float(huber(residual, limit).sum()) + cauchy_cost(offset)
+    return float(huber(residual, limit).sum()) + cauchy_cost(offset, cfg)
 
 
-def start_step(residual: np.ndarray, start: np.ndarray, offset: np.ndarray, limit: float, damping: float) -> np.ndarray:
-    """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
-    weighted = start.T * huber_weight(residual, limit)
-    normal = weighted @ start
-    near = cauchy_weight(offset)
-    normal += np.diag(near + damping * (near + np.diag(normal)))
-    return -np.linalg.solve(normal, weighted @ residual + near * offset)
-
-
-def _samples_about(
+def start_step(
     residual: np.ndarray,
     start: np.ndarray,
     offset: np.ndarray,
-    step: np.ndarray,
     limit: float,
-    rng: np.random.Generator,
-    cfg: InitialStateCfg,
-) -> list[np.ndarray]:
-    """Return initial states sampled about one and about where a step leads, farthest where residuals depend least.
-
-    With discrete time steps the cost of an impact has many local minima; derivatives do not lead from one to the next.
-    """
+    damping: float,
+    cfg: RobustLossCfg | None = None,
+) -> np.ndarray:
+    """Return the damped step of one window's initial state, in units of its spread, shape (2 nv,)."""
     weighted = start.T * huber_weight(residual, limit)
-    factor = np.linalg.cholesky(weighted @ start + np.diag(cauchy_weight(offset)))
-    return [
-        centre + size * np.linalg.solve(factor.T, rng.normal(size=len(offset)))
-        for size in cfg.sample_spreads
-        for centre in (offset, step)
-    ]
+    normal = weighted @ start
+    near = cauchy_weight(offset, cfg)
+    normal += np.diag(near + damping * (near + np.diag(normal)))
+    return -np.linalg.solve(normal, weighted @ residual + near * offset)

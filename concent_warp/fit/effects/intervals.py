@@ -9,10 +9,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
-from concent_warp.fit.effects.least_squares import PRIOR
-
-DISCRETISATION_ERROR = 0.005
-"""Relative standard deviation of an effect's size between time-stepping schemes of one force model [-]."""
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 
 
 @dataclass(frozen=True)
@@ -37,14 +34,14 @@ class FittedParameter:
         return bool(np.isfinite(self.high)) if np.isinf(self.null) else not self.low <= self.null <= self.high
 
 
-def covariance(sums: Sums, blocks: Blocks) -> np.ndarray:
+def covariance(sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior) -> np.ndarray:
     """Return the covariance of the parameters, in units of their scale, robust to correlation within blocks (P, P).
 
     H^-1 (sum_b u_b u_b') H^-1 B / (B - P), the sandwich of Liang and Zeger, Biometrika 73, 1986, but not below H^-1,
-    what independent noise of the stated size would leave.
+    what independent noise of the stated size would leave. `prior` is `LeastSquaresCfg.prior`.
     """
     size = sums.slope.shape[1]
-    inverse = np.linalg.pinv(sums.normal.sum(axis=0) + np.eye(size) / PRIOR**2, hermitian=True)
+    inverse = np.linalg.pinv(sums.normal.sum(axis=0) + np.eye(size) / prior**2, hermitian=True)
     scores = sums.slope - sums.slope.mean(axis=0)
     correction = blocks.count / max(blocks.count - size, 1)
     robust = inverse @ (scores.T @ scores) @ inverse * correction
@@ -55,10 +52,10 @@ def covariance(sums: Sums, blocks: Blocks) -> np.ndarray:
     return found
 
 
-def discretisation_errors(parameters: Sequence[Parameter], values: np.ndarray) -> np.ndarray:
+def discretisation_errors(parameters: Sequence[Parameter], values: np.ndarray, relative_error: float) -> np.ndarray:
     """Return standard deviations of an effect's values due to time discretisation, in the units of these, (P,).
 
-    `DISCRETISATION_ERROR` of the effect's size, which is the largest difference of a parameter from its null value in
+    `relative_error` times the effect's size, which is the largest difference of a parameter from its null value in
     units of its scale, for every parameter. It does not depend on the data: a force model fitted to data from another
     time-stepping scheme of the same model is off by about this much (type B evaluation: Guide to the Expression of
     Uncertainty in Measurement, 2008, section 4.3).
@@ -66,4 +63,4 @@ def discretisation_errors(parameters: Sequence[Parameter], values: np.ndarray) -
     scale = np.array([p.scale for p in parameters])
     null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
     finite = np.where(np.isfinite(values), values, null)
-    return DISCRETISATION_ERROR * scale * float(np.abs((finite - null) / scale).max())
+    return relative_error * scale * float(np.abs((finite - null) / scale).max())

@@ -16,10 +16,7 @@ import numpy as np
 
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.fit.effects.robust import cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
-
-PRIOR = 10.0
-"""Weak prior of a parameter, in units of its typical scale."""
+from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
 
 
 @dataclass(frozen=True)
@@ -57,6 +54,11 @@ class LeastSquaresCfg:
     """Most windows that are polished together; of more, a sample is polished first [-]."""
     polish_sample: int = 8
     """Windows in such a sample [-]."""
+    prior: float = 10.0
+    """Standard deviation of a parameter's weak prior, in units of its typical scale [-]: wide enough to change no value
+    that the data determine."""
+    robust: RobustLossCfg = field(default_factory=RobustLossCfg)
+    """Scales of the robust losses."""
     initial_states: InitialStateCfg = field(default_factory=InitialStateCfg)
     """Settings of the search for initial states."""
 
@@ -113,7 +115,7 @@ class Solver:
         self.low = np.array([q.low for q in prediction.parameters])
         self.high = np.array([q.high for q in prediction.parameters])
         self.step = np.full(len(self.scale), self.cfg.first_step)
-        self.search = InitialStateSearch(prediction, self.cfg.initial_states)
+        self.search = InitialStateSearch(prediction, self.cfg.initial_states, self.cfg.robust)
 
     def fit_initial_states(
         self, values: np.ndarray, offsets: Sequence[np.ndarray], iterations: int | None = None
@@ -178,9 +180,9 @@ class Solver:
         """Return the windows with the largest falls of the cost predicted for other values, see `screened_gain`."""
         move, limit = (
             (values - fit.values) / self.scale,
-            huber_limit([window.residual for window in fit.linear]),
+            huber_limit([window.residual for window in fit.linear], self.cfg.robust),
         )
-        linear = projected(fit)
+        linear = projected(fit, self.cfg.robust)
         falls = [huber(q.residual, limit).sum() - huber(q.residual + q.jacobian @ move, limit).sum() for q in linear]
         order = np.argsort(falls)[::-1]
         reached = np.cumsum(np.maximum(falls, 0.0)[order])
@@ -190,9 +192,10 @@ class Solver:
         """Return a fit at other values, initial states fitted anew; unchanged if the cost of `first` windows rises."""
         measured = [np.zeros_like(o) for o in fit.offsets]
         there = self.improve_initial_states(replace(fit, values=values), [measured], noise, first)
-        limit = huber_limit([window.residual for window in fit.linear])
+        limit = huber_limit([window.residual for window in fit.linear], self.cfg.robust)
         before, after = (
-            sum(start_cost(f.linear[w].residual, f.offsets[w], limit) for w in first) for f in (fit, there)
+            sum(start_cost(f.linear[w].residual, f.offsets[w], limit, self.cfg.robust) for w in first)
+            for f in (fit, there)
         )
         if after >= before:
             return fit
@@ -235,15 +238,17 @@ class Solver:
         noise = self.cfg.noise_ratio if noise is None else noise
         offsets, fresh, residuals = self.search.refined(fit.values, fit.offsets, mine, 1)
         starts = dict(enumerate(fit.starts)) | fresh
-        limit = huber_limit(residuals)
+        limit = huber_limit(residuals, self.cfg.robust)
         outlying = [w for w in mine if np.mean(residuals[w] ** 2) > noise**2]
         for begin in others if outlying else ():
-            upper_bounds = {w: start_cost(residuals[w], offsets[w], limit) for w in outlying}
+            upper_bounds = {w: start_cost(residuals[w], offsets[w], limit, self.cfg.robust) for w in outlying}
             there, found, left = self.search.refined(
                 fit.values, begin, outlying, self.cfg.initial_states.iterations, upper_bounds
             )
             for w in outlying:
-                if start_cost(left[w], there[w], limit) < start_cost(residuals[w], offsets[w], limit):
+                if start_cost(left[w], there[w], limit, self.cfg.robust) < start_cost(
+                    residuals[w], offsets[w], limit, self.cfg.robust
+                ):
                     offsets[w], starts[w], residuals[w] = there[w], found[w], left[w]
         linear = self.linearise(fit.values, offsets)
         cost = self.cost([window.residual for window in linear], offsets, fit.values)
@@ -285,10 +290,12 @@ class Solver:
             fit: Where the step starts.
             move: The step, in units of the parameters' scale, shape (P,).
         """
-        limit, found = huber_limit([window.residual for window in fit.linear]), []
+        limit, found = huber_limit([window.residual for window in fit.linear], self.cfg.robust), []
         for window, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
             aw = a.T * huber_weight(window.residual, limit)
-            found.append(o - np.linalg.solve(aw @ a + np.diag(cauchy_weight(o)), aw @ (window.jacobian @ move)))
+            found.append(
+                o - np.linalg.solve(aw @ a + np.diag(cauchy_weight(o, self.cfg.robust)), aw @ (window.jacobian @ move))
+            )
         return found
 
     def trials(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> list[SimulationRequest]:
@@ -412,13 +419,13 @@ class Solver:
         """Return the parameters' distances from where the fit started, in units of their weak prior."""
         start = np.where(np.isfinite(self.p.start), self.p.start, values)
         finite = np.isfinite(values)
-        return np.where(finite, (values - start) / (PRIOR * self.scale), 0.0)
+        return np.where(finite, (values - start) / (self.cfg.prior * self.scale), 0.0)
 
     def cost(self, residuals: Sequence[np.ndarray], offsets: Sequence[np.ndarray], values: np.ndarray) -> float:
         """Return half the robust sum of squares, with the priors."""
-        limit = huber_limit(residuals)
+        limit = huber_limit(residuals, self.cfg.robust)
         total = sum(float(huber(r, limit).sum()) for r in residuals)
-        total += sum(cauchy_cost(o) for o in offsets)
+        total += sum(cauchy_cost(o, self.cfg.robust) for o in offsets)
         prior = self.prior(values)
         return total + 0.5 * float(prior @ prior)
 
@@ -432,13 +439,13 @@ class Solver:
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Return the damped step of the parameters, in units of their scale, and of each initial state."""
         size = len(self.scale)
-        limit = huber_limit([window.residual for window in linear])
-        normal, slope = np.eye(size) / PRIOR**2, self.prior(values) / PRIOR
+        limit = huber_limit([window.residual for window in linear], self.cfg.robust)
+        normal, slope = np.eye(size) / self.cfg.prior**2, self.prior(values) / self.cfg.prior
         parts = []
         for window, a, o in zip(linear, starts, offsets, strict=True):
             weight = huber_weight(window.residual, limit)
             aw = a.T * weight
-            near = cauchy_weight(o)
+            near = cauchy_weight(o, self.cfg.robust)
             m = aw @ a + np.diag(near * (1 + damping))
             c = aw @ window.jacobian
             b = aw @ window.residual + near * o
@@ -460,14 +467,18 @@ class Solver:
         return move, [-(s[:, size] + s[:, :size] @ move) for s in parts]
 
 
-def projected(fit: Fit) -> list[Linear]:
+def projected(fit: Fit, cfg: RobustLossCfg | None = None) -> list[Linear]:
     """Return residuals and sensitivities with the initial states eliminated, window by window.
 
-    The rest is what no change of the initial state within its prior can explain.
+    They are those parts that no change of the initial state within its prior can explain.
+
+    Args:
+        fit: The fit.
+        cfg: Scales of the robust losses.
     """
     found = []
     for window, a, o in zip(fit.linear, fit.starts, fit.offsets, strict=True):
-        near = cauchy_weight(o)
+        near = cauchy_weight(o, cfg)
         m = a.T @ a + np.diag(near)
         both = np.column_stack([window.jacobian, window.residual])
         inner = a.T @ both

@@ -1,9 +1,9 @@
 """What is fitted: windows of demonstrations, with measured values in units of their noise.
 
 A window starts from a state that is only roughly measured; its error is estimated along with the parameters
-(multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE", 1983). Where motion forgets
-its start or keeps close to it, as in pushing and in driven arms, a window is a whole demonstration; where small
-differences grow, as in impacts and tumbling, it ends before they have grown much.
+(multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE", 1983). Where errors of the
+initial state decay or stay small, as in pushing and in driven arms, a window is a whole demonstration; where they grow,
+as in impacts and tumbling, it ends before they have grown much.
 """
 
 from __future__ import annotations
@@ -23,14 +23,47 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
 
-RATE_TIME = 0.03
-"""A velocity at the start of a window is uncertain by the noise over this time [s]."""
-START_NOISE = 3.0
-"""Uncertainty of a state at the start of a window, in standard deviations of the measurement noise."""
-UNSEEN = (1e-3, 1e-2)
-"""Uncertainty of a position [m or rad] and a velocity that no instrument reads."""
-FEWEST = 12
-"""Least measured values of a recording that can be compared with a model [-]."""
+
+@dataclass(frozen=True)
+class ObservationCfg:
+    """How recordings are cut into windows, and how uncertain the initial states of these are.
+
+    "Empirical" values were set on the scenes of the hidden-effect benchmark.
+    """
+
+    velocity_time: float = 0.03
+    """Time over which the noise of a position makes a velocity at the start of a window uncertain [s]: about the time
+    over which a velocity is estimated."""
+    state_noise: float = 3.0
+    """Uncertainty of a measured state at the start of a window, in standard deviations of the measurement noise [-]:
+    3 sigma."""
+    unmeasured_position: float = 1e-3
+    """Uncertainty of a position that no sensor measures [m or rad]. Empirical."""
+    unmeasured_velocity: float = 1e-2
+    """Uncertainty of a velocity that no sensor measures [m/s or rad/s]. Empirical."""
+    min_values: int = 12
+    """Least measured values of a recording that can be compared with a model [-]: one for each block of time."""
+    probe_pairs: int = 6
+    """Pairs of simulations from opposite errors of the initial state, from which the length of windows is chosen [-].
+    Empirical."""
+    max_curvature: float = 3.0
+    """Deviation of the mean of such a pair from the simulation without an error, over the noise, at which a window ends
+    [-]: beyond it, the effect of an error is no longer in proportion to it. Empirical."""
+    max_scatter: float = 2.0
+    """Scatter of the samples about a smooth motion over its median below which a window may start [-]: it is larger at
+    impacts, where velocities are unknown. Empirical."""
+    min_length: float = 0.12
+    """Shortest window [s]. Empirical."""
+    max_length: float = 20.0
+    """Longest window [s], for the simulations' memory."""
+    default_position_noise: float = 1e-3
+    """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
+    default_noise: float = 1e-2
+    """The same for all other channels [their unit]."""
+
+    def noise_of_unit(self, unit: str) -> float:
+        """Return the noise of a channel for which it is neither stated nor estimable, in its unit."""
+        return self.default_position_noise if unit in ("m", "rad") else self.default_noise
 
 
 @dataclass(frozen=True)
@@ -39,7 +72,7 @@ class Reading:
 
     channel: str
     rows: slice
-    """Where they stand among the residuals of the window; each sample has as many in a row as it has components."""
+    """Their residuals among those of the window; each sample has one for each component, one after the other."""
     time: np.ndarray
     """Times [s] from the window's start, shape (T,)."""
     value: np.ndarray
@@ -72,13 +105,20 @@ class Window:
     """Time in the demonstration that each residual belongs to [s], shape (count,)."""
 
 
-def start_spread(m: mujoco.MjModel, noise: Mapping[str, float]) -> np.ndarray:
-    """Return the standard deviation of a measured initial state, positions and then velocities, shape (2 nv,)."""
-    position, velocity = np.full(m.nv, UNSEEN[0]), np.full(m.nv, UNSEEN[1])
+def start_spread(m: mujoco.MjModel, noise: Mapping[str, float], cfg: ObservationCfg | None = None) -> np.ndarray:
+    """Return the standard deviation of a measured initial state, positions and then velocities, shape (2 nv,).
+
+    Args:
+        m: The compiled model.
+        noise: Standard deviation of a component of each channel.
+        cfg: Settings.
+    """
+    cfg = cfg or ObservationCfg()
+    position, velocity = np.full(m.nv, cfg.unmeasured_position), np.full(m.nv, cfg.unmeasured_velocity)
 
     def seen(dof: slice, std: float) -> None:
-        position[dof] = START_NOISE * std
-        velocity[dof] = START_NOISE * std / RATE_TIME
+        position[dof] = cfg.state_noise * std
+        velocity[dof] = cfg.state_noise * std / cfg.velocity_time
 
     for sensor, std in noise.items():
         row = m.sensor(sensor).id
@@ -111,6 +151,8 @@ class ObservedRecording:
     recording: Recording
     noise: Mapping[str, float]
     """Standard deviation of a component of each channel that counts."""
+    cfg: ObservationCfg = field(default_factory=ObservationCfg)
+    """Settings."""
 
     def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the measured state of a demonstration at a time [s], qpos (nq,) and qvel (nv,)."""
@@ -131,7 +173,7 @@ class ObservedRecording:
         )
 
     def measured(self, d: Demonstration) -> StateEstimator | None:
-        """Return how everything was seen to move in a demonstration, None where something was not."""
+        """Return the estimated motion of a demonstration, None where the pose of a body or joint was not measured."""
         try:
             return StateEstimator.of(self.model, d)
         except RecordingError:
@@ -163,7 +205,7 @@ class ObservedRecording:
         if not count:
             return None
         qpos, qvel = self.state(d, start)
-        spread = start_spread(m, {r.channel: r.std for r in readings})
+        spread = start_spread(m, {r.channel: r.std for r in readings}, self.cfg)
         return Window(d, number, start, end, qpos, qvel, spread, tuple(readings), count, np.concatenate(clock))
 
 

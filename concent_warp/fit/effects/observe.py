@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -13,8 +13,7 @@ from concent_warp.estimation.noise import pooled_noise
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.fit.effects.observation import (
-    FEWEST,
-    START_NOISE,
+    ObservationCfg,
     ObservedRecording,
     Window,
     first_time,
@@ -28,28 +27,19 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Demonstration, Recording
 
-PROBES = 6
-"""Pairs of simulations from slightly different states."""
-CURVED = 3.0
-"""A window ends when what errors of its start do is no longer in proportion to them: when what opposite errors do
-differs by this many times the noise."""
-CALM = 2.0
-"""Scatter of the samples about a smooth motion, over its median, below which a window may start."""
-SHORTEST = 0.12
-"""Shortest window [s]."""
-LONGEST = 20.0
-"""Longest window [s]."""
-DEFAULT_STD = {"rad": 1e-3, "m": 1e-3, "rad/s": 1e-2, "m/s": 1e-2}
-"""Noise of channels for which it is neither stated nor estimable, by unit."""
 
-
-def channel_noises(model: Model, recording: Recording) -> dict[str, float]:
+def channel_noises(model: Model, recording: Recording, cfg: ObservationCfg | None = None) -> dict[str, float]:
     """Return the noise of each channel that the model's sensors predict, standard deviation of a component.
+
+    Args:
+        model: The model.
+        recording: What was measured.
+        cfg: Settings.
 
     Raises:
         RecordingError: A channel has another dimension than its sensor, or no channel can be compared at all.
     """
-    m = model.compile()
+    cfg, m = cfg or ObservationCfg(), model.compile()
     found: dict[str, float] = {}
     names = dict.fromkeys(name for d in recording.demonstrations for name in d.measured)
     known = {m.sensor(i).name for i in range(m.nsensor)}
@@ -73,18 +63,18 @@ def channel_noises(model: Model, recording: Recording) -> dict[str, float]:
             continue
         kind, unit = kind_and_unit(m, row)
         std = pooled_noise(channels, kind).std
-        found[name] = std if np.isfinite(std) and std > 0 else DEFAULT_STD.get(unit, 1e-2)
+        found[name] = std if np.isfinite(std) and std > 0 else cfg.noise_of_unit(unit)
     count = sum(
         int(np.isfinite(d.measured[name].value).sum())
         for name in found
         for d in recording.demonstrations
         if name in d.measured
     )
-    if count < FEWEST:
+    if count < cfg.min_values:
         raise RecordingError(
             "too little was measured to compare a model with",
             where=recording.source,
-            expected=f"at least {FEWEST} finite values in channels that the model's sensors predict",
+            expected=f"at least {cfg.min_values} finite values in channels that the model's sensors predict",
             found=count,
         )
     return found
@@ -98,6 +88,7 @@ def observe(
     noise: Mapping[str, float] | None = None,
     engine: EngineName = "mujoco",
     seed: int = 0,
+    cfg: ObservationCfg | None = None,
 ) -> list[Window]:
     """Return the windows of all demonstrations of a recording.
 
@@ -108,11 +99,13 @@ def observe(
         noise: Standard deviation of a component of each channel; by default stated or estimated.
         engine: Which engine simulates.
         seed: Seed of the disturbances from which the growth of differences is estimated.
+        cfg: Settings.
 
     Raises:
         RecordingError: There is too little to compare.
     """
-    source = ObservedRecording(model, recording, noise or channel_noises(model, recording))
+    cfg = cfg or ObservationCfg()
+    source = ObservedRecording(model, recording, noise or channel_noises(model, recording, cfg), cfg)
     windows: list[Window] = []
     for number, d in enumerate(recording.demonstrations):
         channels = [c for c in source.noise if c in d.measured]
@@ -123,7 +116,7 @@ def observe(
             end = last
             if measured is not None:
                 reach = length if length is not None else keeps_close(source, d, start, last, engine, seed)
-                end = last if last - start - reach < SHORTEST else _calmest(measured, start, reach)
+                end = last if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
             if (window := source.window(number, start, end)) is not None:
                 windows.append(window)
             start = end
@@ -135,15 +128,15 @@ def observe(
 def keeps_close(
     source: ObservedRecording, d: Demonstration, start: float, last: float, engine: EngineName, seed: int
 ) -> float:
-    """Return for how long [s] what errors of a start do to the motion stays in proportion to them."""
-    m = source.model.compile()
-    span = min(last - start, LONGEST)
+    """Return for how long [s] the effects of errors of an initial state stay in proportion to them."""
+    cfg, m = source.cfg, source.model.compile()
+    span = min(last - start, cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
     qpos, qvel = source.state(d, start)
     noise = {c: source.noise[c] for c in source.noise if c in d.measured}
-    spread = start_spread(m, noise) / START_NOISE
+    spread = start_spread(m, noise, cfg) / cfg.state_noise
     rng = np.random.default_rng(seed)
-    n = 2 * PROBES + 1
+    n = 2 * cfg.probe_pairs + 1
     positions, velocities = np.tile(qpos, (n, 1)), np.tile(qvel, (n, 1))
     for i in range(1, n, 2):
         offset = rng.normal(size=2 * m.nv) * spread
@@ -167,19 +160,14 @@ def keeps_close(
         with np.errstate(invalid="ignore"):  # inf - inf between two samples that diverge
             bend = np.quantile(size * second, 0.8, axis=0)
         curved = np.maximum(curved, np.nan_to_num(bend, nan=np.inf))
-    wild = np.flatnonzero(curved > CURVED)
+    wild = np.flatnonzero(curved > cfg.max_curvature)
     reach = span if not len(wild) else float(record[wild[0]] * m.opt.timestep)
-    return float(np.clip(reach, SHORTEST, span))
+    return float(np.clip(reach, cfg.min_length, span))
 
 
-def _calmest(measured: StateEstimator, start: float, reach: float) -> float:
-    """Return where a reach had better end [s]: late, and not in an impact, where no velocity is to be had."""
+def _calmest(measured: StateEstimator, start: float, reach: float, cfg: ObservationCfg) -> float:
+    """Return the time at which a window ends [s]: late, and not in an impact, where velocities are unknown."""
     times = start + np.linspace(reach, 0.35 * reach, 27)
     rough = measured.scatter(times)
-    calm = np.flatnonzero(rough < CALM)
+    calm = np.flatnonzero(rough < cfg.max_scatter)
     return float(times[calm[0] if len(calm) else rough.argmin()])
-
-
-def _demonstrations_of(windows: Sequence[Window]) -> list[int]:
-    """Return the demonstrations that windows are of, each once."""
-    return sorted({w.number for w in windows})

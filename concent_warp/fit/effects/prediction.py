@@ -22,12 +22,19 @@ if TYPE_CHECKING:
     from concent_warp.fit.effects.observation import Window
     from concent_warp.model import Model
 
-LOST = 1e3
-"""Residual, in units of noise, of what is not predicted because the simulation has diverged."""
-BEYOND = 0.05
-"""How far predictions are continued in a straight line before and after a window [s]."""
-MEMORY = 2**25
-"""Size of the simulations that are kept in case they are asked for again [bytes]."""
+
+@dataclass(frozen=True)
+class PredictionCfg:
+    """Settings of predicted readings."""
+
+    max_residual: float = 1e3
+    """Largest residual, in units of noise, and that of readings which a diverged simulation does not predict [-]: far
+    above what robust losses are linear from."""
+    extrapolation: float = 0.05
+    """Time before and after a window over which predictions are continued linearly [s]: readings may be delayed by as
+    much."""
+    cache_bytes: int = 2**25
+    """Size of the simulations that are kept for repeated requests [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,7 @@ class Prediction:
         *,
         engine: EngineName = "mujoco",
         threads: int | None = None,
+        cfg: PredictionCfg | None = None,
     ) -> None:
         """Prepare to simulate.
 
@@ -78,7 +86,9 @@ class Prediction:
             windows: What is predicted.
             engine: Which engine simulates.
             threads: Simulations at a time, for C MuJoCo; by default one for each CPU.
+            cfg: Settings.
         """
+        self.cfg = cfg or PredictionCfg()
         self.windows = list(windows)
         self.effects: tuple[Effect, ...] = (*(a.effect for a in model.effects), *effects)
         self._base = replace(model, effects=())
@@ -149,7 +159,7 @@ class Prediction:
         found = [fresh[key].reader if key in fresh else self._kept[key][0] for key in keys]
         self._kept |= {key: (course.reader, course.size) for key, course in fresh.items()}
         size = sum(size for _, size in self._kept.values())
-        while size > MEMORY:
+        while size > self.cfg.cache_bytes:
             size -= self._kept.pop(next(iter(self._kept)))[1]
         return found
 
@@ -207,7 +217,7 @@ class Prediction:
         courses = []
         for qpos, qvel, read in zip(rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
             own = read.copy()  # not a part of the array of all, which would live as long
-            courses.append(Course(SensorReader(m, rollout.time, own), qpos, qvel, own.nbytes))
+            courses.append(Course(SensorReader(m, rollout.time, own, self.cfg.extrapolation), qpos, qvel, own.nbytes))
         return courses
 
     def _commands(self, m: mujoco.MjModel, w: Window, steps: int) -> np.ndarray:
@@ -234,12 +244,12 @@ class Prediction:
         for e, part in zip(self.effects, self.split, strict=True):
             if e.measures:
                 read = e.measure(m, read, values[part])
-        residual = np.empty(w.count)
+        residual, most = np.empty(w.count), self.cfg.max_residual
         for r in w.readings:
             predicted = read(r.channel, r.time + w.start)
             value = turn(predicted, r.value) if r.orientation else r.value - predicted
-            residual[r.rows] = np.nan_to_num(value / r.std, nan=LOST, posinf=LOST, neginf=-LOST).ravel()
-        return np.clip(residual, -LOST, LOST)
+            residual[r.rows] = np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most).ravel()
+        return np.clip(residual, -most, most)
 
     def residuals(self, trials: Sequence[SimulationRequest]) -> list[np.ndarray]:
         """Return the residuals of each trial, see `observed`."""
@@ -248,11 +258,24 @@ class Prediction:
 
 
 class SensorReader:
-    """Predicted sensor values at any time, linear between records, a straight line a little beyond them."""
+    """Predicted sensor values at any time, linear between records and for a short time beyond them."""
 
-    def __init__(self, m: mujoco.MjModel, time: np.ndarray, sensordata: np.ndarray) -> None:
-        """Hold records at `time` (R,) [s], `sensordata` (R, nsensordata)."""
-        self._m, self._time, self._data = m, time, sensordata
+    def __init__(
+        self,
+        m: mujoco.MjModel,
+        time: np.ndarray,
+        sensordata: np.ndarray,
+        extrapolation: float = PredictionCfg.extrapolation,
+    ) -> None:
+        """Set the records.
+
+        Args:
+            m: The compiled model.
+            time: Times [s], shape (R,).
+            sensordata: Sensor values, shape (R, nsensordata).
+            extrapolation: Time before and after the records over which they are continued linearly [s].
+        """
+        self._m, self._time, self._data, self._extrapolation = m, time, sensordata, extrapolation
 
     def __call__(self, sensor: str, time: np.ndarray) -> np.ndarray:
         """Return the values of a sensor at times (T,) [s], shape (T, dim)."""
@@ -261,7 +284,7 @@ class SensorReader:
         value = self._data[:, address : address + dim]
         if len(self._time) < 2:
             return np.repeat(value[:1], len(time), axis=0)
-        now = np.clip(time, self._time[0] - BEYOND, self._time[-1] + BEYOND)
+        now = np.clip(time, self._time[0] - self._extrapolation, self._time[-1] + self._extrapolation)
         step = self._time[1] - self._time[0]
         lower = np.clip(((now - self._time[0]) / step + 1e-9).astype(int), 0, len(self._time) - 2)
         weight = ((now - self._time[lower]) / step)[:, None]

@@ -7,33 +7,45 @@ weight times its argument is the slope of the loss.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-HUBER = 4.0
-"""Residual over the spread of the residuals beyond which Huber's loss is linear [-]."""
-TRUSTED = 2.0
-"""Scale of Cauchy's loss, in units of the initial state's spread [-]."""
+
+@dataclass(frozen=True)
+class RobustLossCfg:
+    """Scales of the robust losses."""
+
+    residual_limit: float = 4.0
+    """Residual over the spread of the residuals beyond which Huber's loss is linear [-]: of normal noise, 6 samples in
+    100 000 are beyond."""
+    state_scale: float = 2.0
+    """Scale of Cauchy's loss of an error of an initial state, in units of the state's spread [-]: near the 2.39 with 95
+    % efficiency under normal noise (Holland and Welsch, 1977)."""
 
 
-def cauchy_cost(offset: np.ndarray) -> float:
+def cauchy_cost(offset: np.ndarray, cfg: RobustLossCfg | None = None) -> float:
     """Return the cost of an error of an initial state in units of its spread [-], by Cauchy's loss.
 
     It is half the square for small errors and grows logarithmically for large ones, as of states measured during an
     impact.
     """
-    return float(0.5 * TRUSTED**2 * np.log1p((offset / TRUSTED) ** 2).sum())
+    scale = (cfg or RobustLossCfg()).state_scale
+    return float(0.5 * scale**2 * np.log1p((offset / scale) ** 2).sum())
 
 
-def cauchy_weight(offset: np.ndarray) -> np.ndarray:
+def cauchy_weight(offset: np.ndarray, cfg: RobustLossCfg | None = None) -> np.ndarray:
     """Return the weight of each component in iteratively reweighted least squares, see `cauchy_cost`."""
-    return 1.0 / (1.0 + (offset / TRUSTED) ** 2)
+    return 1.0 / (1.0 + (offset / (cfg or RobustLossCfg()).state_scale) ** 2)
 
 
-def huber_limit(residuals: Sequence[np.ndarray]) -> float:
-    """Return the residual from which Huber's loss is linear: `HUBER` times the spread, at least that of the noise."""
+def huber_limit(residuals: Sequence[np.ndarray], cfg: RobustLossCfg | None = None) -> float:
+    """Return the residual beyond which Huber's loss is linear: `residual_limit` times the spread, at least the noise.
+
+    The spread is estimated by 1.4826 times the median absolute residual.
+    """
     pooled = np.concatenate(residuals)
-    return HUBER * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
+    return (cfg or RobustLossCfg()).residual_limit * max(1.0, 1.4826 * float(np.median(np.abs(pooled))))
 
 
 def huber(residual: np.ndarray, limit: float) -> np.ndarray:
@@ -42,9 +54,9 @@ def huber(residual: np.ndarray, limit: float) -> np.ndarray:
     return np.where(size <= limit, 0.5 * residual**2, limit * (size - 0.5 * limit))
 
 
-def robust_noise_ratio(residuals: Sequence[np.ndarray]) -> float:
-    """Return the root mean square of residuals in units of noise [-], those beyond `HUBER` with Huber's loss."""
-    return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), HUBER))))
+def robust_noise_ratio(residuals: Sequence[np.ndarray], cfg: RobustLossCfg | None = None) -> float:
+    """Return the RMS of residuals in units of noise [-], those beyond `residual_limit` with Huber's loss."""
+    return float(np.sqrt(np.mean(2 * huber(np.concatenate(residuals), (cfg or RobustLossCfg()).residual_limit))))
 
 
 def huber_weight(residual: np.ndarray, limit: float) -> np.ndarray:

@@ -99,7 +99,7 @@ def test_an_effect_whose_parameter_may_be_null_or_is_at_its_bound_is_not_accepte
 def test_an_interval_is_two_standard_deviations_and_the_formulas_own_error(base, damping):
     (found,) = fitted_parameters(base, damping)
     p = Prediction(base.model, (damping.effect,), base.windows).parameters[-1]
-    own = discretisation_errors([p], damping.fit.values[-1:])[0]
+    own = discretisation_errors([p], damping.fit.values[-1:], base.cfg.discretisation_error)[0]
     std = np.sqrt(covariance(damping.sums, base.blocks)[-1, -1]) * p.scale
     assert std > 0
     assert found.high - found.value == pytest.approx(1.96 * np.hypot(std, own), rel=1e-9)

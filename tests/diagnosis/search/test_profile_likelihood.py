@@ -19,7 +19,7 @@ from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
-from concent_warp.fit.effects.intervals import DISCRETISATION_ERROR, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import covariance, discretisation_errors
 from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 
 CFG = ProfileLikelihoodCfg()
@@ -113,7 +113,7 @@ def test_the_error_of_a_law_is_a_share_of_the_effects_size():
     gain = Parameter("gain", "-", 1.0, 0.0, 9.0, 0.3)
     limit = Parameter("limit", "N", np.inf, 0.0, 9.0, 1.0)
     x, y = (Parameter(n, "m", 0.0, -1.0, 1.0, 0.01) for n in "xy")
-    assert discretisation_errors([gain], np.array([0.4])) == pytest.approx([0.6 * DISCRETISATION_ERROR])
-    assert discretisation_errors([limit], np.array([3.0])) == pytest.approx([3.0 * DISCRETISATION_ERROR])
-    assert discretisation_errors([limit], np.array([np.inf])) == pytest.approx([0.0])
-    assert discretisation_errors([x, y], np.array([0.02, 0.0])) == pytest.approx([0.02 * DISCRETISATION_ERROR] * 2)
+    assert discretisation_errors([gain], np.array([0.4]), 0.005) == pytest.approx([0.6 * 0.005])
+    assert discretisation_errors([limit], np.array([3.0]), 0.005) == pytest.approx([3.0 * 0.005])
+    assert discretisation_errors([limit], np.array([np.inf]), 0.005) == pytest.approx([0.0])
+    assert discretisation_errors([x, y], np.array([0.02, 0.0]), 0.005) == pytest.approx([0.02 * 0.005] * 2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.evidence import indistinguishable
@@ -14,8 +15,11 @@ from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.cross_validation import cut_blocks
-from concent_warp.fit.effects.least_squares import Solver
+from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.fit.effects.cross_validation import BlockCfg, cut_blocks
+from concent_warp.fit.effects.initial_states import InitialStateCfg
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
+from concent_warp.fit.effects.observation import ObservationCfg
 from concent_warp.fit.effects.prediction import Prediction
 from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
 
@@ -192,3 +196,20 @@ def test_nearly_equal_candidates_get_a_profile_likelihood_and_the_first_is_polis
     assert finding.accepted
     assert finding.name == "joint_damping"
     assert first.std is not None
+
+
+def test_a_diagnosis_fits_with_its_own_settings():
+    states = InitialStateCfg(iterations=2)
+    fits = EffectSolverCfg(
+        least_squares=LeastSquaresCfg(prior=3.0, max_polished_windows=1, initial_states=states),
+        blocks=BlockCfg(min_blocks=6, max_blocks=7, folds=3),
+        observation=ObservationCfg(state_noise=4.0),
+    )
+    recording = swung(seconds=1.0)
+    base = Procedure(drawing(recording), recording, DiagnoseCfg(fits=fits)).baseline()
+    plain = Procedure(drawing(recording), recording, DiagnoseCfg()).baseline()
+    assert base.cfg == fits
+    assert base.solver().cfg == fits.least_squares
+    assert 6 <= base.blocks.count <= 7 < plain.blocks.count
+    assert set(base.blocks.fold) == {0, 1, 2}
+    np.testing.assert_allclose(base.windows[0].spread[0], plain.windows[0].spread[0] * 4 / 3)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.fit.effects.cross_validation import (
+    BlockCfg,
     Blocks,
     HeldOut,
     Sums,
@@ -56,7 +57,7 @@ def test_folds_are_whole_demonstrations_where_there_are_as_many():
     assert four.fold.tolist() == [k % 5 for k in range(four.count)]
     five = cut_blocks([window(0.0, 0.4, number=n) for n in (0, 2, 3, 4, 7)])
     assert five.fold.tolist() == np.repeat(np.arange(5), 4).tolist()
-    seven = cut_blocks([window(0.0, 0.2, number=n) for n in range(7)], folds=3)
+    seven = cut_blocks([window(0.0, 0.2, number=n) for n in range(7)], BlockCfg(folds=3))
     assert seven.fold.tolist() == np.repeat(np.arange(7) % 3, 2).tolist()
 
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from concent_warp.fit.effects.cross_validation import (
-    FEWEST_BLOCKS,
-    FOLDS,
-    MOST_BLOCKS,
+    BlockCfg,
     Blocks,
     HeldOut,
     block_sums,
@@ -15,8 +13,10 @@ from concent_warp.fit.effects.cross_validation import (
     sign_flip_p,
 )
 from concent_warp.fit.effects.intervals import covariance
-from concent_warp.fit.effects.least_squares import PRIOR, Linear
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Linear
 from tests.scenes.swinging import swung, windows_of
+
+PRIOR, FOLDS = LeastSquaresCfg.prior, BlockCfg.folds
 
 WIDE = 1e6
 """A limit that no residual reaches, so that nothing is weighed down."""
@@ -37,7 +37,7 @@ def line(rng, rows, *, slope=0.0, size=2):
 def test_blocks_cover_windows_and_are_dealt_in_turn():
     windows = windows_of(swung(seconds=4.0), 1.0)
     blocks = cut_blocks(windows)
-    assert FEWEST_BLOCKS <= blocks.count <= MOST_BLOCKS
+    assert BlockCfg().min_blocks <= blocks.count <= BlockCfg().max_blocks
     assert set(np.bincount(blocks.fold)) <= {blocks.count // FOLDS, blocks.count // FOLDS + 1}
     for window, rows in zip(windows, blocks.of_row, strict=True):
         assert (blocks.start[rows] <= window.clock + 1e-9).all()

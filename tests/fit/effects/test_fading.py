@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects import fading
-from concent_warp.fit.effects.fading import AFTER, FADED, ReferenceSimulation, _has_faded, is_long, residuals_near
-from concent_warp.fit.effects.initial_states import InitialStateSearch
+from concent_warp.fit.effects.fading import FadingCfg, ReferenceSimulation, _has_faded, is_long, residuals_near
+from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from tests.scenes.swinging import swing_scene, swung, windows_of
 
+AFTER, FADED = FadingCfg.time, FadingCfg.max_share
 STRONG = 0.1
 """Damping at which a swing is over within a moment [N m s/rad]."""
 WEAK = 0.002
@@ -78,12 +78,12 @@ def test_short_windows_are_simulated_to_their_end():
     assert not any(is_long(prediction, w) for w in range(len(short)))
 
 
-def test_initial_states_are_found_as_without_it(windows, monkeypatch):
+def test_initial_states_are_found_as_without_it(windows):
     found = []
-    for longest in (fading.LONG, np.inf):
-        monkeypatch.setattr(fading, "LONG", longest)
+    for min_window in (FadingCfg.min_window, np.inf):
+        cfg = InitialStateCfg(fading=FadingCfg(min_window=min_window))
         prediction = Prediction(Model(Scene(swing_scene(STRONG))), (effect_class("armature")("hinge"),), windows)
-        offsets, starts, _ = InitialStateSearch(prediction).refined(np.array([1e-5]), [np.ones(2)], [0], 4)
+        offsets, starts, _ = InitialStateSearch(prediction, cfg).refined(np.array([1e-5]), [np.ones(2)], [0], 4)
         found.append((offsets[0], starts[0], prediction.simulated))
     np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-2)
     np.testing.assert_allclose(found[0][1], found[1][1], atol=0.05)

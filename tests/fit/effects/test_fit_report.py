@@ -26,7 +26,7 @@ from concent_warp.fit.effects.fit import (
 )
 from concent_warp.fit.effects.initial_states import start_cost, start_step
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
-from concent_warp.fit.effects.least_squares import Fit, Linear
+from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear
 from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from tests.fit.effects.test_fit_effects import model_with
 from tests.scenes.swinging import swung
@@ -46,7 +46,7 @@ def solver_of(parameters: Any = PARAMETERS, split: Any = None, **options: Any) -
     prediction = SimpleNamespace(parameters=parameters, split=split, effects=names)
     scale = np.array([p.scale for p in parameters])
     high = np.array([p.high for p in parameters])
-    return SimpleNamespace(p=prediction, scale=scale, high=high, **options)
+    return SimpleNamespace(p=prediction, cfg=LeastSquaresCfg(), scale=scale, high=high, **options)
 
 
 def fit_of(values: Any, *, converged: bool = True) -> Fit:
@@ -74,7 +74,7 @@ def test_intervals_combine_the_covariance_and_the_discretisation_error():
     std = np.sqrt(np.diag(covered))
     np.testing.assert_allclose(correlation, covered / np.outer(std, std))
     for k, (p, q) in enumerate(zip(PARAMETERS, found, strict=True)):
-        model = discretisation_errors([p], np.array([values[k]]))[0]
+        model = discretisation_errors([p], np.array([values[k]]), CFG.discretisation_error)[0]
         reach = NORMAL * np.sqrt((std[k] * p.scale) ** 2 + model**2)
         assert (q.name, q.unit, q.null, q.value) == (p.name, p.unit, p.null, values[k])
         assert q.low == pytest.approx(max(values[k] - reach, p.low))
@@ -255,7 +255,9 @@ def test_residuals_are_those_with_the_initial_states_eliminated():
     plain = [rng.normal(0, 3, 20) for _ in range(2)]
     starts, offsets = [rng.normal(size=(20, 2)) for _ in range(2)], [rng.normal(size=2) for _ in range(2)]
     solver: Any = SimpleNamespace(
-        p=SimpleNamespace(residuals=lambda trials: plain if trials == "trials" else []), trials=lambda *_: "trials"
+        p=SimpleNamespace(residuals=lambda trials: plain if trials == "trials" else []),
+        cfg=LeastSquaresCfg(),
+        trials=lambda *_: "trials",
     )
     limit = huber_limit(plain)
     for k, found in enumerate(_residuals_at(solver, np.zeros(1), offsets, starts)):

@@ -6,7 +6,9 @@ import pytest
 from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
-from concent_warp.fit.effects.least_squares import PRIOR
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg
+
+PRIOR = LeastSquaresCfg.prior
 
 
 def blocks_of(count: int) -> Blocks:
@@ -65,9 +67,9 @@ def test_correlation_stays_where_a_variance_is_raised_to_that_of_the_noise():
 
 def test_the_formulas_own_error_is_half_a_percent_of_the_largest_deviation():
     parameters = (Parameter("a", "N", 1.0, 0.0, 9.0, 0.5), Parameter("b", "s", np.inf, 0.0, np.inf, 2.0))
-    found = discretisation_errors(parameters, np.array([2.0, np.inf]))
+    found = discretisation_errors(parameters, np.array([2.0, np.inf]), 0.005)
     np.testing.assert_allclose(found, 0.005 * np.array([0.5, 2.0]) * (2.0 - 1.0) / 0.5)
-    found = discretisation_errors(parameters, np.array([0.5, 6.0]))
+    found = discretisation_errors(parameters, np.array([0.5, 6.0]), 0.005)
     np.testing.assert_allclose(found, 0.005 * np.array([0.5, 2.0]) * 6.0 / 2.0)
 
 

@@ -7,7 +7,7 @@ from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.initial_states import InitialStateCfg, start_step
 from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear, Solver, projected
 from concent_warp.fit.effects.prediction import Prediction
-from concent_warp.fit.effects.robust import HUBER, cauchy_weight
+from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_weight
 from tests.scenes.bouncing import SPREAD, bounced
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
@@ -143,7 +143,7 @@ def test_what_an_initial_state_can_take_up_is_projected_out():
 def test_the_step_of_an_initial_state_is_that_of_ridge_regression():
     rng = np.random.default_rng(1)
     a, r, o = rng.normal(size=(20, 2)), 0.1 * rng.normal(size=20), np.array([0.5, -4.0])
-    step = start_step(r, a, o, HUBER, 0.0)
+    step = start_step(r, a, o, RobustLossCfg().residual_limit, 0.0)
     root = np.sqrt(cauchy_weight(o))
     stacked = np.vstack([a, np.diag(root)])
     expected = -np.linalg.lstsq(stacked, np.concatenate([r, root * o]), rcond=None)[0]

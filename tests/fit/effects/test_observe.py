@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
-from concent_warp.fit.effects.observation import RATE_TIME, START_NOISE, ObservedRecording, start_spread
+from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, start_spread
 from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -47,7 +47,7 @@ def test_the_state_at_the_start_of_a_window_is_the_measured_one():
     while d.time < later.start - 1e-9:
         d.ctrl[0] = action.value[np.searchsorted(action.time, d.time + 1e-9, side="right") - 1]
         mujoco.mj_step(m, d)
-    assert abs(later.qpos[0] - d.qpos[0]) < START_NOISE * NOISE
+    assert abs(later.qpos[0] - d.qpos[0]) < ObservationCfg().state_noise * NOISE
     assert later.qvel[0] == pytest.approx(d.qvel[0], rel=0.1)  # a command changes there, and with it the acceleration
 
 
@@ -75,13 +75,15 @@ def test_a_window_ends_late_but_before_an_impact():
         def scatter(self, times):
             return np.where(times > 0.8, 10.0, 1.0)
 
-    found = _calmest(Rough(), 0.0, 1.0)  # pyright: ignore[reportArgumentType]
+    found = _calmest(Rough(), 0.0, 1.0, ObservationCfg())  # pyright: ignore[reportArgumentType]
     assert 0.75 < found <= 0.8
 
 
 def test_an_initial_state_is_as_uncertain_as_what_was_seen_of_it():
     m = mujoco.MjModel.from_xml_string(swing_scene())
-    np.testing.assert_allclose(start_spread(m, {"angle": NOISE}), [3 * NOISE, 3 * NOISE / RATE_TIME])
+    np.testing.assert_allclose(
+        start_spread(m, {"angle": NOISE}), [3 * NOISE, 3 * NOISE / ObservationCfg().velocity_time]
+    )
     unseen = start_spread(m, {})
     cube = mujoco.MjModel.from_xml_string(toss_scene(EDGE))
     seen = start_spread(cube, {"position": 1e-4, "orientation": 2e-3})

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.prediction import BEYOND, Prediction, SensorReader, SimulationRequest, turn
+from concent_warp.fit.effects.prediction import Prediction, PredictionCfg, SensorReader, SimulationRequest, turn
 from tests.scenes.swinging import DAMPING, NOISE, drawing, swung, windows_of
 
 
@@ -75,9 +75,9 @@ def test_one_simulation_serves_all_values_of_an_effect_of_measurement(recording,
     assert np.std(later - first) > 1
 
 
-def test_no_more_simulations_are_kept_than_memory_allows(recording, windows, monkeypatch):
-    monkeypatch.setattr("concent_warp.fit.effects.prediction.MEMORY", 5000)
-    prediction = damped(recording, windows[:1])
+def test_no_more_simulations_are_kept_than_memory_allows(recording, windows):
+    effects = (effect_class("joint_damping")("hinge"),)
+    prediction = Prediction(drawing(recording), effects, windows[:1], cfg=PredictionCfg(cache_bytes=5000))
     for _ in range(2):
         before = prediction.simulated
         prediction.residuals([SimulationRequest(0, np.array([value])) for value in np.linspace(0.0, 0.1, 20)])
@@ -122,7 +122,9 @@ def test_a_reader_is_linear_between_records_and_a_little_beyond():
     time = 0.1 * np.arange(4)
     read = SensorReader(m, time, (2 * time)[:, None])
     asked = np.array([-0.02, 0.05, 0.23, 0.32, 9.0])
-    np.testing.assert_allclose(read("angle", asked)[:, 0], [-0.04, 0.1, 0.46, 0.64, 2 * (0.3 + BEYOND)])
+    np.testing.assert_allclose(
+        read("angle", asked)[:, 0], [-0.04, 0.1, 0.46, 0.64, 2 * (0.3 + PredictionCfg().extrapolation)]
+    )
 
 
 def test_a_reader_of_orientations_takes_the_short_way_and_keeps_the_norm():

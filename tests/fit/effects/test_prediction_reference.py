@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects import prediction as predicting
 from concent_warp.fit.effects.fading import (
     ReferenceSimulation,
     _has_faded,
@@ -20,6 +19,7 @@ from concent_warp.fit.effects.fading import (
 from concent_warp.fit.effects.prediction import (
     Course,
     Prediction,
+    PredictionCfg,
     SensorReader,
     SimulationRequest,
     turn,
@@ -155,11 +155,11 @@ def test_effects_reach_back_whole_steps_and_threads_are_those_asked_for(recordin
     assert free.threads == MujocoEngine(drawing(recording)).threads
 
 
-def test_the_oldest_simulations_are_forgotten_first(recording, windows, monkeypatch):
+def test_the_oldest_simulations_are_forgotten_first(recording, windows):
     prediction = Prediction(drawing(recording), (effect_class("joint_damping")("hinge"),), windows)
     trials = [SimulationRequest(0, np.array([v])) for v in (0.0, 0.1, 0.2)]
     size = prediction.courses(trials[:1])[0].size
-    monkeypatch.setattr(predicting, "MEMORY", 2 * size)
+    prediction.cfg = PredictionCfg(cache_bytes=2 * size)
     prediction.readers(trials)
     assert list(prediction._kept) == [prediction._key(t) for t in trials[1:]]
 

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
-from concent_warp.fit.effects.robust import HUBER, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
+from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
+
+HUBER = RobustLossCfg.residual_limit
 
 
 def test_the_loss_is_quadratic_and_then_linear():

@@ -10,7 +10,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects import observe as observing
-from concent_warp.fit.effects.observation import ObservedRecording, first_time, start_spread
+from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, first_time, start_spread
 from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -257,7 +257,7 @@ class Rough:
 
 def calmest(rough: Any, start: float, length: float) -> float:
     measured: Any = Rough(rough)
-    return _calmest(measured, start, length)
+    return _calmest(measured, start, length, ObservationCfg())
 
 
 def test_a_window_ends_at_the_last_calm_time_in_the_later_two_thirds():
@@ -278,7 +278,7 @@ def cuts(monkeypatch) -> dict[str, Any]:
         return told["reach"]
 
     monkeypatch.setattr(observing, "keeps_close", keeps)
-    monkeypatch.setattr(observing, "_calmest", lambda _, start, reach: start + reach)
+    monkeypatch.setattr(observing, "_calmest", lambda _, start, reach, __: start + reach)
     monkeypatch.setattr(ObservedRecording, "measured", lambda *_: told["measured"])
     monkeypatch.setattr(ObservedRecording, "state", lambda *_: (np.zeros(1), np.zeros(1)))
     return told
