@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_bytes
+from concent_warp.limits import limits, raising
 
 if TYPE_CHECKING:
     import torch
 
-MAX_BYTES = 4 << 30
-"""Largest checkpoint, in the file and in memory [bytes]: a thousand million numbers of single precision."""
 MAX_DEPTH = 20
 """Most levels of dictionaries, lists and tuples within one another."""
 PLAIN = (bool, int, float, str, type(None))
@@ -75,8 +74,10 @@ def _check_size(path: Path, error: type[ConcentError]) -> None:
         raise error("the checkpoint cannot be read", where=path, found=reason.strerror) from None
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as reason:
         raise error("not a checkpoint", where=path, expected="an archive of torch.save", found=reason) from None
-    if size > MAX_BYTES:
-        raise error("the checkpoint is too large", where=path, expected=f"at most {MAX_BYTES} bytes", found=size)
+    most = limits().checkpoint_bytes
+    if size > most:
+        fix = raising("checkpoint_bytes")
+        raise error("the checkpoint is too large", where=path, expected=f"at most {most} bytes", found=size, fix=fix)
 
 
 def _load(path: Path, error: type[ConcentError]) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,7 @@ def train_run(
     seconds: float | None = None,
     process: DistributedProcess | None = None,
     begin_with: Mapping[str, Any] | None = None,
+    begun: Callable[[], Path] | None = None,
 ) -> tuple[Trainer, Iteration | None]:
     """Train, and return the trainer and its last iteration.
 
@@ -111,6 +112,7 @@ def train_run(
         process: This process of a data-parallel training, within its group; a single process by default. Each rank
             simulates `run.cfg.environment.worlds` worlds.
         begin_with: Checkpoint of the initial policy as `load_checkpoint` returns it, unless a training is resumed.
+        begun: Called when all is set up and a checkpoint is written; returns the run folder from then on.
 
     Raises:
         TrainError: The folder's training was started with other settings, or the initial policy has another
@@ -118,10 +120,8 @@ def train_run(
     """
     process = process or DistributedProcess()
     with process.raise_together():
-        if folder is not None and process.is_rank_zero:
-            if resume:
-                _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
-            run.save(folder)
+        if folder is not None and process.is_rank_zero and resume:
+            _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
         task, device, seed = run.task(), process.device(device), process.seed(run.cfg.seed)
         states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
         environment = make_environment(task, run.cfg.environment, states, device=device, seed=seed)
@@ -131,6 +131,13 @@ def train_run(
             trainer.resume(folder / CHECKPOINT)
         elif begin_with is not None:
             trainer.begin_with(begin_with)
+        if folder is not None and process.is_rank_zero:
+            run.save(folder)
+    if not resume:
+        trainer.save()
+    with process.raise_together():
+        if begun is not None:
+            trainer.folder = begun()
     return trainer, trainer.learn(report, seconds=seconds)
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
-from concent_warp.run_folder import plain, run_folder, write_settings
+from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
-from concent_warp.train.learning.ppo import Iteration
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -68,21 +68,28 @@ def train(
     name = recording[0].name if demonstration is None else demonstration
     sequence = events.get(name) if isinstance(events, Mapping) else events
     folder = None if out is None else Path(out)
-    claimed = nullcontext()
-    if folder is not None and process.is_rank_zero:
-        claimed = run_folder(folder, overwrite=overwrite, resume=resume)
-    with process.group(process.device(device)), claimed:
-        if folder is not None and process.is_rank_zero:
-            write_settings(folder, {"demonstration": name, **plain(cfg)})
+    with process.group(process.device(device)), ExitStack() as stack:
+        claimed: RunFolder | None = None
+        with process.raise_together():
+            if folder is not None and process.is_rank_zero:
+                claimed = stack.enter_context(run_folder(folder, overwrite=overwrite, resume=resume))
+        path = process.gather(None if claimed is None else claimed.path)[0]
+
+        def begin() -> Path:
+            assert claimed is not None
+            write_settings(claimed.path, {"demonstration": name, **plain(cfg)})
+            return claimed.commit()
+
         run = TrainingRun.new(model, recording, cfg, demonstration=name, events=sequence)
         trainer, _ = train_run(
             run,
-            folder,
+            path,
             device=device,
-            resume=resume,
+            resume=resume and path is not None and (path / CHECKPOINT).exists(),
             report=progress,
             seconds=seconds,
             process=process,
             begin_with=None if begin_with is None else begin_with.weights,
+            begun=None if claimed is None else begin,
         )
     return Policy(run, trainer.weights(), folder or Path())

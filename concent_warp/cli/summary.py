@@ -14,7 +14,6 @@ from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import mean_and_interval, percent, unit_shown
 from concent_warp.events.sequence import ContactEventSequence
-from concent_warp.run_folder import resuming_command
 
 if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import Progress
@@ -23,20 +22,15 @@ if TYPE_CHECKING:
 
 @contextmanager
 def fit_progress() -> Iterator[Callable[[Progress], None]]:
-    """Show the progress of a fit; on an interruption, name the command that continues it."""
+    """Show the progress of a fit."""
     quiet_warp()
-    try:
-        with status_bar("fitting") as update:
+    with status_bar("fitting") as update:
 
-            def show(progress: Progress) -> None:
-                text = (
-                    f"{progress.what} {progress.generation}/{progress.generations}, best {1e3 * progress.best:.2f} mm"
-                )
-                update(progress.generation / max(progress.generations, 1), text, progress.seconds_left)
+        def show(progress: Progress) -> None:
+            text = f"{progress.what} {progress.generation}/{progress.generations}, best {1e3 * progress.best:.2f} mm"
+            update(progress.generation / max(progress.generations, 1), text, progress.seconds_left)
 
-            yield show
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"The state is saved; continue with: {resuming_command()}") from None
+        yield show
 
 
 def say_grounded(found: Grounded, folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -101,8 +100,8 @@ def render(
     if cfg.figure is not None:
         claim_file(cfg.figure, overwrite=overwrite)
     _check_replaced(out, overwrite=overwrite)
-    to = Destination(out, cfg, format, device, resume, overwrite)
-    with run_folder(out, overwrite=False, resume=resume or overwrite):
+    with run_folder(out, overwrite=overwrite, resume=resume, keep_folders=False) as claimed:
+        to = Destination(claimed.path, cfg, format, device, resume)
         from concent_warp.recording.recording import Recording
 
         film = _film_recording if isinstance(source, Recording) else _film_policy
@@ -120,7 +119,6 @@ class Destination:
     format: Format
     device: str | None
     resume: bool
-    overwrite: bool
 
 
 def _ignore(share: float) -> None:
@@ -284,10 +282,7 @@ def _addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[
 
 
 def _dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
-    """Return the data set, new or to be continued; an earlier one is replaced only here, where all input is valid."""
-    if to.overwrite and not to.resume:
-        for path in to.out.iterdir():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    """Return the data set, new or to be continued."""
     settings = {"format": to.format, "out": str(to.out), **plain(to.cfg)}
     if to.resume:
         check_unchanged(to.out / SETTINGS, settings, FREE)

@@ -18,8 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from concent_warp.errors import RenderError
+from concent_warp.run_folder import EPISODES
 
-STAGING = ".staging"
+STAGING = EPISODES
 """Folder of the episodes that are not packed."""
 PARTIAL = ".partial"
 

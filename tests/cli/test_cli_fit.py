@@ -12,7 +12,7 @@ from concent_warp.fit.geometry.search import Search
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import _claim_folder
+from concent_warp.run_folder import run_folder
 
 SMALL = ["--count", "60", "--radius", "0.008", "--fit.generations", "3", "--fit.evolution.population", "4"]
 
@@ -89,10 +89,11 @@ def test_a_run_is_not_resumed_with_other_settings_and_stays_as_it_is(bench, run,
 
 def test_a_run_killed_while_it_wrote_its_settings_can_go_on(tmp_path):
     (tmp_path / ".settings.toml.partial").write_text("comm")
-    _claim_folder(tmp_path, overwrite=False, resume=True)
+    with run_folder(tmp_path, overwrite=False, resume=True):
+        pass
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(ConcentError, match="other things"):
-        _claim_folder(tmp_path, overwrite=False, resume=True)
+    with pytest.raises(ConcentError, match="other things"), run_folder(tmp_path, overwrite=False, resume=True):
+        pass
 
 
 def test_an_interrupted_fit_says_how_to_go_on_and_then_ends_as_if_it_had_not_been(

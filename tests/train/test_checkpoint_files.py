@@ -10,7 +10,6 @@ import pytest
 import torch
 from data_parallel_training import make_run
 
-from concent_warp import checkpoint_file
 from concent_warp.checkpoint_file import read_checkpoint, write_checkpoint
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError, RenderError, TrainError
@@ -238,7 +237,7 @@ def deep(path: Path) -> None:
 )
 def test_files_that_are_no_checkpoints_are_refused(trained, tmp_path, monkeypatch, spoil, reason):
     path = copied(trained, tmp_path) / CHECKPOINT
-    monkeypatch.setattr(checkpoint_file, "MAX_BYTES", 1_000_000)
+    monkeypatch.setenv("CONCENT_MAX_CHECKPOINT_BYTES", "1000000")
     load_checkpoint(path)
     spoil(path)
     with pytest.raises(TrainError, match=reason):

@@ -46,12 +46,12 @@ class Arguments:
 def run(arguments: Arguments) -> Grounded:
     """Run the demonstration and write the run folder."""
     folder = arguments.out
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
-        settings = write_settings(folder, arguments)
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
+        settings = write_settings(claimed.path, arguments)
         with progress_bar("recording") as progress:
             seeds = [*arguments.seeds, *arguments.unseen_seeds]
             recording, truths = record(arguments.reality, seeds, progress=progress)
-        write_hdf5(recording, folder / "demo.h5")
+        write_hdf5(recording, claimed.path / "demo.h5")
         names = tuple(d.name for d in recording.demonstrations)
         say(f"recorded {len(names)} demonstrations")
         truth = {name: (found.time, found.contacts) for name, found in zip(names, truths, strict=True)}
@@ -59,7 +59,7 @@ def run(arguments: Arguments) -> Grounded:
         with fit_progress() as progress:
             found = ground(
                 recording,
-                folder,
+                claimed.path,
                 cfg,
                 truth=truth,
                 settings=settings,

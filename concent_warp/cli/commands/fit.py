@@ -62,12 +62,12 @@ def run(arguments: Arguments) -> Grounded:
         method=arguments.method,
         demonstrations=arguments.demonstrations,
     )
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
-        settings = write_settings(folder, arguments)
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
+        settings = write_settings(claimed.path, arguments)
         with fit_progress() as progress:
             found = ground(
                 recording,
-                folder,
+                claimed.path,
                 cfg,
                 start=start,
                 settings=settings,

@@ -14,7 +14,6 @@ from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.cfg import Format, RenderCfg
 from concent_warp.errors import RenderError
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import resuming_command
 
 if TYPE_CHECKING:
     from concent_warp.deploy.render_dataset import Dataset
@@ -58,20 +57,17 @@ def run(arguments: Arguments) -> Dataset:
         source = given_policy(arguments.checkpoint, arguments.pretrained)
     from concent_warp.deploy.render_dataset import render
 
-    try:
-        with progress_bar("rendering") as progress:
-            found = render(
-                source,
-                arguments.out,
-                arguments.cfg,
-                format=arguments.format,
-                device=arguments.device,
-                resume=arguments.resume,
-                overwrite=arguments.overwrite,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"The finished episodes are saved; continue with: {resuming_command()}") from None
+    with progress_bar("rendering") as progress:
+        found = render(
+            source,
+            arguments.out,
+            arguments.cfg,
+            format=arguments.format,
+            device=arguments.device,
+            resume=arguments.resume,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
     if found.dropped:
         say(f"{found.dropped} episodes were no success and are left out")
     say(f"the data set holds {found.episodes} episode{'s' * (found.episodes != 1)}")

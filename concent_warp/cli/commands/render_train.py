@@ -12,7 +12,7 @@ from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
 from concent_warp.render.networks.cfg import RenderTrainCfg
-from concent_warp.run_folder import resuming_command, run_folder, write_settings
+from concent_warp.run_folder import run_folder, write_settings
 
 if TYPE_CHECKING:
     from concent_warp.render.networks.train import RenderTraining
@@ -60,26 +60,23 @@ def run(arguments: Arguments) -> RenderTraining:
 
     device = arguments.device or preferred_device()
     cfg, folder = arguments.cfg(), arguments.out
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
         recording = load_recording(arguments.recording)
         with progress_bar("simulation's images") as progress:
             pairs = pairs_of(recording, arguments.cameras, device=device, progress=progress)
-        training = RenderTraining(pairs, cfg, folder, device=str(wp.device_to_torch(wp.get_device(device))))
-        if arguments.resume and (folder / CHECKPOINT).exists():
+        training = RenderTraining(pairs, cfg, claimed.path, device=str(wp.device_to_torch(wp.get_device(device))))
+        if arguments.resume and (claimed.path / CHECKPOINT).exists():
             training.resume()
-        write_settings(folder, arguments)
+        write_settings(claimed.path, arguments)
         names = list(training.trainings)
         total = sum(one.cfg.steps for one in training.trainings.values())
-        try:
-            with status_bar("training") as update:
+        with status_bar("training") as update:
 
-                def show(name: str, loss: float) -> None:
-                    done = sum(one.done for one in training.trainings.values())
-                    update(done / total, f"{name} ({names.index(name) + 1} of {len(names)}), loss {loss:.4f}", None)
+            def show(name: str, loss: float) -> None:
+                done = sum(one.done for one in training.trainings.values())
+                update(done / total, f"{name} ({names.index(name) + 1} of {len(names)}), loss {loss:.4f}", None)
 
-                training.learn(show)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"The state is saved; continue with: {resuming_command()}") from None
+            training.learn(show)
     frames = ", ".join(f"{one.camera.name} {len(one)}" for one in pairs)
     say(f"trained on frames: {frames}; {total} steps of {len(names)} networks")
     say_written(folder / CHECKPOINT)

@@ -15,7 +15,7 @@ from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
 from concent_warp.files import write_text
 from concent_warp.render.splats.cfg import SplatFitCfg
-from concent_warp.run_folder import CHECKPOINT, resuming_command, run_folder, write_settings
+from concent_warp.run_folder import CHECKPOINT, run_folder, write_settings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,15 +62,12 @@ def run(arguments: Arguments) -> list[Score]:
     views = read_views(arguments.images).shrunk(arguments.longest)
     source = arguments.images if arguments.images.is_dir() else arguments.images.parent
     folder = arguments.out or Path("runs") / f"splats_{source.resolve().name}"
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume):
-        write_settings(folder, arguments)
-        try:
-            fit = _fitted(arguments, views, folder / CHECKPOINT)
-        except KeyboardInterrupt:
-            saved = (folder / CHECKPOINT).exists()
-            ending = f"The state is saved; continue with: {resuming_command()}" if saved else "Nothing was saved yet."
-            raise KeyboardInterrupt(ending) from None
-        return _write_results(fit, folder)
+    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
+        write_settings(claimed.path, arguments)
+        fit = _fitted(arguments, views, claimed.path / CHECKPOINT)
+        scores = _write_results(fit, claimed.path)
+    say_written(*(folder / name for name in (SPLATS, SCORES, PICTURE) if (folder / name).exists()))
+    return scores
 
 
 def _fitted(arguments: Arguments, views: SplatViews, checkpoint: Path) -> SplatFit:
@@ -121,7 +118,6 @@ def _write_results(fit: SplatFit, folder: Path) -> list[Score]:
         fit.splats().write(folder / SPLATS)
     scores = fit.evaluate()
     write_text(folder / SCORES, json.dumps([asdict(score) for score in scores], indent=1))
-    written = [folder / SPLATS, folder / SCORES]
     if scores:
         psnr = np.array([[score.psnr, score.psnr_object] for score in scores]).mean(axis=0)
         say(
@@ -132,6 +128,4 @@ def _write_results(fit: SplatFit, folder: Path) -> list[Score]:
         partial = folder / f".partial_{PICTURE}"
         cv2.imwrite(str(partial), picture[..., ::-1])
         partial.replace(folder / PICTURE)
-        written.append(folder / PICTURE)
-    say_written(*written)
     return scores

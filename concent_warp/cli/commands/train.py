@@ -13,7 +13,7 @@ from concent_warp.cli.given_policy import given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import processes, resuming_command
+from concent_warp.run_folder import processes
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
@@ -87,33 +87,28 @@ def run(arguments: Arguments) -> Policy:
     events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     cfg = arguments.cfg()
     last: Iteration | None = None
-    try:
-        with status_bar("training") as update:
+    with status_bar("training") as update:
 
-            def progress(this: Iteration) -> None:
-                nonlocal last
-                last = this
-                text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
-                left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
-                update(this.iteration / cfg.ppo.iterations, text, left)
+        def progress(this: Iteration) -> None:
+            nonlocal last
+            last = this
+            text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
+            left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
+            update(this.iteration / cfg.ppo.iterations, text, left)
 
-            policy = train(
-                model,
-                recording,
-                cfg,
-                events=events,
-                demonstration=arguments.demonstration,
-                begin_with=begin_with,
-                device=arguments.device,
-                out=folder,
-                resume=arguments.resume,
-                overwrite=arguments.overwrite,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        saved = (folder / CHECKPOINT).exists()
-        ending = f"The state is saved; continue with: {resuming_command()}" if saved else "Nothing was trained yet."
-        raise KeyboardInterrupt(ending) from None
+        policy = train(
+            model,
+            recording,
+            cfg,
+            events=events,
+            demonstration=arguments.demonstration,
+            begin_with=begin_with,
+            device=arguments.device,
+            out=folder,
+            resume=arguments.resume,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
     if last is None:
         say(f"nothing is left to train: {cfg.ppo.iterations} iterations are done")
     else:
