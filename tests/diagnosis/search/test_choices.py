@@ -1,0 +1,410 @@
+"""Which candidates the search fits, fits again, groups and removes, with fits that are made up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
+from concent_warp.diagnosis.search import fit_promising, gradient_start, grouping, profile_likelihood
+from concent_warp.diagnosis.search.fit_candidate import _better, polish_candidate
+from concent_warp.diagnosis.search.fit_promising import CandidateFits
+from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
+from concent_warp.diagnosis.search.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
+from concent_warp.diagnosis.tasks import TaskRunner, run_tasks, silent
+from concent_warp.errors import ModelError
+
+ANY: Any = None
+
+
+@dataclass(frozen=True)
+class MadeUp:
+    """A fit with a gain, a cost and a noise ratio."""
+
+    name: str
+    gain: float
+    cost: float = 100.0
+    ratio: float = 1.2
+    polished: bool = False
+    errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
+
+    @property
+    def fit(self) -> Any:
+        """The cost as that of a fit."""
+        return SimpleNamespace(cost=self.cost, of=self.name)
+
+    def share(self, base: Any) -> float:
+        """Return the gain."""
+        del base
+        return self.gain
+
+
+def made(*values: Any, **more: Any) -> Any:
+    """Return a fit that is made up."""
+    return MadeUp(*values, **more)
+
+
+def screened(name: str, expected: float) -> Any:
+    """Return a screened candidate."""
+    return SimpleNamespace(name=name, expected_gain=expected)
+
+
+def base_of(windows: int = 2, length: float = 1.0) -> Any:
+    """Return a baseline with windows of a length [s]."""
+    return SimpleNamespace(windows=[SimpleNamespace(start=0.5, end=0.5 + length)] * windows)
+
+
+class Tasks:
+    """Stands in for the tasks of the search, and notes what they are called with."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fits: dict[str, Any]) -> None:
+        self.fits, self.done = fits, []
+        for name in ("fit_candidate", "restart_candidate", "polish_candidate", "multiple_shooting_candidate"):
+            monkeypatch.setattr(fit_promising, name, self._task(name.split("_candidate")[0]))
+
+    def _task(self, kind: str):
+        def task(base: Any, candidate: Any, *settings: Any) -> Any:
+            del base
+            extra = [s for s in settings if not isinstance(s, SearchCfg)]
+            self.done.append((kind, candidate.name, *(getattr(s, "of", s) for s in extra)))
+            return self.fits.get(f"{candidate.name} {kind}", self.fits.get(candidate.name, candidate))
+
+        return task
+
+
+def fits_of(fits: list[Any], base: Any = None, **changes: Any) -> Any:
+    """Return the search at some fits."""
+    cfg = replace(DiagnoseCfg(jobs=1), search=replace(SearchCfg(), **changes))
+    found = CandidateFits(base or base_of(), cfg, TaskRunner())
+    found.fits = list(fits)
+    return found
+
+
+def test_candidates_are_fitted_by_promise_in_batches_until_one_explains_the_data(monkeypatch):
+    gains = (("a", 0.3, 1.5), ("b", 0.5, 1.09), ("c", 0.6, 1.2), ("d", 0.4, 1.3), ("e", 0.1, 1.3), ("f", 0.1, 1.4))
+    fits = {name: made(name, gain, ratio=ratio) for name, gain, ratio in gains}
+    tasks = Tasks(monkeypatch, fits)
+    order = [screened("e", 0.2), screened("a", 0.9), screened("d", 0.5), screened("c", 0.6), screened("b", 0.7)]
+    search = fits_of([], batch_size=3)
+    search._fit_in_batches(sorted(order, key=lambda s: -s.expected_gain))
+    assert [d[1] for d in tasks.done] == ["a", "b", "c", "d", "e"]
+    assert search.runner.share == pytest.approx(2 * 0.15 / 3)
+    tasks.done.clear()
+    fits["c"] = replace(fits["c"], gain=0.7)
+    again = fits_of([], batch_size=3)
+    again._fit_in_batches(sorted(order, key=lambda s: -s.expected_gain))
+    assert [d[1] for d in tasks.done] == ["a", "b", "c", "d"]  # 0.2 is less than 0.3 of 0.7
+    tasks.done.clear()
+    fits["b"] = replace(fits["b"], ratio=1.02)
+    noise = fits_of([], batch_size=3)
+    noise._fit_in_batches(sorted([*order, screened("f", 0.3)], key=lambda s: -s.expected_gain))
+    assert [d[1] for d in tasks.done] == ["a", "b", "c", "d"]  # 0.3 is less than 0.5 of 0.7
+    tasks.done.clear()
+    fits["b"] = replace(fits["b"], ratio=1.1)
+    none = fits_of([], batch_size=3)
+    none._fit_in_batches(sorted([*order, screened("f", 0.1)], key=lambda s: -s.expected_gain))
+    assert len(tasks.done) == 6
+
+
+def test_only_promising_candidates_are_fitted_and_at_most_so_many(monkeypatch):
+    fits = {n: made(n, 0.5, ratio=1.0) for n in "abcdef"}
+    tasks = Tasks(monkeypatch, fits)
+    promises = [screened(n, 0.5 - 0.05 * k) for k, n in enumerate("abcdef")]
+    search = fits_of([])
+    search.cfg = replace(search.cfg, max_fits=4)
+    assert [c.name for c in search.fit(promises[::-1], 0.6, ANY)] == ["a", "b", "c", "d"]
+    few = fits_of([])
+    assert [c.name for c in few.fit(promises, 0.8, ANY)] == ["a", "b"]  # more than half of 0.8
+    tasks.done.clear()
+    assert fits_of([]).fit(promises, 1.0, ANY) == []
+    assert tasks.done == []
+
+
+def test_the_search_ends_with_multiple_shooting_where_nothing_explains_the_data(monkeypatch):
+    called = []
+    for ratio, wanted in ((1.26, True), (1.25, False)):
+        Tasks(monkeypatch, {"a": made("a", 0.5, ratio=ratio)})
+        search = fits_of([])
+        monkeypatch.setattr(search, "_initialise_by_multiple_shooting", called.append)
+        search.fit([screened("a", 0.9)], 0.1, "windows")
+        assert called == (["windows"] if wanted else [])
+        called.clear()
+
+
+def test_expected_gains_are_the_larger_of_promise_and_fit(monkeypatch):
+    Tasks(monkeypatch, {"a": made("a", 0.5, ratio=1.2), "b": made("b", 0.3, ratio=1.2)})
+    seen = []
+    search = fits_of([])
+    monkeypatch.setattr(search, "_restart_lagging", lambda best, e: seen.append((best.name, e.tolist())))
+    monkeypatch.setattr(search, "_polish_near", lambda best, e: seen.append((best.name, e.tolist())))
+    monkeypatch.setattr(search, "refit_rivals", lambda e: seen.append(e.tolist()))
+    search.fit([screened("a", 0.4), screened("b", 0.35)], 0.1, ANY)
+    assert seen == [("a", [0.5, 0.35]), ("a", [0.5, 0.35]), [0.5, 0.35]]
+
+
+def test_candidates_that_lag_behind_an_explained_fit_are_restarted(monkeypatch):
+    best = made("best", 0.8, ratio=1.09)
+    lagging = [made(f"x{g}", g) for g in (0.39, 0.41, 0.55, 0.57)]
+    tasks = Tasks(monkeypatch, {"x0.41 restart": made("x0.41", 0.6), "x0.55 restart": made("x0.55", 0.5)})
+    search = fits_of([best, *lagging])
+    expected = np.array([0.8, 0.39, 0.41, 0.55, 0.57])
+    search._restart_lagging(best, expected)
+    assert tasks.done == [("restart", "x0.41", "best", True), ("restart", "x0.55", "best", True)]
+    assert expected.tolist() == [0.8, 0.39, 0.6, 0.55, 0.57]
+    tasks.done.clear()
+    search._restart_lagging(replace(best, ratio=1.1), expected)
+    assert tasks.done == []
+
+
+def test_fits_near_the_best_that_have_not_reached_the_noise_are_polished(monkeypatch):
+    tasks = Tasks(monkeypatch, {})
+    best = made("best", 0.8, ratio=1.04)
+    fits = [best, made("near", 0.7), made("low", 0.5), made("done", 0.75, ratio=1.03), made("far", 0.1)]
+    expected = np.array([0.8, 0.7, 0.57, 0.75, 0.55])
+    fits_of(fits)._polish_near(best, expected)
+    assert [d[:2] for d in tasks.done] == [("polish", "best"), ("polish", "near"), ("polish", "low")]
+    tasks.done.clear()
+    reached = replace(best, ratio=1.02)
+    fits_of([reached, made("a", 0.69), made("b", 0.68), made("c", 0.3)])._polish_near(
+        reached,
+        np.array([0.8, 0.7, 0.7, 0.7]),
+    )
+    assert [d[1] for d in tasks.done] == ["b", "c"]  # those above 0.85 of 0.8 are left to the rivals
+
+
+def test_rivals_are_refitted_as_long_as_a_cost_falls(monkeypatch):
+    one = np.array([1.0])
+    best = made("best", 0.8, 100.0, errors=one)
+    near, far = made("near", 0.75, 110.0, errors=1.03 * one), made("far", 0.5, 300.0, errors=9 * one)
+    tasks = Tasks(monkeypatch, {"near polish": replace(near, cost=108.0)})
+    search = fits_of([near, best, far])
+    search.refit_rivals(np.array([0.75, 0.8, 0.69]))
+    rounds = [("restart", "near", "best"), ("restart", "far", "best"), ("polish", "near"), ("polish", "best")]
+    assert tasks.done == [*rounds, ("restart", "near", "best"), ("polish", "near"), ("polish", "best")]
+    assert search.fits[0].fit.cost == 108.0
+    tasks.done.clear()
+    equal = replace(near, errors=1.02 * one)
+    fits_of([equal, best, far]).refit_rivals(np.array([0.75, 0.8, 0.68]))
+    assert tasks.done == [("restart", "near", "best"), ("polish", "best")]
+    tasks.done.clear()
+    fits_of([equal, replace(best, ratio=1.03)]).refit_rivals(np.array([0.75, 0.8]))
+    assert tasks.done == [("restart", "near", "best")]
+
+
+def test_rivals_are_refitted_in_a_few_rounds_at_most_and_once_over_many_windows(monkeypatch):
+    counts = []
+    for windows in (16, 17):
+        costs = iter(np.geomspace(1000, 1, 40))
+        best = made("best", 0.8, 2000.0)
+        done = []
+
+        def polish(_base, c, _cfg, costs=costs, done=done):
+            done.append(c.name)
+            return replace(c, cost=next(costs))
+
+        monkeypatch.setattr(fit_promising, "polish_candidate", polish)
+        fits_of([best], base_of(windows)).refit_rivals(np.array([0.8]))
+        counts.append(len(done))
+    assert counts == [3, 1]
+
+
+def test_fits_that_explain_most_are_initialised_by_multiple_shooting(monkeypatch):
+    tasks = Tasks(monkeypatch, {})
+    fits = [made(n, g, c) for n, g, c in (
+        ("a", 0.8, 9.0), ("b", 0.41, 5.0), ("c", 0.4, 1.0), ("d", 0.5, 7.0), ("e", 0.6, 6.0))]  # fmt: skip
+    fits_of(fits, base_of(length=0.8))._initialise_by_multiple_shooting(lambda: ANY)
+    assert [d[:2] for d in tasks.done] == [("multiple_shooting", n) for n in "bed"]
+    tasks.done.clear()
+    fits_of(fits, base_of(length=0.79))._initialise_by_multiple_shooting(lambda: ANY)
+    assert tasks.done == []
+
+
+def test_the_better_of_two_fits_has_the_lower_cost():
+    one, other = (made(n, 0.5, c) for n, c in (("one", 2.0), ("other", 1.0)))
+    assert _better(one, other) is other
+    assert _better(other, one) is other
+    assert _better(one, replace(one, name="same")) is one
+    done = replace(one, polished=True)
+    assert polish_candidate(ANY, done) is done
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The evidence of a made-up fit."""
+
+    name: str
+    accepted: bool
+    reason: str
+
+
+@pytest.mark.parametrize(("windows", "wider"), [(16, True), (17, True), (16, False)])
+def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equals(monkeypatch, windows, wider):
+    done, cfg = [], DiagnoseCfg(jobs=1)
+    fits = [made(n, 0.5) for n in "abcde"]
+    pairs: Any = [(c, Judged(c.name, True, "")) for c in fits]
+
+    def judge(c: Any) -> Any:
+        return Judged(c.name, False, "no")
+
+    def indistinguishable(_base, accepted, _search, slack=1.0):
+        done.append(("group", slack, len(accepted)))
+        return list(accepted) if slack > 1 and wider else list(accepted)[:2]
+
+    def refine(_base, c, _runner, _cfg):
+        done.append(("profile", c.name))
+        return replace(c, gain=c.gain + 0.1)
+
+    def polish(_base, c, _search, *, thorough):
+        done.append(("polish", c.name, thorough))
+        return c
+
+    monkeypatch.setattr(grouping, "indistinguishable", indistinguishable)
+    monkeypatch.setattr(grouping, "refine_by_profile", refine)
+    monkeypatch.setattr(grouping, "polish_candidate", polish)
+    group: Any = grouping.group_indistinguishable(
+        base_of(windows),
+        pairs,
+        judge,
+        TaskRunner(),
+        cfg,
+    )
+    profiled = wider and windows == 16
+    near = [("profile", n) for n in "abc"] if profiled else []
+    size = 5 if wider else 2
+    assert done == [
+        ("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True), ("profile", "a"),
+    ]  # fmt: skip
+    assert [(f.name, f.accepted, f.reason) for _, f in group] == [("a", True, ""), ("b", True, "")]
+    assert group[0][0].gain == pytest.approx(0.7 if profiled else 0.6)
+
+
+def point(distance: float, cost: float, rise: float = 0.0, parameter: int = 0) -> Any:
+    """Return a point of a profile."""
+    return SimpleNamespace(parameter=parameter, distance=distance, cost=cost, expected_rise=rise)
+
+
+def test_the_farthest_points_and_the_roughness_of_a_profile_are_those_of_its_parameter():
+    points = [point(2.0, 1), point(-6.0, 2), point(6.0, 3), point(9.0, 4, parameter=1), point(-2.0, 5)]
+    assert _farthest(points, 0, 1.0) is points[2]
+    assert _farthest(points, 0, -1.0) is points[1]
+    assert _farthest(points, 1, -1.0) is None
+    cfg, c = ProfileLikelihoodCfg(), made("c", 0.5, 10.0)
+    near = [point(2.0, 17.0, 2.0), point(-2.0, 13.0, 2.0), point(6.0, 99.0, 1.0), point(2.0, 99.0, 1.0, parameter=1)]
+    assert _roughness(c, near, 0, cfg) == pytest.approx(3.0)
+    assert _roughness(c, near[:1], 0, cfg) == pytest.approx(5.0)
+    assert _roughness(c, [point(2.0, 11.0, 2.0)], 0, cfg) == 0.0
+    assert _roughness(c, near[2:3], 0, cfg) == 0.0
+
+
+def test_a_distance_is_doubled_as_long_as_the_cost_falls(monkeypatch):
+    for costs, end, count in (([9, 8, 8.5, 7], 4.0 * 2, 3), ([9, 8, 7, 6, 5, 4], 2.0 * 16, 4), ([11], 2.0, 1)):
+        left, asked = iter(costs), []
+
+        def evaluate(_base, _c, parameter, distance, _cfg, left=left, asked=asked):
+            asked.append(distance)
+            return point(distance, next(left), parameter=parameter)
+
+        monkeypatch.setattr(profile_likelihood, "profile_point", evaluate)
+        found = _line_search(ANY, ANY, point(2.0, 10.0), ProfileLikelihoodCfg())
+        assert found.distance == end
+        assert asked == [2.0 * 2**k for k in range(1, count + 1)]
+
+
+def test_a_profile_restarts_from_lower_costs_a_few_times(monkeypatch):
+    cfg, seen = ProfileLikelihoodCfg(), []
+    for falls, restarts in (([0.5], 0), ([2.0, 0.0], 1), ([2.0] * 9, 3)):
+        left, done = iter(falls), []
+
+        def profile(_base, c, _runner, _cfg, least, left=left, done=done):
+            done.append(least)
+            return [point(2.0, c.cost - (0.0 if np.isinf(least) else next(left)))]
+
+        monkeypatch.setattr(profile_likelihood, "_profile", profile)
+        monkeypatch.setattr(profile_likelihood, "_line_search", lambda _b, _c, best, _cfg: best)
+        monkeypatch.setattr(profile_likelihood, "_restarted", lambda _b, c, best: replace(c, cost=best.cost))
+        monkeypatch.setattr(profile_likelihood, "_with_spread", lambda _b, c, points, _cfg: (c, len(points)))
+        found: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner(), cfg)
+        assert found[0].cost == 100.0 - 2.0 * restarts
+        assert len(done) == restarts + 1
+        assert np.isinf(done[-1]) == (restarts == 3)
+        seen.append(found[1])
+    assert seen == [1, 1, 1]
+    monkeypatch.setattr(profile_likelihood, "_profile", lambda *_: [])
+    none: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner())
+    assert none[1] == 0
+
+
+def effect(name: str, *target: str) -> Any:
+    """Return an effect by its name."""
+    return SimpleNamespace(name=name, target=target)
+
+
+FACTORS: Any = SimpleNamespace(friction=2.0, stiffness=4.0, mass={"box": 3.0})
+
+
+def test_factors_act_on_friction_stiffness_and_mass():
+    names = (
+        ("sliding_friction", "box"),
+        ("contact_compliance", "box"),
+        ("mass", "box"),
+        ("mass", "lid"),
+        ("size", "box"),
+    )
+    assert [_factor_of(effect(*n), FACTORS) for n in names] == [2.0, 4.0, 3.0, 1.0, 1.0]
+    values = np.array([0.02, 1.0])
+    assert _scaled(effect("contact_compliance"), values, 4.0).tolist() == [0.01, 1.0]
+    assert _scaled(effect("mass"), values, 3.0).tolist() == [0.06, 1.0]
+    assert values.tolist() == [0.02, 1.0]
+
+
+def test_candidates_with_a_factor_are_started_from_it_and_factors_follow_the_model(monkeypatch):
+    asked = []
+
+    def factors(model, _recording, _cfg):
+        asked.append(model)
+        if "wild" in model.effects:
+            raise ModelError("Newton cannot simulate it.")
+        return FACTORS
+
+    monkeypatch.setattr(gradient_start, "factors", factors)
+    monkeypatch.setattr(gradient_start, "start_from_factor", lambda _b, s, f: (s.effect.name, f))
+
+    def model(*effects: str) -> Any:
+        return SimpleNamespace(effects=effects)
+
+    starts: Any = GradientStarts(model(), ANY)
+    candidates: Any = [SimpleNamespace(effect=effect(n, "box")) for n in ("size", "mass", "sliding_friction")]
+    found = starts.apply(SimpleNamespace(model=model()), candidates, TaskRunner())
+    assert found == [candidates[0], ("mass", 3.0), ("sliding_friction", 2.0)]
+    assert len(asked) == 1
+    for _ in range(2):
+        starts.apply(SimpleNamespace(model=model("more")), candidates, TaskRunner())
+    assert [m.effects for m in asked] == [(), ("more",)]
+    assert starts.apply(SimpleNamespace(model=model("wild")), candidates, TaskRunner()) == candidates
+    with pytest.raises(ModelError, match=r"Newton cannot simulate it; or diagnose without --gradient\."):
+        GradientStarts(model("wild"), ANY)
+
+
+def test_tasks_report_their_share_in_order():
+    seen: list[tuple[float, str]] = []
+    runner = TaskRunner(1, lambda share, text: seen.append((share, text)))
+    runner.share = 0.2
+    assert runner.run(lambda a, b: a + b, [(1, 2), (3, 4)], "adding", 0.5) == [3, 7]
+    assert seen == [(pytest.approx(0.45), "adding, 1 of 2"), (pytest.approx(0.7), "adding, 2 of 2")]
+    assert runner.share == pytest.approx(0.7)
+    assert runner.run(lambda: 1, [], "nothing") == []
+    assert runner.share == pytest.approx(0.7)
+    assert (TaskRunner().jobs, TaskRunner().progress) == (1, silent)
+    silent(0.5, "half")
+    done: list[int] = []
+    lazy = run_tasks(done.append, [(k,) for k in range(3)], 1)
+    assert done == []
+    assert len(list(lazy)) == 3
+    assert done == [0, 1, 2]
+    alone = run_tasks(done.append, [(9,)], 8)
+    list(alone)
+    assert done[-1] == 9
