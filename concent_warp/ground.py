@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 BEFORE, NULL, AFTER = "before", "no contact", "after"
 """Names of the models that are compared: the starting geometry, the null model, the fitted geometry."""
-OVERLAP_FRAME = 0.01
-"""Length of the frames in which contact is compared with the truth [s]."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,9 @@ class GroundCfg:
     """Demonstrations to fit; all where empty. The comparison is about all in any case."""
     method: Method = "es"
     """How the fit searches: evolution strategy, gradients through Newton, or the latter as a start for the former."""
+    overlap_frame: float = 0.01
+    """Length of the frames in which contact is compared with the truth [s]: shorter than contacts that count, see
+    `StagingCfg.blip`."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +145,8 @@ def ground(
     overlap = {}
     if truth is not None:
         overlap = {
-            BEFORE: contact_overlap(extract_events(start, recording), truth, start.scene.objects()),
-            AFTER: contact_overlap(events, truth, start.scene.objects()),
+            BEFORE: contact_overlap(extract_events(start, recording), truth, start.scene.objects(), cfg.overlap_frame),
+            AFTER: contact_overlap(events, truth, start.scene.objects(), cfg.overlap_frame),
         }
     document = comparison.to_json()
     write_json(folder / "comparison.json", {**document, "fitted": list(fitted), "contact_overlap": overlap})
@@ -166,14 +167,22 @@ def contact_overlap(
     events: Mapping[str, ContactEventSequence],
     truth: Mapping[str, tuple[np.ndarray, Frames]],
     objects: Sequence[str],
+    frame: float = GroundCfg.overlap_frame,
 ) -> dict[str, float]:
-    """Return the overlap (IoU) of the frames in which objects touch one another with the truth, by demonstration."""
+    """Return the overlap (IoU) of the frames in which objects touch one another with the truth, by demonstration.
+
+    Args:
+        events: Contact event sequences by demonstration.
+        truth: Times [s] and contacts in frames by demonstration.
+        objects: Names of the objects.
+        frame: Length of the frames that are compared [s].
+    """
     pairs = [pair(a, b) for a, b in combinations(objects, 2)]
     found = {}
     for name, sequence in events.items():
         if name in truth and pairs:
             time, frames = truth[name]
-            grid = time_grid(sequence.duration, OVERLAP_FRAME)
-            real = debounce_frames(resample(frames, time, grid), OVERLAP_FRAME, sequence.settings)
+            grid = time_grid(sequence.duration, frame)
+            real = debounce_frames(resample(frames, time, grid), frame, sequence.settings)
             found[name] = iou(sequence_frames(sequence, grid), real, pairs).pooled
     return found

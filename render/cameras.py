@@ -12,8 +12,9 @@ from concent_warp.errors import RenderError
 from concent_warp.recording.recording import ImageStream
 from concent_warp.scene.scene import Scene
 
-CENTRED = 0.02
-"""Largest accepted offset of the principal point from the centre, as a share of the image."""
+PINHOLE_TOLERANCE = 0.02
+"""Largest offset of the principal point from the centre, as a share of the image, and largest relative difference of
+the focal lengths, that are neglected [-]: the renderer has neither."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Camera:
         height, width = stream.rgb.shape[1:3]
         matrix = np.asarray(stream.intrinsics, float)
         off = np.abs(matrix[:2, 2] - [(width - 1) / 2, (height - 1) / 2]) / [width, height]
-        if off.max() > CENTRED or abs(matrix[0, 0] / matrix[1, 1] - 1) > CENTRED:
+        if off.max() > PINHOLE_TOLERANCE or abs(matrix[0, 0] / matrix[1, 1] - 1) > PINHOLE_TOLERANCE:
             raise RenderError(
                 "images of this camera cannot be rendered",
                 where=name,

@@ -149,6 +149,9 @@ class UnknownForceCfg:
     """Shares of the error that the prior of the force expects, tried in turn [-]. Empirical."""
     force_scale: float = 0.1
     """Typical force on a free body over its weight [-]. Empirical."""
+    fade_speed: float = 2e-3
+    """Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out: far below the speeds of
+    motions that are measured."""
     lever: float = 0.05
     """Lever of the typical torque on a free body [m]: half the size of a hand-held object."""
     percentile: float = 0.5

@@ -1,7 +1,6 @@
 """A non-parametric force: a sum of Gaussian basis functions of joint position, velocity or body position.
 
-It is not registered as an effect; it represents forces that no effect of the library can produce. Basis functions
-("bumps") are Gaussian,
+It is not registered as an effect; it represents forces that no effect of the library can produce. Basis functions are
 exp(-x^2 / 2) with x the distance from a centre in widths.
 """
 
@@ -17,14 +16,14 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.force_model import ForceModel
 
-SMALLEST = 1e-12
-"""Sizes below this are zero."""
+NEGLIGIBLE_SIZE = 1e-12
+"""Sizes of basis functions below this count as zero [N or N m]."""
 
 
 class UnknownJointForce(ForceModel):
     """On each of some joints a force that depends on the joint's own position, or velocity.
 
-    Parameters are the sizes of the bumps over their scale, joint by joint, shape (n K,).
+    Parameters are the sizes of the basis functions over their scale, joint by joint, shape (n K,).
     """
 
     def __init__(self, of: np.ndarray, dof: np.ndarray, centre: np.ndarray, scale: np.ndarray, *, moving: bool) -> None:
@@ -33,7 +32,7 @@ class UnknownJointForce(ForceModel):
         Args:
             of: Where in the positions, or the velocities if `moving`, each joint is, shape (n,) int.
             dof: Its degree of freedom, shape (n,) int.
-            centre: Centres of the bumps, evenly spaced by their width [rad, m, rad/s or m/s], shape (n, K).
+            centre: Centres of the basis functions, evenly spaced by their width [rad, m, rad/s or m/s], shape (n, K).
             scale: [N m or N], shape (n,).
             moving: Whether it depends on the velocity.
         """
@@ -52,7 +51,7 @@ class UnknownJointForce(ForceModel):
         sizes = values.reshape(self.centre.shape) * self.scale[:, None]
         rows = [
             (int(self.of[i]), int(self.dof[i]), float(self.centre[i, k]), 1.0 / float(width[i]), float(sizes[i, k]))
-            for i, k in np.argwhere(np.abs(sizes) > SMALLEST)
+            for i, k in np.argwhere(np.abs(sizes) > NEGLIGIBLE_SIZE)
         ]
 
         def act() -> None:
@@ -70,18 +69,24 @@ class UnknownJointForce(ForceModel):
 Way = Literal["field", "brake", "drag", "turning"]
 """How a force on a body acts: along each axis of the world by place; against the velocity by place, or by speed; as a
 torque against the turning by its rate."""
-STILL = 2e-3
-"""Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out."""
 
 
 class UnknownBodyForce(ForceModel):
     """On a free body a force that depends on where it is, or a resistance that depends on that or on its speed.
 
-    Parameters are the sizes of the bumps over their scale, shape (K,), or (3 K,) along x, y and z of each bump.
+    Parameters are the sizes of the basis functions over their scale, shape (K,), or (3 K,) along x, y and z of each.
     """
 
     def __init__(
-        self, body: int, place: int, dof: int, centre: np.ndarray, width: float, scale: float, way: Way
+        self,
+        body: int,
+        place: int,
+        dof: int,
+        centre: np.ndarray,
+        width: float,
+        scale: float,
+        way: Way,
+        fade_speed: float = 2e-3,
     ) -> None:
         """Set the basis functions.
 
@@ -90,12 +95,13 @@ class UnknownBodyForce(ForceModel):
             place: Of its free joint in the positions.
             dof: Of its free joint.
             centre: Centres [m], shape (K, 3), or [m/s or rad/s], shape (K, 1).
-            width: Of the bumps, in the same unit.
+            width: Of the basis functions, in the same unit.
             scale: [N or N m].
             way: See `Way`.
+            fade_speed: Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out.
         """
         self.body, self.place, self.dof = body, place, dof
-        self.centre, self.width, self.scale, self.way = centre, width, scale, way
+        self.centre, self.width, self.scale, self.way, self.fade_speed = centre, width, scale, way, fade_speed
 
     @property
     def count(self) -> int:
@@ -109,9 +115,10 @@ class UnknownBodyForce(ForceModel):
         rate, torque = d.qvel[self.dof + 3 : self.dof + 6], d.qfrc_applied[self.dof + 3 : self.dof + 6]
         force = d.xfrc_applied[self.body, :3]
         sizes = np.reshape(values, (len(self.centre), -1)) * self.scale
-        used = np.flatnonzero((np.abs(sizes) > SMALLEST).any(axis=1))
+        used = np.flatnonzero((np.abs(sizes) > NEGLIGIBLE_SIZE).any(axis=1))
         rows = [(self.centre[k], sizes[k]) for k in used]
         narrow, way = 1.0 / self.width, self.way
+        fade_speed = 10 * self.fade_speed if way == "turning" else self.fade_speed
 
         def act() -> None:
             for centre, size in rows:
@@ -122,8 +129,7 @@ class UnknownBodyForce(ForceModel):
                 if way == "field":
                     force[:] += bump * size
                     continue
-                still = 10 * STILL if way == "turning" else STILL
-                (torque if way == "turning" else force)[:] -= bump * size[0] / math.hypot(speed, still) * moved
+                (torque if way == "turning" else force)[:] -= bump * size[0] / math.hypot(speed, fade_speed) * moved
 
         return act
 

@@ -2,8 +2,8 @@
 
 MuJoCo's contacts of the two bodies are frictionless; the force is computed from the normal forces N of the previous
 step and the velocity v at each point: f = -N (mu_x v_x, mu_y v_y) / |v|, with an anisotropic coefficient of friction
-(Zmitrowicz, "A theoretical model of anisotropic dry friction", Wear 73(1), 1981). Below a creep speed it fades, so that
-a body comes to rest within microns; it does not hold a body on a slope.
+(Zmitrowicz, "A theoretical model of anisotropic dry friction", Wear 73(1), 1981). Below `FADE_SPEED` it fades, so that
+a body comes to rest within microns; a body on a slope creeps.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
-CREEP = 2e-3
-"""Speed below which friction fades [m/s]; the step must be short against CREEP / (mu g)."""
+FADE_SPEED = 2e-3
+"""Speed below which friction fades [m/s]; the step must be short against FADE_SPEED / (mu g)."""
 Coefficients = Callable[[float, np.ndarray], np.ndarray]
 """Given time [s] and a point [m], world frame, returns the coefficients along the world's x and y (2,) [-]."""
 
@@ -52,7 +52,7 @@ def rub(coefficients: Coefficients, body: str, surface: str) -> Callable[[mujoco
         for place, normal in zip(*normal_forces(model, data, b, model.geom(surface).id), strict=True):
             x, y, z = place - centre
             slip_x, slip_y = vx + wy * z - wz * y, vy + wz * x - wx * z
-            pressure = normal / (slip_x**2 + slip_y**2 + CREEP**2) ** 0.5
+            pressure = normal / (slip_x**2 + slip_y**2 + FADE_SPEED**2) ** 0.5
             mu_x, mu_y = coefficients(data.time, place)
             push_x, push_y = -pressure * mu_x * slip_x, -pressure * mu_y * slip_y
             data.xfrc_applied[b] += (push_x, push_y, 0.0, -z * push_y, z * push_x, x * push_y - y * push_x)

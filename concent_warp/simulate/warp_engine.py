@@ -32,10 +32,10 @@ FATAL = BITS.HFIELD | BITS.NVMAX | BITS.EPA_HORIZON | BITS.TACTILE
 LIMITED = BITS.ITERATIONS | BITS.LS_ITERATIONS
 
 LOG_ROW_BYTES = 14 * 4
-PROGRAMS = 2
-"""Programs kept for the next run with the same shapes."""
-HEADROOM = 1.5
-"""Memory that MuJoCo-Warp takes in a step, relative to that of its data."""
+MAX_PROGRAMS = 2
+"""Most programs kept for the next run with the same shapes: each holds the data of all worlds."""
+STEP_MEMORY_RATIO = 1.5
+"""Memory that MuJoCo-Warp takes in a step, relative to that of its data [-]."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class WarpEngine:
         if plan in self._programs:
             self._programs.move_to_end(plan)
             return self._programs[plan]
-        while len(self._programs) >= PROGRAMS:
+        while len(self._programs) >= MAX_PROGRAMS:
             self._programs.popitem(last=False)
         typical = {name: largest(value) + (name in edited) for name, value in fields.items()}
         try:
@@ -257,7 +257,7 @@ class WarpEngine:
         if buffers not in self._world_bytes:
             self._world_bytes[buffers] = world_bytes(m, buffers)
         recorded = 2 * 4 * len(run.record) * (m.nq + m.nv + m.nsensordata + 7 * len(run.bodies))
-        one = int(HEADROOM * self._world_bytes[buffers]) + recorded + m.ngeom * m.nbody + 4 * run.steps * m.nu
+        one = int(STEP_MEMORY_RATIO * self._world_bytes[buffers]) + recorded + m.ngeom * m.nbody + 4 * run.steps * m.nu
         logged = buffers.log_rows * LOG_ROW_BYTES if run.contacts == "all" else 0
         room = (self._max_memory - logged) // one
         if room < 1:

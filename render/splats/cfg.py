@@ -48,6 +48,14 @@ class SplatFitCfg:
     """Steps between splits, until two thirds of the fit are done."""
     faint: float = 0.02
     """Opacity below which a Gaussian is taken out."""
+    hull_cells: int = 72
+    """Cells along an edge of the cube in which the visual hull of the masks is carved."""
+    hull_alpha: int = 128
+    """Least alpha of a pixel that shows the object, 0 to 255: half."""
+    initial_opacity: float = 0.3
+    """Opacity of the first Gaussians [0 to 1]."""
+    checkpoint_period: float = 20.0
+    """Time between checkpoints [s]."""
     rates: RatesCfg = field(default_factory=RatesCfg)
     seed: int = 0
 

@@ -35,9 +35,8 @@ Report = Callable[[int, float], None]
 """Called with the number of steps done and the loss."""
 NAMES = ("means", "quats", "scales", "opacities", "constant", "rest")
 MOMENTS = ("exp_avg", "exp_avg_sq")
-PERIOD = 20.0
-"""Time between checkpoints [s]."""
-STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+IDENTITY_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""Position [m] and quaternion wxyz."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,8 @@ class SplatFit:
         self._rgb = (rgba[..., :3] * rgba[..., 3:]).contiguous()
         self._poses = torch.tensor(views.camera_poses(), dtype=torch.float32, device=self.device)
         self._intrinsics = torch.tensor(views.intrinsics, dtype=torch.float32, device=self.device)
-        self._still = torch.tensor([[STILL]], device=self.device)
-        first = first_splats(views, points, cfg.degree, self.device)
+        self._still = torch.tensor([[IDENTITY_POSE]], device=self.device)
+        first = first_splats(views, points, cfg, self.device)
         self._extent = float((first.means - first.means.mean(dim=0)).norm(dim=1).quantile(0.95))
         means, quats, scales, opacities, harmonics = first.tensors()
         values = [means, quats, scales.log(), opacities.logit(), harmonics[:, :1], harmonics[:, 1:]]
@@ -125,7 +124,7 @@ class SplatFit:
             loss = self.step()
             if report is not None and (self.iteration % 10 == 0 or self.iteration == self.cfg.iterations):
                 report(self.iteration, float(loss))
-            due = time.monotonic() - saved > PERIOD or self.iteration == self.cfg.iterations
+            due = time.monotonic() - saved > self.cfg.checkpoint_period or self.iteration == self.cfg.iterations
             if checkpoint is not None and due:
                 self.save(checkpoint)
                 saved = time.monotonic()

@@ -9,19 +9,15 @@ import torch
 from scipy.spatial import KDTree
 
 from concent_warp.errors import RenderError
+from concent_warp.render.splats.cfg import SplatFitCfg
 from concent_warp.render.splats.splats import COEFFICIENTS, Splats
 from concent_warp.render.splats.views import SplatViews
 from concent_warp.scene.shapes.objects import MESHES, read_mesh, read_points
 from concent_warp.scene.shapes.ply import read_header
 from concent_warp.scene.shapes.splat import HARMONIC
 
-CELLS = 72
-"""Cells along an edge of the cube in which the hull is carved."""
-SURE = 128
-"""Least alpha of a pixel that shows the object."""
-OPACITY = 0.3
-"""Initial opacity."""
 FLIP = np.diag([1.0, -1.0, -1.0])
+"""Turns a camera that looks along -z with y up into one that looks along z with y down."""
 
 
 def read_start(path: Path, count: int, scale: float, rng: np.random.Generator) -> np.ndarray:
@@ -58,32 +54,35 @@ def _within(views: SplatViews, pixels: np.ndarray, depth: np.ndarray) -> np.ndar
     return (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < views.size).all(axis=1)
 
 
-def visual_hull(views: SplatViews, count: int, rng: np.random.Generator) -> np.ndarray:
+def visual_hull(views: SplatViews, count: int, rng: np.random.Generator, cfg: SplatFitCfg | None = None) -> np.ndarray:
     """Return points on the surface of the visual hull of all masks [m], at most `count`, shape (n, 3).
 
     Raises:
         RenderError: there are no masks, or they have no volume in common.
     """
+    cfg = cfg or SplatFitCfg()
+    cells = cfg.hull_cells
     if not views.masked:
         raise RenderError(
-            "nothing tells where the object is", expected="images with an alpha channel, or points to start from",
+            "the images do not show which pixels are the object",
+            expected="images with an alpha channel, or points to start from",
             fix="pass --points with a mesh or a point cloud",
         )  # fmt: skip
-    middle, half = _enclosing_cube(views)
-    axis = (np.arange(CELLS) + 0.5) / CELLS * 2 - 1
+    middle, half = _enclosing_cube(views, cfg.hull_alpha)
+    axis = (np.arange(cells) + 0.5) / cells * 2 - 1
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3) * half + middle
     inside = np.ones(len(grid), dtype=bool)
     for v in range(len(views)):
         pixels, depth = _project(views, v, grid)
         seen = _within(views, pixels, depth)
-        mask = views.rgba[v, ..., 3] >= SURE
+        mask = views.rgba[v, ..., 3] >= cfg.hull_alpha
         # What is beyond the image may belong to an object that the image's border cuts, and to no other.
         cut = mask[[0, -1]].any() or mask[:, [0, -1]].any()
         covered = np.full(len(grid), cut)
         covered[seen] = mask[pixels[seen, 1], pixels[seen, 0]]
         inside &= covered
-    solid = np.pad(inside.reshape((CELLS,) * 3), 1)
-    core = np.ones((CELLS,) * 3, dtype=bool)
+    solid = np.pad(inside.reshape((cells,) * 3), 1)
+    core = np.ones((cells,) * 3, dtype=bool)
     for k in range(3):
         for step in (-1, 1):
             core &= np.roll(solid, step, axis=k)[1:-1, 1:-1, 1:-1]
@@ -93,16 +92,16 @@ def visual_hull(views: SplatViews, count: int, rng: np.random.Generator) -> np.n
             "the masks of the images have no volume in common", expected="poses and masks of one object",
             fix="check the convention of transform_matrix: cameras look along -z, with y up",
         )  # fmt: skip
-    cell = 2 * half / CELLS
+    cell = 2 * half / cells
     points = surface[rng.choice(len(surface), max(count, len(surface)))]
     return _thinned(points + rng.uniform(-cell / 2, cell / 2, points.shape), count, rng)
 
 
-def _enclosing_cube(views: SplatViews) -> tuple[np.ndarray, float]:
-    """Return the middle [m], shape (3,), and half the edge [m] of a cube that holds the object, by its masks."""
+def _enclosing_cube(views: SplatViews, alpha: int) -> tuple[np.ndarray, float]:
+    """Return the middle [m], shape (3,), and half the edge [m] of a cube around the object, by its masks."""
     origins, rays, spans = [], [], []
     for v in range(len(views)):
-        rows, columns = np.nonzero(views.rgba[v, ..., 3] >= SURE)
+        rows, columns = np.nonzero(views.rgba[v, ..., 3] >= alpha)
         if not len(rows):
             continue
         matrix, pose = views.intrinsics[v], views.poses[v]
@@ -123,7 +122,7 @@ def _enclosing_cube(views: SplatViews) -> tuple[np.ndarray, float]:
     return middle, float((distance * np.array(spans)).max() * 1.1)
 
 
-def first_splats(views: SplatViews, points: np.ndarray, degree: int, device: torch.device) -> Splats:
+def first_splats(views: SplatViews, points: np.ndarray, cfg: SplatFitCfg, device: torch.device) -> Splats:
     """Return splats at points (n, 3) [m], as wide as the gaps between them, coloured as the images show them."""
     if len(points) < 10:
         raise RenderError("too few points to start from", expected="at least 10", found=len(points))
@@ -136,7 +135,7 @@ def first_splats(views: SplatViews, points: np.ndarray, degree: int, device: tor
         rgba = views.rgba[v, pixels[seen, 1], pixels[seen, 0]].astype(float) / 255
         total[seen] += rgba[:, :3] * rgba[:, 3:]
         weight[seen] += rgba[:, 3:]
-    harmonics = np.zeros((len(points), COEFFICIENTS[degree], 3))
+    harmonics = np.zeros((len(points), COEFFICIENTS[cfg.degree], 3))
     harmonics[:, 0] = (total / weight - 0.5) / HARMONIC
 
     def tensor(values: np.ndarray) -> torch.Tensor:
@@ -144,5 +143,5 @@ def first_splats(views: SplatViews, points: np.ndarray, degree: int, device: tor
 
     return Splats(
         tensor(points), tensor(np.tile([1.0, 0, 0, 0], (len(points), 1))), tensor(np.tile(scale[:, None], 3)),
-        torch.full((len(points),), OPACITY, device=device), tensor(harmonics),
+        torch.full((len(points),), cfg.initial_opacity, device=device), tensor(harmonics),
     )  # fmt: skip

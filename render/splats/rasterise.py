@@ -18,8 +18,8 @@ from concent_warp.errors import RenderError
 from concent_warp.kernels.splats.splats import PARAMETERS, SplatArrays, SplatPlan
 from concent_warp.render.splats.splats import Splats
 
-HEADROOM = 2.0
-"""Room for pairs of Gaussian and tile, as a multiple of what the first images take."""
+PAIR_CAPACITY_RATIO = 2.0
+"""Size of the buffer for pairs of Gaussian and tile, as a multiple of what the first images take [-]."""
 
 
 class Layer(NamedTuple):
@@ -175,7 +175,7 @@ class Rasteriser:
         self.launch()
         # Where a camera comes near, a Gaussian covers many tiles.
         if not self._limited and int(self.overflow.sum()):
-            self._make(int(HEADROOM * int(self.pairs.sum())))
+            self._make(int(PAIR_CAPACITY_RATIO * int(self.pairs.sum())))
             self.launch()
         return self.layer()
 
@@ -185,7 +185,7 @@ class Rasteriser:
             self.plan.launch()
             if not self._measured:
                 self._measured = True
-                self._make(int(HEADROOM * int(self.pairs.sum())))
+                self._make(int(PAIR_CAPACITY_RATIO * int(self.pairs.sum())))
                 self.plan.launch()
         self.launches += 1
 

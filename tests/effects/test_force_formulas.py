@@ -9,7 +9,7 @@ import pytest
 from concent_warp.effects.library.contact_forces import SMOOTH, AdhesionForce, AnisotropicForce, _outermost
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.library.gear_forces import BacklashForce, Gear
-from concent_warp.effects.unknown_force import STILL, UnknownBodyForce, UnknownJointForce
+from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownJointForce
 
 SLIDING = """
 <mujoco><option timestep="0.002" cone="{cone}"/><worldbody>
@@ -366,7 +366,7 @@ def test_force_on_a_body_is_the_sum_of_its_bumps(way):
     if way == "field":
         expected = scale * bumps @ values.reshape(count, 3)
     else:
-        still = 10 * STILL if way == "turning" else STILL
+        still = 10 * 2e-3 if way == "turning" else 2e-3
         expected = -scale * (bumps @ values) * moved / np.sqrt(moved @ moved + still**2)
     model = UnknownBodyForce(2, 1, 1, centre, width, scale, way)
     model.apply(m, d, values)

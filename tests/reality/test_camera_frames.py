@@ -8,7 +8,7 @@ import pytest
 
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
 from concent_warp.reality.sensors.camera import _edges, film
-from concent_warp.reality.sensors.sensing import SLACK, SensingCfg, seen
+from concent_warp.reality.sensors.sensing import SensingCfg, seen
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 SCENE = ShapeSorterCfg().build()
@@ -157,14 +157,14 @@ def test_points_outside_the_image_are_not_seen():
     corners = np.array([[0.0, height - 1], [width - 1, height - 1], [width / 2, height / 2]])
     _, depth = cast(model, data.qpos, camera, height, width)
     inside = camera.lift(corners, np.array([depth[-1, 0], depth[-1, -1], depth[height // 2, width // 2]]))
-    np.testing.assert_array_equal(seen(SENSING, model, data, inside, SLACK), True)
+    np.testing.assert_array_equal(seen(SENSING, model, data, inside, SENSING.visibility_slack), True)
     pixels = np.array([[width + 2.0, 60], [80, height + 2.0], [-3, 60], [80, 60]])
     outside = camera.lift(pixels, np.array([0.5, 0.5, 0.5, -0.5]))
-    np.testing.assert_array_equal(seen(SENSING, model, data, outside, SLACK), False)
+    np.testing.assert_array_equal(seen(SENSING, model, data, outside, SENSING.visibility_slack), False)
     # Nearer and in view, a point in the air is seen; under the table it is not.
     between = camera.lift(corners[2:], np.array([0.5]))
-    assert seen(SENSING, model, data, between, SLACK)[0]
-    assert not seen(SENSING, model, data, np.array([[0.48, -0.02, -0.1]]), SLACK)[0]
+    assert seen(SENSING, model, data, between, SENSING.visibility_slack)[0]
+    assert not seen(SENSING, model, data, np.array([[0.48, -0.02, -0.1]]), SENSING.visibility_slack)[0]
 
 
 def test_camera_looks_at_its_target_upright():

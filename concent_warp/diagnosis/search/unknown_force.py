@@ -178,10 +178,10 @@ def _body_forces(
     position, speed = qpos[:, place : place + 3], np.linalg.norm(qvel[:, dof : dof + 3], axis=1)
     rate = np.linalg.norm(qvel[:, dof + 3 : dof + 6], axis=1)
     centre, width = _spread_out(position, cfg.basis_points)
-    laid: list[tuple[str, Way, np.ndarray, float, float]] = []
+    basis: list[tuple[str, Way, np.ndarray, float, float]] = []
     if width > 1e-4:
-        laid.append(("a force that depends on the position", "field", centre, width, force))
-        laid.append(("a resistance that depends on the position", "brake", centre, width, force))
+        basis.append(("a force that depends on the position", "field", centre, width, force))
+        basis.append(("a resistance that depends on the position", "brake", centre, width, force))
     resisted: tuple[tuple[str, Way, np.ndarray, float], ...] = (
         ("a resistance that depends on the speed", "drag", speed, force),
         ("a resistance that depends on the rate of turning", "turning", rate, cfg.lever * force),
@@ -190,11 +190,11 @@ def _body_forces(
     for words, way, values, scale in resisted:
         high = float(np.percentile(values, 100 - cfg.percentile))
         if high > 1e-3:
-            laid.append((words, way, np.linspace(0, high, count)[:, None], high / (count - 1), scale))
+            basis.append((words, way, np.linspace(0, high, count)[:, None], high / (count - 1), scale))
     label = name(m, mujoco.mjtObj.mjOBJ_BODY, body) or f"body {body}"
     return [
-        UnknownForce(f"{words} of {label}", UnknownBodyForce(body, place, dof, c, w, s, way))
-        for words, way, c, w, s in laid
+        UnknownForce(f"{words} of {label}", UnknownBodyForce(body, place, dof, c, w, s, way, cfg.fade_speed))
+        for words, way, c, w, s in basis
     ]
 
 

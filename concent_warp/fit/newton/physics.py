@@ -5,9 +5,9 @@ that the stiffest motion of a body bounds the time step. With contacts at r_i fr
 6 x 6 inertia and J_i = [1, -[r_i]x], the largest eigenvalue L of M^-1 sum_i J_i^T J_i says how strongly all contacts
 together act on the body [1/kg]. The rules are
 
-    dt^2 ke L <= 0.5,    dt kd L <= 0.8,    dt kf L <= 0.8.
+    dt^2 ke L <= max_spring_number,    dt kd L <= max_damper_number,    dt kf L <= max_damper_number.
 
-A forward run looks fine well beyond the last of them; gradients do not.
+A forward run stays stable well beyond the last of them; gradients do not.
 """
 
 from __future__ import annotations
@@ -18,9 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from concent_warp.errors import EngineError
-
-SPRING, DAMPER = 0.5, 0.8
-"""Right-hand sides of the rules [-]."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +43,18 @@ class NewtonCfg:
     min_contacts: int = 4
     """Contacts that carry a resting body [-]: they share its stiffness, and at least so many are assumed."""
     min_damping: float = 0.6
-    """Share of the wanted damping below which a body would bounce [-]."""
+    """Share of `damping` below which a body would bounce [-]."""
+    max_spring_number: float = 0.5
+    """Largest dt^2 ke L [-]: semi-implicit Euler is stable below 4, and accurate well below 1."""
+    max_damper_number: float = 0.8
+    """Largest dt kd L and dt kf L [-]: an explicit damper overshoots from 1 on and is unstable from 2 on."""
     pair_states: int = 200
     """States of a segment, of those simulated, in which pairs that may collide are searched for [-]."""
 
 
 @dataclass(frozen=True)
 class BodyInertia:
-    """A simulated body as its contacts feel it."""
+    """Inertia of a simulated body."""
 
     name: str
     mass: float
@@ -103,10 +104,10 @@ def choose_physics(
     friction: float,
     gravity: float,
 ) -> NewtonPhysics:
-    """Return numbers by the rules.
+    """Return time step, stiffness and damping by the rules.
 
     Args:
-        cfg: What is wanted.
+        cfg: Settings.
         timestep: MuJoCo's step, of which Newton's is a part [s].
         bodies: The simulated bodies, D of them.
         couplings: L of each with all contacts that it may have at a time [1/kg].
@@ -123,10 +124,10 @@ def choose_physics(
     first = max(int(np.ceil(timestep / cfg.longest_step - 1e-9)), 1)
     last = int(np.floor(timestep / cfg.shortest_step + 1e-9))
     steps = np.array([timestep / k for k in range(first, max(last, first) + 1)])[:, None]
-    limit = DAMPER / (steps * strength)
+    limit = cfg.max_damper_number / (steps * strength)
     slope = limit.min(axis=1, keepdims=True)
     reasons = {
-        "its contacts are too stiff": steps**2 * stiffness * strength <= SPRING,
+        "its contacts are too stiff": steps**2 * stiffness * strength <= cfg.max_spring_number,
         "it would bounce": limit >= cfg.min_damping * damping,
         "it would creep": friction * gravity * mass
         <= cfg.creep * slope * np.maximum(mass * strength, cfg.min_contacts),

@@ -38,8 +38,8 @@ class Parameters:
     """Factor on mass and inertia of each simulated body [-], shape (P, D)."""
 
 
-CHUNK = 200
-"""Steps of a chunk."""
+CHUNK_STEPS = 200
+"""Steps whose states are stored at a time, for gradients: memory grows with it, and the time to repeat steps falls."""
 NAMES = ("position", "radius", "friction", "friction_scale", "stiffness_scale", "mass_scale")
 """Of the parameters."""
 
@@ -62,7 +62,7 @@ class NewtonWorlds:
         self.device = wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu"))
         self.segments = len(scene.segments)
         self.worlds = count * self.segments
-        self.chunk = min(CHUNK, scene.steps)
+        self.chunk = min(CHUNK_STEPS, scene.steps)
         self.chunks = -(-scene.steps // self.chunk)
         with wp.ScopedDevice(self.device):
             self._model = self._build(newton)

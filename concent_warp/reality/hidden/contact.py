@@ -12,7 +12,7 @@ from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.sliding_friction import Coefficients, frictionless, normal_forces, rub
 from concent_warp.reality.world import HiddenEffect
 
-FADE = 0.05
+FADE_RATE = 0.05
 """Turning speed below which torsional and rolling friction fade [rad/s]."""
 
 
@@ -73,7 +73,7 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
         for coefficient, part in ((about, [0, 0, 1]), (across, [1, 1, 0])):
             spin = velocity[:3] * part
-            data.xfrc_applied[body, 3:] -= coefficient * normal * spin / np.hypot(np.linalg.norm(spin), FADE)
+            data.xfrc_applied[body, 3:] -= coefficient * normal * spin / np.hypot(np.linalg.norm(spin), FADE_RATE)
 
     return HiddenEffect("rolling_friction" if rolling else "torsional_friction", edit=edit, force=force)
 

@@ -12,9 +12,6 @@ from concent_warp.perception.visible_region import cast_rays
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 
-SLACK = 2e-3
-"""Distance of a surface in front of a point below which the point counts as visible [m]."""
-
 
 @dataclass(frozen=True)
 class SensingCfg:
@@ -34,6 +31,9 @@ class SensingCfg:
     """Noise of each tracked surface point [m]."""
     point_rate: float = 30.0
     """Rate of the point tracks, that is of the camera [Hz]."""
+    visibility_slack: float = 2e-3
+    """Distance of a surface in front of a point below which the point counts as visible [m]: larger than rounding of
+    sampled surface points, smaller than objects."""
     point_count: int = 96
     """Points tracked on each object."""
     camera_position: tuple[float, float, float] = (1.05, -0.45, 0.65)
@@ -137,7 +137,7 @@ def visible_points(
     local = _surface_points(scene, body, 40 * sensing.point_count, rng)
     place = data.body(body)
     points = place.xpos + local @ place.xmat.reshape(3, 3).T
-    local = local[seen(sensing, model, data, points, SLACK)]
+    local = local[seen(sensing, model, data, points, sensing.visibility_slack)]
     return local[rng.choice(len(local), sensing.point_count, replace=False)]
 
 

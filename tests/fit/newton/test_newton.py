@@ -13,7 +13,7 @@ from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.newton.descent import GradientCfg
 from concent_warp.fit.newton.horizon import HorizonCfg, _tilt, gradient_segments
 from concent_warp.fit.newton.loss import NewtonLoss, recording_gradient
-from concent_warp.fit.newton.physics import DAMPER, SPRING, BodyInertia, NewtonCfg, choose_physics, coupling
+from concent_warp.fit.newton.physics import BodyInertia, NewtonCfg, choose_physics, coupling
 from concent_warp.fit.newton.scene import newton_scene
 from concent_warp.fit.newton.worlds import Parameters
 from concent_warp.model import Model
@@ -199,7 +199,9 @@ def test_numbers_keep_the_rules_of_stability():
     assert strength > 4 / 0.08
     found = choose_physics(NewtonCfg(), 0.004, [body], [strength], 0.5, 9.81)
     assert found.timestep * found.substeps == pytest.approx(0.004)
-    assert found.timestep**2 * found.stiffness[0] * strength <= SPRING
-    assert found.timestep * max(found.damping[0], found.friction_slope) * strength <= DAMPER * (1 + 1e-9)
+    assert found.timestep**2 * found.stiffness[0] * strength <= NewtonCfg().max_spring_number
+    assert found.timestep * max(found.damping[0], found.friction_slope) * strength <= NewtonCfg().max_damper_number * (
+        1 + 1e-9
+    )
     with pytest.raises(EngineError, match="block"):
         choose_physics(NewtonCfg(), 0.004, [body], [100 * strength], 0.5, 9.81)
