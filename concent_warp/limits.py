@@ -34,10 +34,12 @@ class Limits:
     text_bytes: int = 1 << 20
     """A text attribute, such as the task [bytes]."""
     file_bytes: int = 1 << 30
-    """One CSV, JSON, TOML or geometry file, one mesh, or one ``.pt`` toss [bytes]; HDF5 files are bounded by what they
-    declare instead."""
+    """One CSV file, one geometry, one mesh, or one ``.pt`` toss [bytes]; HDF5 files are bounded by what they declare
+    instead."""
     checkpoint_bytes: int = 4 << 30
     """A checkpoint of a training, in the file and in memory [bytes]: a thousand million numbers of single precision."""
+    document_bytes: int = 256 << 20
+    """One TOML or JSON file [bytes]; its text takes about ten times as much once read."""
     chunk_bytes: int = 256 << 20
     """One chunk of an HDF5 dataset, uncompressed: several frames of any camera [bytes]."""
     scene_bytes: int = 256 << 20

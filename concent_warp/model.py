@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from concent_warp.documents import is_number, read_toml
 from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.table import checked_values, effects_table, read_effects
@@ -35,6 +35,23 @@ class ContactParameters:
     """Impedance at zero depth, at full depth [-], and the depth between them [m]."""
     condim: int = 4
     """Contact dimensionality: 3 sliding friction, 4 torsional too, 6 rolling too."""
+
+    def __post_init__(self) -> None:
+        (first, second), (shallow, deep, width) = self.solref, self.solimp
+        if not np.isfinite([*self.solref, *self.solimp]).all():
+            raise ModelError("[contact] holds a number that is not finite", found=[*self.solref, *self.solimp])
+        if not ((first > 0 and second > 0) or (first <= 0 and second <= 0)):
+            raise ModelError(
+                "[contact] solref is not right",
+                expected="a time constant and a damping ratio above 0, or stiffness and damping both with a minus sign",
+                found=list(self.solref),
+            )
+        if not (0 <= shallow <= deep <= 1 and width >= 0):
+            raise ModelError(
+                "[contact] solimp is not right",
+                expected="0 <= impedance at zero depth <= impedance at full depth <= 1, and a depth >= 0",
+                found=list(self.solimp),
+            )
 
 
 @dataclass(frozen=True)
@@ -196,10 +213,7 @@ class Model:
             return Model(Scene.from_mjcf(path))
         if not path.is_file():
             raise ModelError("no such model", where=path, expected="a model.toml or an MJCF .xml")
-        try:
-            document = tomllib.loads(path.read_text())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ModelError("not a TOML file", where=path, found=error) from None
+        document = read_toml(path, ModelError)
         if document.get("format") != FORMAT:
             raise ModelError(
                 "not a concent model", where=path, expected=f'format = "{FORMAT}"', found=document.get("format")
@@ -217,6 +231,8 @@ class Model:
             raise ModelError(
                 "the model file names no scene", where=path, expected='scene = "file.xml"', found=document.get("scene")
             )
+        if not isinstance(document.get("geometry", ""), str):
+            raise ModelError("the geometry has no file name", where=path, expected='geometry = "file.npz"')
         scene = Scene.from_mjcf(path.parent / document["scene"])
         geometry = ContactGeometry.load(path.parent / document["geometry"]) if "geometry" in document else None
         model = Model(scene, geometry, _contact_parameters(document.get("contact", {}), path))
@@ -231,6 +247,8 @@ class Model:
 
 def _contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParameters:
     """Read the ``[contact]`` table of a model file, strictly."""
+    if not isinstance(table, Mapping):
+        raise ModelError("[contact] is not a table", where=path, found=table)
     known = {f.name: f for f in fields(ContactParameters)}
     if unknown := sorted(set(table) - set(known)):
         raise ModelError("unknown entries in [contact]", where=path, expected=f"only {sorted(known)}", found=unknown)
@@ -238,17 +256,20 @@ def _contact_parameters(table: Mapping[str, Any], path: Path) -> ContactParamete
     for name, value in table.items():
         default = getattr(ContactParameters(), name)
         if isinstance(default, tuple):
-            numbers = isinstance(value, list) and all(isinstance(v, int | float) for v in value)
+            numbers = isinstance(value, list) and all(map(is_number, value))
             if not numbers or len(value) != len(default):
                 raise ModelError(
-                    f"[contact] {name} is not right", where=path, expected=f"{len(default)} numbers", found=value
+                    f"[contact] {name} is not right", where=path, expected=f"{len(default)} finite numbers", found=value
                 )
             values[name] = tuple(float(v) for v in value)
-        elif value not in (3, 4, 6):
+        elif not isinstance(value, int) or value not in (3, 4, 6):
             raise ModelError(f"[contact] {name} is not right", where=path, expected="3, 4 or 6", found=value)
         else:
             values[name] = value
-    return ContactParameters(**values)
+    try:
+        return ContactParameters(**values)
+    except ModelError as error:
+        raise ModelError(str(error).rstrip("."), where=path) from None
 
 
 def load_model(path: str | Path) -> Model:

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from concent_warp.documents import is_number
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
@@ -84,6 +85,8 @@ def read_effects(rows: Any, path: Path) -> list[AddedEffect]:
             or not all(_numbers(p) and len(p) == 2 for p in intervals)
         ):
             raise ModelError("values and intervals are not right", where=where, expected="lists of numbers")
+        if wrong := next((pair for pair in intervals if pair[0] > pair[1]), None):
+            raise ModelError("an interval is reversed", where=where, expected="its lower end first", found=wrong)
         pairs = tuple((float(low), float(high)) for low, high in intervals)
         found.append(AddedEffect(effect_class(name)(*target), tuple(float(v) for v in values), pairs))
     return found
@@ -91,6 +94,4 @@ def read_effects(rows: Any, path: Path) -> list[AddedEffect]:
 
 def _numbers(values: Any) -> bool:
     """Return whether something is a list of numbers, none of them NaN."""
-    return isinstance(values, list) and all(
-        isinstance(v, int | float) and not isinstance(v, bool) and not np.isnan(v) for v in values
-    )
+    return isinstance(values, list) and all(is_number(v) or v in (np.inf, -np.inf) for v in values)

@@ -43,8 +43,8 @@ class SurfaceEffect(Effect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body."""
-        return free_body_targets(m)
+        """Return each free body that collides."""
+        return tuple(t for t in free_body_targets(m) if all(_collides(m, m.body(n).id) for n in t))
 
     def geoms(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the geoms of the target and of all that stands still, shape (n,) int."""
@@ -244,8 +244,8 @@ class PadFriction(Effect):
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return the fingers."""
-        found = tuple(n for b in fingers(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        """Return the fingers that collide."""
+        found = tuple(n for b in fingers(m) if _collides(m, b) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:

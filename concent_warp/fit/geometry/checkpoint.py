@@ -72,5 +72,5 @@ class Checkpoint:
                 found={name: self.cfg.get(name) for name in differing},
                 fix="repeat the settings, or start anew without --resume",
             )
-        if self.start.shape != start.shape or not np.array_equal(self.start, start):
+        if not np.array_equal(self.start, start):
             raise ModelError("the checkpoint belongs to another starting geometry", fix="start anew without --resume")

@@ -46,7 +46,7 @@ def touched_spheres(touched: np.ndarray, sphere_geom: np.ndarray, robot: np.ndar
     Returns:
         Spheres that touched anything but the robot, and spheres that the robot touched, each (S,) bool.
     """
-    by_sphere = np.where(sphere_geom[:, None] >= 0, touched[np.maximum(sphere_geom, 0)], False)
+    by_sphere = np.where(sphere_geom[:, None] >= 0, touched[sphere_geom], False)
     return np.any(by_sphere[:, ~robot], axis=1), np.any(by_sphere[:, robot], axis=1)
 
 

@@ -14,7 +14,6 @@ of the position is stated as what the encoder's 12 bits leave, tick / sqrt(12).
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.errors import RecordingError
-from concent_warp.limits import limits, raising
+from concent_warp.documents import is_number, read_json
+from concent_warp.errors import RecordingError, printable
+from concent_warp.limits import limits
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
@@ -143,7 +143,7 @@ def _swing(document: dict[str, Any], name: str, path: Path) -> Demonstration:
     position = columns["position"]
     return Demonstration(
         name=name,
-        task=str(document.get("trajectory", "")),
+        task=printable(str(document.get("trajectory", ""))),
         qpos=position[:1],
         qvel=np.zeros(1),
         action={DRIVE: Channel(time, columns["goal_position"])},
@@ -169,26 +169,19 @@ def _column(document: dict[str, Any], key: str, path: Path) -> np.ndarray:
     entries = document["entries"]
     values = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
     for row, value in enumerate(values):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if not is_number(value):
             raise RecordingError(
-                f"{key} is not a number", where=f"{path}, entry {row}", expected="a finite number", found=repr(value)
+                f"{key} is not a number",
+                where=f"{path}, entry {row}",
+                expected="a finite number",
+                found=repr(value)[:80],
             )
     return np.array(values, dtype=float)
 
 
 def _read_document(path: Path) -> dict[str, Any]:
     """Return the JSON document of a log, with its entries."""
-    if path.stat().st_size > limits().file_bytes:
-        raise RecordingError(
-            "the log is too large",
-            where=path,
-            expected=f"at most {limits().file_bytes} bytes",
-            fix=raising("file_bytes"),
-        )
-    try:
-        document = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RecordingError("not a JSON file", where=path, found=error) from None
+    document = read_json(path, RecordingError)
     entries = document.get("entries") if isinstance(document, dict) else None
     if not isinstance(entries, list) or not 2 <= len(entries) <= limits().samples:
         found = len(entries) if isinstance(entries, list) else type(entries).__name__
@@ -201,7 +194,9 @@ def _setup_of(document: dict[str, Any], path: Path) -> Setup:
     values = []
     for key in SETUP:
         value = document.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
-            raise RecordingError(f"{key} of the set-up is not right", where=path, expected="> 0", found=repr(value))
+        if not is_number(value) or value <= 0:
+            raise RecordingError(
+                f"{key} of the set-up is not right", where=path, expected="> 0", found=repr(value)[:80]
+            )
         values.append(float(value))
     return Setup(*values)

@@ -3,6 +3,7 @@
 A folder holds ``scene.xml`` and, either in itself or in ``demo_*`` subfolders (one per demonstration):
 
 - ``measured_<sensor>.csv``: a header row, ``time`` and one name per number of the sensor; then one row per sample.
+  Names of components (``x``, ``qw``, ``pos_z``) say the order, see `csv_columns`; other names are read as they stand.
 - ``action_<actuator>.csv``: the same with one value column.
 - ``initial.csv``, optional: a row ``qpos,...`` and a row ``qvel,...`` with the state at time 0.
 
@@ -17,10 +18,12 @@ from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError, SceneError
 from concent_warp.limits import limits, raising
+from concent_warp.recording.formats.csv_columns import check_command_column, column_order
 from concent_warp.recording.naming import PREFIX, by_number, name_of
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
@@ -61,14 +64,15 @@ def read_csv(folder: Path) -> Recording:
         if (demonstration / SCENE).exists():
             raise RecordingError("a demonstration has a scene of its own", where=demonstration, fix=f"remove {SCENE}")
     try:
-        scene = Scene.from_mjcf(folder / SCENE).xml
+        scene = Scene.from_mjcf(folder / SCENE)
+        m = scene.model
     except SceneError as error:
         raise RecordingError("the scene of the recording cannot be read", found=str(error).rstrip(".")) from None
     _check_size(folder)
-    demonstrations = tuple(_read_demonstration(f, f.name) for f in nested) or (
-        _read_demonstration(folder, f"{PREFIX}0"),
+    demonstrations = tuple(_read_demonstration(f, f.name, m) for f in nested) or (
+        _read_demonstration(folder, f"{PREFIX}0", m),
     )
-    recording = Recording(scene, demonstrations, str(folder))
+    recording = Recording(scene.xml, demonstrations, str(folder))
     validate(recording)
     return recording
 
@@ -88,7 +92,7 @@ def _check_size(folder: Path) -> None:
             )
 
 
-def _read_demonstration(folder: Path, name: str) -> Demonstration:
+def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstration:
     """Read the CSV files of one demonstration."""
     action: dict[str, Channel] = {}
     measured: dict[str, Channel] = {}
@@ -111,14 +115,16 @@ def _read_demonstration(folder: Path, name: str) -> Demonstration:
         if path.name == INITIAL:
             state = _read_state(path)
         elif kind == "measured" and channel:
-            table = _read_table(path)
-            measured[name_of(channel)] = Channel(table[:, 0], table[:, 1:])
+            header, table = _read_table(path)
+            order = column_order(path, header[1:], m, name_of(channel))
+            measured[name_of(channel)] = Channel(table[:, 0], table[:, 1:][:, order])
         elif kind == "action" and channel:
-            table = _read_table(path)
+            header, table = _read_table(path)
             if table.shape[1] != 2:
                 raise RecordingError(
                     "wrong number of columns", where=path, expected="time and one value", found=table.shape[1]
                 )
+            check_command_column(path, header[1:], m, name_of(channel))
             action[name_of(channel)] = Channel(table[:, 0], table[:, 1])
         else:
             raise RecordingError(
@@ -130,8 +136,8 @@ def _read_demonstration(folder: Path, name: str) -> Demonstration:
     return Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
 
 
-def _read_table(path: Path) -> np.ndarray:
-    """Return the numbers below the header of a channel's file, shape (T, columns); the first column is time [s]."""
+def _read_table(path: Path) -> tuple[list[str], np.ndarray]:
+    """Return the header of a channel's file and the numbers below it, shape (T, columns); column 0 is time [s]."""
     rows = _read_rows(path)
     header = [cell.strip().lower() for cell in next(rows, (1, []))[1]]
     if len(header) < 2 or header[0] != "time":
@@ -151,7 +157,7 @@ def _read_table(path: Path) -> np.ndarray:
         table.extend(_number(cell, path, line, column) for column, cell in zip(header, cells, strict=True))
     if not table:
         raise RecordingError("the file has no rows below its header", where=path, expected="one row per sample")
-    return np.array(table).reshape(-1, len(header))
+    return header, np.array(table).reshape(-1, len(header))
 
 
 def _read_state(path: Path) -> dict[str, np.ndarray]:
@@ -170,6 +176,8 @@ def _read_state(path: Path) -> dict[str, np.ndarray]:
 def _read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, each with its line number."""
     most = limits().samples
+    if not path.is_file():
+        raise RecordingError("not a CSV file", where=path, expected="a file", found="a folder, device or pipe")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
@@ -190,7 +198,7 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     if not cell:
         return float("nan")
     try:
-        if "_" in cell:
+        if "_" in cell or not cell.isascii():
             raise ValueError
         return float(cell)
     except ValueError:

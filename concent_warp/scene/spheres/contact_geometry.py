@@ -6,15 +6,14 @@ stay for looks and for the sampling of surface points.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
 
+from concent_warp.array_file import read_arrays
 from concent_warp.errors import ModelError
 
 GROUP = 3
@@ -46,7 +45,17 @@ class ContactGeometry:
     """Sliding friction coefficients [-], shape (S,)."""
 
     def __post_init__(self) -> None:
-        count = len(self.radius)
+        count = len(self.radius) if np.ndim(self.radius) else -1
+        for name, kinds in (("body", "iu"), *((n, "iuf") for n in ("position", "radius", "mass", "friction"))):
+            kind = np.asarray(getattr(self, name)).dtype
+            if kind.kind not in kinds:
+                raise ModelError(
+                    f"contact geometry: wrong kind of {name}",
+                    expected="whole numbers" if kinds == "iu" else "numbers",
+                    found=kind,
+                )
+        if len(set(self.bodies)) < len(self.bodies):
+            raise ModelError("contact geometry: two bodies have the same name", found=list(self.bodies))
         shapes = {"body": (count,), "position": (count, 3), "mass": (count,), "friction": (count,)}
         for name, shape in shapes.items():
             found = np.shape(getattr(self, name))
@@ -64,6 +73,15 @@ class ContactGeometry:
                 expected="> 0 m",
                 found=f"{self.radius[worst]:g} m at sphere {worst}",
             )
+        for name, unit in (("mass", "kg"), ("friction", "")):
+            values = getattr(self, name)
+            if count and values.min() < 0:
+                worst = int(np.argmin(values))
+                raise ModelError(
+                    f"contact geometry: a {name} is negative",
+                    expected=f">= 0 {unit}".rstrip(),
+                    found=f"{values[worst]:g} at sphere {worst}",
+                )
         if count and ((self.body < 0) | (self.body >= len(self.bodies))).any():
             raise ModelError(
                 "contact geometry: a sphere names a body that does not exist", expected=f"0..{len(self.bodies) - 1}"
@@ -123,15 +141,20 @@ class ContactGeometry:
         """Read what `save` wrote."""
         if not path.is_file():
             raise ModelError("the contact geometry is missing", where=path, expected="a .npz file")
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in ("bodies", "body", "position", "radius", "mass", "friction")}
-        except (ValueError, OSError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+        names = ("bodies", "body", "position", "radius", "mass", "friction")
+        arrays = read_arrays(path, names, kind="a contact geometry written by concent", error=ModelError)
+        bodies = arrays.pop("bodies")
+        if bodies.ndim != 1 or bodies.dtype.kind != "U":
             raise ModelError(
-                "not a contact geometry", where=path, expected="an .npz written by concent", found=error
-            ) from None
-        bodies = tuple(str(name) for name in arrays.pop("bodies"))
-        return ContactGeometry(bodies=bodies, **arrays)
+                "not a contact geometry", where=path, expected="names of bodies", found=f"{bodies.shape} {bodies.dtype}"
+            )
+        try:
+            geometry = ContactGeometry(bodies=tuple(str(name) for name in bodies), **arrays)
+        except ModelError as error:
+            raise ModelError(str(error).rstrip("."), where=path) from None
+        if not len(geometry):
+            raise ModelError("the contact geometry has no spheres", where=path, expected="at least one")
+        return geometry
 
     def attach(
         self,

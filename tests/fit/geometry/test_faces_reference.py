@@ -235,6 +235,13 @@ def test_neighbours_are_those_of_the_same_body():
     assert one.sum() == 2
 
 
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_sphere_at_the_place_of_another_is_no_neighbour_where_none_is_asked_for(row):
+    geometry, one = spheres(np.zeros((2, 3))), np.arange(2) == row
+    np.testing.assert_array_equal(with_neighbours(geometry, one, 0), one)
+    assert with_neighbours(geometry, one, 1).all()
+
+
 def test_spheres_that_are_not_collidable_touch_nothing():
     touched = np.zeros((5, 3), dtype=bool)
     touched[0] = True  # of a geom that is no sphere
