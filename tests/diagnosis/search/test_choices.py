@@ -17,6 +17,7 @@ from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor
 from concent_warp.diagnosis.search.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks, silent
 from concent_warp.errors import ModelError
+from concent_warp.fit.effects.cfg import EffectSolverCfg
 
 ANY: Any = None
 
@@ -55,7 +56,7 @@ def screened(name: str, expected: float) -> Any:
 
 def base_of(windows: int = 2, length: float = 1.0) -> Any:
     """Return a baseline with windows of a length [s]."""
-    return SimpleNamespace(windows=[SimpleNamespace(start=0.5, end=0.5 + length)] * windows)
+    return SimpleNamespace(windows=[SimpleNamespace(start=0.5, end=0.5 + length)] * windows, cfg=EffectSolverCfg())
 
 
 class Tasks:
