@@ -7,14 +7,12 @@ import numpy as np
 
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.recording import ImageStream
+from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.location import ErrorLocation
 from concent_warp.recording.validation.magnitudes import check_lengths
 
-ROTATION_TOLERANCE = 1e-3
-"""How far from the unit matrix R R^T may be: calibrations are printed with four digits and more."""
 
-
-def check_image(stream: ImageStream, model: mujoco.MjModel, place: ErrorLocation) -> None:
+def check_image(stream: ImageStream, model: mujoco.MjModel, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check frames, depth [m], intrinsics [px] and pose of one camera; its time is checked already.
 
     Raises:
@@ -38,9 +36,9 @@ def check_image(stream: ImageStream, model: mujoco.MjModel, place: ErrorLocation
                 found=_worst(frame),
             )
     middle = depth[count // 2].ravel()
-    check_lengths(middle[middle > 0], model, place)
+    check_lengths(middle[middle > 0], model, place, cfg.units)
     _check_intrinsics(stream.intrinsics, shape[2], shape[1], place)
-    _check_pose(stream.pose, model, place)
+    _check_pose(stream.pose, model, place, cfg)
     names = [model.body(i).name for i in range(model.nbody)]
     if stream.body is not None and stream.body not in names:
         raise place.error("the camera is on a body that the scene lacks", expected=f"one of {names}", found=stream.body)
@@ -66,7 +64,7 @@ def _check_intrinsics(matrix: np.ndarray, width: int, height: int, place: ErrorL
         raise place.error("the principal point is far outside the image", expected=f"px within {size}", found=centre)
 
 
-def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: ErrorLocation) -> None:
+def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check a camera-to-world transform, shape (4, 4)."""
     pose = np.asarray(pose)
     if pose.shape != (4, 4) or not _usable(pose):
@@ -80,16 +78,17 @@ def _check_pose(pose: np.ndarray, model: mujoco.MjModel, place: ErrorLocation) -
             fix="transpose it if need be",
         )
     rotation = pose[:3, :3].astype(float)
+    tolerance = cfg.rotation_tolerance
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if error > tolerance or np.linalg.det(rotation) < 0:
         raise place.error(
             "the camera pose is not a rotation and a translation",
-            expected=f"an orthonormal right-handed matrix within {ROTATION_TOLERANCE}",
+            expected=f"an orthonormal right-handed matrix within {tolerance}",
             found=f"deviation {error:.3g}, determinant {np.linalg.det(rotation):.3g}",
         )
-    check_lengths(np.linalg.norm(pose[None, :3, 3], axis=1), model, place)
+    check_lengths(np.linalg.norm(pose[None, :3, 3], axis=1), model, place, cfg.units)
 
 
 def _usable(matrix: np.ndarray) -> bool:
-    """Return whether a matrix holds finite numbers of a sane size."""
+    """Return whether all entries of a matrix are finite numbers and not absurdly large."""
     return matrix.dtype.kind in "fiu" and bool((np.abs(matrix) <= MAX_MAGNITUDE).all())

@@ -18,6 +18,7 @@ from concent_warp.limits import limits, raising
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
 from concent_warp.recording.validation.images import check_image
 from concent_warp.recording.validation.location import ErrorLocation
@@ -30,22 +31,24 @@ from concent_warp.recording.validation.magnitudes import (
 from concent_warp.recording.validation.scene_text import check_scene_text
 from concent_warp.scene.scene import Scene
 
-QUATERNION_TOLERANCE = 0.05
-"""How far from 1 the norm of a measured or initial quaternion may be: rounding and additive noise stay below it, Euler
-angles, zeros and degrees do not."""
 QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
 
-def validate(recording: Recording) -> None:
+def validate(recording: Recording, cfg: ValidateCfg | None = None) -> None:
     """Check that a recording is consistent and fits its scene.
+
+    Args:
+        recording: The recording.
+        cfg: Thresholds.
 
     Raises:
         RecordingError: The first thing that is wrong, with file, demonstration, channel and row (counted from 0).
     """
+    cfg = cfg or ValidateCfg()
     place = ErrorLocation(recording.source)
     model = _compile_scene(recording)
     if not recording.demonstrations:
-        raise place.error("the recording holds no demonstration", expected="at least one")
+        raise place.error("the recording has no demonstration", expected="at least one")
     seen: set[str] = set()
     for demonstration in recording.demonstrations:
         name = demonstration.name
@@ -56,7 +59,7 @@ def validate(recording: Recording) -> None:
         if name in seen:
             raise place.error("two demonstrations have the same name", found=repr(name))
         seen.add(name)
-        _check_demonstration(demonstration, model, ErrorLocation(recording.source, name))
+        _check_demonstration(demonstration, model, ErrorLocation(recording.source, name), cfg)
 
 
 def _compile_scene(recording: Recording) -> mujoco.MjModel:
@@ -70,21 +73,23 @@ def _compile_scene(recording: Recording) -> mujoco.MjModel:
         raise place.error(reason, fix="mend the MJCF in the recording") from None
 
 
-def _check_demonstration(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation) -> None:
+def _check_demonstration(
+    demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation, cfg: ValidateCfg
+) -> None:
     """Check one demonstration against the compiled scene."""
     if demonstration.success is not None and not isinstance(demonstration.success, bool | np.bool_):
         raise place.error("success is not a truth value", expected="True or False", found=demonstration.success)
-    _check_initial(demonstration, model, place)
+    _check_initial(demonstration, model, place, cfg)
     for name, channel in demonstration.action.items():
-        _check_action(channel, model, name, place.at(f"action/{name}"))
+        _check_action(channel, model, name, place.at(f"action/{name}"), cfg)
     for name, channel in demonstration.measured.items():
-        _check_measured(channel, model, name, place.at(f"measured/{name}"))
+        _check_measured(channel, model, name, place.at(f"measured/{name}"), cfg)
     for name, track in demonstration.points.items():
-        _check_points(track, model, name, place.at(f"points/{name}"))
+        _check_points(track, model, name, place.at(f"points/{name}"), cfg)
     for name, stream in demonstration.image.items():
         _check_time(stream.time, place.at(f"image/{name}"))
-        check_image(stream, model, place.at(f"image/{name}"))
-    check_clocks(demonstration, place)
+        check_image(stream, model, place.at(f"image/{name}"), cfg)
+    check_clocks(demonstration, place, cfg.clocks)
     _check_duration(demonstration, model.opt.timestep, place)
 
 
@@ -103,7 +108,7 @@ def _check_duration(demonstration: Demonstration, timestep: float, place: ErrorL
             )
 
 
-def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation) -> None:
+def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check the state at time 0: sizes, finite values, unit quaternions, units."""
     for name, value, size in (("qpos", demonstration.qpos, model.nq), ("qvel", demonstration.qvel, model.nv)):
         if value is None:
@@ -119,18 +124,18 @@ def _check_initial(demonstration: Demonstration, model: mujoco.MjModel, place: E
             continue
         start = model.jnt_qposadr[joint] + (3 if free else 0)
         norm = float(np.linalg.norm(qpos[start : start + 4]))
-        if abs(norm - 1) > QUATERNION_TOLERANCE:
+        if abs(norm - 1) > cfg.quaternion_tolerance:
             raise place.at("initial/qpos").error(
                 f"the quaternion of joint {model.joint(joint).name!r} is not of unit length",
                 row=int(start),
-                expected=f"norm 1 within {QUATERNION_TOLERANCE}",
+                expected=f"norm 1 within {cfg.quaternion_tolerance}",
                 found=f"{norm:.4g}",
                 fix="write w, x, y, z after the three positions of a free joint",
             )
-    check_positions(qpos, model, place.at("initial/qpos"))
+    check_positions(qpos, model, place.at("initial/qpos"), cfg.units)
 
 
-def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
+def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check one commanded channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
     if row < 0:
@@ -139,10 +144,10 @@ def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Err
     _check_time(channel.time, place)
     _check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
     _check_finite(channel.value, place, missing_allowed=False)
-    check_command(np.asarray(channel.value), model, row, place)
+    check_command(np.asarray(channel.value), model, row, place, cfg.units)
 
 
-def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
+def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check one measured channel."""
     row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
@@ -160,11 +165,11 @@ def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: E
     if channel.noise_std is not None and not 0 <= channel.noise_std <= MAX_MAGNITUDE:
         raise place.error("noise_std is not a standard deviation", expected=">= 0", found=channel.noise_std)
     if model.sensor_type[row] in QUATERNION_SENSORS:
-        _check_quaternions(value, place)
-    check_measurement(value, model, row, place)
+        _check_quaternions(value, place, cfg)
+    check_measurement(value, model, row, place, cfg.units)
 
 
-def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: ErrorLocation) -> None:
+def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check the tracked points of one body."""
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
         known = [model.body(i).name for i in range(1, model.nbody)]
@@ -184,7 +189,7 @@ def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Er
     if lost.any():
         row, point = np.argwhere(lost)[0]
         raise place.error(f"point {point} is visible but has no position", row=int(row), found="NaN")
-    check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place)
+    check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place, cfg.units)
 
 
 def _check_time(time: np.ndarray, place: ErrorLocation) -> None:
@@ -239,21 +244,21 @@ def _check_finite(value: np.ndarray, place: ErrorLocation, *, missing_allowed: b
             row=bad,
             expected="a number",
             found="NaN",
-            fix="leave the samples out, so that the value before them is held",
+            fix="leave the samples out, so that the value before them stays in force",
         )
 
 
-def _check_quaternions(value: np.ndarray, place: ErrorLocation) -> None:
+def _check_quaternions(value: np.ndarray, place: ErrorLocation, cfg: ValidateCfg) -> None:
     """Check quaternions, shape (T, 4): whole or missing, and of unit length."""
     missing = np.count_nonzero(np.isnan(value), axis=1)
     if (bad := _first((missing > 0) & (missing < 4))) is not None:
         raise place.error("a quaternion is missing in part", row=bad, expected="four numbers or four NaN")
     norm = np.sqrt((value**2).sum(axis=1))
-    if (bad := _first(np.asarray(np.abs(norm - 1) > QUATERNION_TOLERANCE))) is not None:
+    if (bad := _first(np.asarray(np.abs(norm - 1) > cfg.quaternion_tolerance))) is not None:
         raise place.error(
             "a quaternion is not of unit length",
             row=bad,
-            expected=f"norm 1 within {QUATERNION_TOLERANCE}",
+            expected=f"norm 1 within {cfg.quaternion_tolerance}",
             found=f"{norm[bad]:.4g}",
             fix="write w, x, y, z",
         )
