@@ -139,9 +139,9 @@ def choose_physics(
             "Newton cannot simulate this scene stably for gradients",
             where=bodies[body].name,
             expected=f"a time step of at least {1e3 * cfg.shortest_step:g} ms to do",
-            found=f"that with {1e3 * float(steps[-1, 0]):.3g} ms {why}",
+            found=f"that with {1e3 * steps[-1].item():.3g} ms {why}",
             fix="take fewer spheres or the evolution strategy (--method es)",
         )
     k = int(fine.argmax())
-    step = float(steps[k, 0])
+    step = steps[k].item()
     return NewtonPhysics(first + k, step, stiffness, np.minimum(damping, limit[k]), float(limit[k].min()), cfg.onset)

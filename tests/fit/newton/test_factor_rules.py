@@ -366,6 +366,20 @@ def test_gradients_have_to_gain_a_twentieth(gradients, after, helped):
     del gradients
 
 
+def test_distances_and_seconds_are_told_as_they_are(gradients):
+    searched = Searched()
+    found = warm(searched, GradientCfg(iterations=2))
+    found.before, found.begun = 4.0, found.begun - 7.0
+    searched.losses = lambda position: np.full(len(position), 1.9)
+    result = found.run(None, False, None)
+    assert "best iterate 3800.00 mm in MuJoCo, start 4000.00 mm" in result.remark
+    assert result.helped
+    assert 17.0 < searched.seconds < 27.0
+    found.without_help("", [])
+    assert 24.0 < searched.seconds < 34.0
+    del gradients
+
+
 def test_a_motion_that_newton_simulates_otherwise_ends_the_descent_at_its_first_step(gradients):
     gradients["mujoco"] = 4e-3 * 0.9 / 5.01
     result = warm(cfg=GradientCfg(iterations=6)).run(None, False, None)
