@@ -27,6 +27,7 @@ CHANGED_IN_PLACE = {
     "PlyElement",
     "VariantResult",
     "ResetCandidate",
+    "RunFolder",
     "Iteration",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""

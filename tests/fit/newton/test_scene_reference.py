@@ -439,7 +439,7 @@ def test_candidates_do_not_influence_one_another(scene, simulated):
 def test_chunks_do_not_change_a_rollout_nor_its_gradients(scene, simulated, monkeypatch):
     import torch
 
-    monkeypatch.setattr(of_worlds, "CHUNK", scene.steps // 3 + 1)
+    monkeypatch.setattr(of_worlds, "CHUNK_STEPS", scene.steps // 3 + 1)
     worlds = NewtonWorlds(scene, 3, "cpu")
     assert (worlds.chunk, worlds.chunks) == (scene.steps // 3 + 1, 3)
     found = poses(worlds, **simulated["given"])
