@@ -29,6 +29,7 @@ CHANGED_IN_PLACE = {
     "ResetCandidate",
     "RunFolder",
     "Iteration",
+    "RunFolder",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""
 

@@ -11,6 +11,7 @@ from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
 from concent_warp.files import write_text
 from concent_warp.run_folder import plain
+from concent_warp.train.check_cfg import check_cfg
 
 Range = tuple[float, float]
 ALL = "all"
@@ -411,38 +412,7 @@ class TrainCfg:
     ppo: PpoCfg = field(default_factory=PpoCfg)
 
     def __post_init__(self) -> None:
-        e, p = self.environment, self.ppo
-        for name, value in {
-            "worlds": e.worlds,
-            "decimation": e.decimation,
-            "stride": e.stride,
-            "slots": e.observation.slots,
-            "states": e.reset.states,
-            "iterations": p.iterations,
-            "steps": p.steps,
-            "checkpoint": self.checkpoint,
-        }.items():
-            if value < 1:
-                raise TrainError(f"{name} is out of bounds", expected="at least 1", found=value)
-        if e.decimation % e.stride:
-            raise TrainError(
-                "an action is not a whole number of simulation steps",
-                expected=f"a divisor of the decimation, {e.decimation}",
-                found=f"stride {e.stride}",
-            )
-        std, share = e.randomisation.perturbation, e.randomisation.perturbation_share
-        if min(std) < 0 or not 0 <= share <= 1:
-            raise TrainError(
-                "the random force perturbations are out of bounds",
-                expected="standard deviations of at least 0 and a share from 0 to 1",
-                found=f"perturbation {std}, perturbation_share {share}",
-            )
-        if e.worlds * p.steps < p.batches:
-            raise TrainError(
-                "an iteration has fewer environment steps than mini-batches",
-                expected=f"at least {p.batches}",
-                found=e.worlds * p.steps,
-            )
+        check_cfg(self)
 
     def with_perturbations(self) -> TrainCfg:
         """Return the settings with random force perturbations on the grasped object in training.

@@ -17,7 +17,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import SETTINGS, TrainCfg
-from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
@@ -123,6 +123,7 @@ def train_run(
         if folder is not None and process.is_rank_zero and resume:
             _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
         task, device, seed = run.task(), process.device(device), process.seed(run.cfg.seed)
+        check_worlds(task, run.cfg.environment, device)  # before much is computed
         states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
         environment = make_environment(task, run.cfg.environment, states, device=device, seed=seed)
         trainer = Trainer(environment, run.cfg, folder, process)

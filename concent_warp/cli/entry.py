@@ -128,6 +128,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     try:
         import tyro
 
+        from concent_warp.checks import check_settings
         from concent_warp.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
@@ -141,6 +142,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
                 config=(tyro.conf.HelptextFromCommentsOff,),
                 console_outputs=processes()[0] == 0,
             )
+            check_settings(settings)
             module.run(settings)
     except ConcentError as error:
         _complain(f"concent {command}: {error}")

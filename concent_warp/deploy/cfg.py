@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from concent_warp.checks import check_seed
 from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import wanted
 from concent_warp.reality.world import WorldCfg
@@ -130,12 +131,13 @@ class RenderCfg:
     """Settings of the lights."""
 
 
-def check(cfg: EvaluateCfg, world: WorldName, episodes: int) -> None:
+def check(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: int = 0) -> None:
     """Check the settings of an evaluation.
 
     Raises:
         TrainError: One is out of bounds, or concerns Reality while the policy runs in simulation.
     """
+    check_seed(seed, TrainError)
     if episodes < 1:
         raise TrainError("the number of episodes is out of bounds", expected="at least 1", found=episodes)
     if not 0 <= cfg.videos <= episodes:

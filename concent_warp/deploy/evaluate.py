@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from concent_warp.checks import check_device
 from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
 from concent_warp.deploy.reality_world import reality_environment, reality_world
 from concent_warp.reality.hidden.in_task import TaskWorld
@@ -60,7 +61,8 @@ def evaluate(
         1.0
     """
     cfg = cfg or EvaluateCfg()
-    check(cfg, world, episodes)
+    check(cfg, world, episodes, seed)
+    check_device(device)
     default = Path("videos") if policy.pretrained else policy.folder / "videos"
     videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import mujoco
 import torch
 
+from concent_warp.checks import check_device, check_seed
 from concent_warp.deploy.cfg import PlayCfg, WorldName
 from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import TrainError
@@ -55,6 +56,8 @@ def play(
         >>> len(outcomes)
         1
     """
+    check_seed(seed, TrainError)
+    check_device(device)
     cfg = cfg or PlayCfg()
     player, shown = _make_player(policy, cfg, world=world, seed=seed, device=device)
     task = player.environment.task

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
+from concent_warp.checks import check_seed
 from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
@@ -66,7 +67,12 @@ def record(
 
     The box has the configured pose in every demonstration; the block's pose and the expert's offsets are sampled from
     the seed. `progress` is called with the share done, 0..1.
+
+    Raises:
+        ConcentError: A seed is out of bounds.
     """
+    for seed in seeds:
+        check_seed(seed)
     scene = cfg.task.build()
     demonstrations, truths = [], []
     for k, seed in enumerate(seeds):

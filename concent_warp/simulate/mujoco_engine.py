@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.checks import check_at_least
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import collect
 from concent_warp.simulate.engine import Contacts, Rollout, Variants
@@ -60,9 +61,13 @@ class MujocoEngine:
             memory: Arena of one simulation [bytes], which holds contacts and constraints; by default what MuJoCo takes.
                 It grows when it overflows.
             max_memory: How far the arena may grow [bytes].
+
+        Raises:
+            EngineError: An argument is out of bounds.
         """
+        check_at_least(1, EngineError, threads=threads, memory=memory, max_memory=max_memory)
         self.model = model
-        self.threads = simulations_at_a_time() if threads is None else max(int(threads), 1)
+        self.threads = simulations_at_a_time() if threads is None else int(threads)
         self.max_memory = int(max_memory)
         self._collidable = None if collidable is None else np.array(collidable)
         self._memory = memory

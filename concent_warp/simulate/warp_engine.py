@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.checks import check_at_least, check_device
 from concent_warp.errors import EngineError
 from concent_warp.simulate.contact_log import sorted_log
 from concent_warp.simulate.engine import ContactLog, Contacts, Rollout, Variants
@@ -79,8 +80,11 @@ class WarpEngine:
             max_worlds: Worlds simulated at a time; by default what fits the memory.
 
         Raises:
-            EngineError: The model holds an effect that needs the other engine.
+            EngineError: The model holds an effect that needs the other engine, or an argument is out of bounds.
+            ConcentError: There is no such device.
         """
+        check_at_least(1, EngineError, nconmax=nconmax, njmax=njmax, max_memory=max_memory, max_worlds=max_worlds)
+        check_device(device)
         if foreign := sorted({a.effect.name for a in model.effects if "warp" not in a.effect.engines}):
             raise EngineError(f"{', '.join(foreign)} cannot run on MuJoCo-Warp", fix="use MujocoEngine")
         self.model = model

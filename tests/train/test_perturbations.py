@@ -71,7 +71,7 @@ def test_perturbations_come_in_training_and_not_in_an_evaluation(task, states):
 
 @pytest.mark.parametrize("wrong", [{"perturbation": (-1.0, 0.1)}, {"perturbation_share": 1.5}])
 def test_negative_deviations_and_shares_above_one_are_refused(wrong):
-    with pytest.raises(TrainError, match="perturbations are out of bounds"):
+    with pytest.raises(TrainError, match=r"perturbation(_share)? is out of bounds"):
         TrainCfg(environment=replace(PERTURBED, randomisation=replace(PERTURBED.randomisation, **wrong)))
 
 

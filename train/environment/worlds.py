@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import copy
+import os
 
 import mujoco
+import warp as wp
 
+from concent_warp.errors import TrainError
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.command_dynamics import CommandDynamics
 from concent_warp.train.environment.environment import Environment
@@ -36,8 +39,41 @@ def make_environment(
         states: Initial states of the episodes.
         device: Warp's name of the device; the first CUDA device by default, the CPU without one.
         seed: Seed of the values that are sampled for each world.
+
+    Raises:
+        TrainError: The worlds do not fit the memory.
     """
+    check_worlds(task, cfg, device)
     return Environment(task, cfg, _make_physics(task, cfg, device=device, seed=seed), states)
+
+
+def check_worlds(task: Task, cfg: EnvironmentCfg, device: str | None = None) -> None:
+    """Check that the worlds of an environment fit the memory, by the size of one.
+
+    Raises:
+        TrainError: They need more than the device has.
+    """
+    from concent_warp.simulate.warp_engine import preferred_device
+
+    device = preferred_device() if device is None else device
+    m, (contacts, constraints) = task.compiled, buffer_sizes(task, cfg)
+    if cfg.engine == "mujoco" or (cfg.engine == "auto" and not device.startswith("cuda")):
+        data = mujoco.MjData(m)
+        size = int(data.nbuffer) + (1 << 16)  # of the arena, which is large, only what is used is taken
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 1 << 40
+    else:
+        from concent_warp.simulate.warp_program import Buffers, world_bytes
+
+        size = world_bytes(m, Buffers(contacts, constraints))
+        memory = int(wp.get_device(device).total_memory) if device.startswith("cuda") else 1 << 40
+    if size * cfg.worlds > memory:
+        raise TrainError(
+            "so many worlds do not fit the memory",
+            where=device,
+            expected=f"at most {memory // size:,} of {size / 1e3:,.0f} kB each",
+            found=f"{cfg.worlds:,}",
+            fix="lower --worlds",
+        )
 
 
 def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0) -> Physics:

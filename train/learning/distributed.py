@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import distributed
 
+from concent_warp.checks import check_device
 from concent_warp.errors import ConcentError, TrainError
 
 
@@ -59,9 +60,11 @@ class DistributedProcess:
 
         Raises:
             TrainError: There are more processes than GPUs, or one GPU is requested for several processes.
+            ConcentError: There is no such device.
         """
         found = torch.cuda.device_count()
         if self.is_single:
+            check_device(wanted)
             return wanted or ("cuda:0" if found else "cpu")
         if wanted not in (None, "cpu", "cuda"):
             raise TrainError("each process uses its own GPU", expected="--device cuda or cpu", found=wanted)
