@@ -29,7 +29,6 @@ CHANGED_IN_PLACE = {
     "ResetCandidate",
     "RunFolder",
     "Iteration",
-    "RunFolder",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""
 
