@@ -149,6 +149,24 @@ def test_what_holds_data_is_frozen():
     assert loose <= CHANGED_IN_PLACE
 
 
+def test_methods_take_an_object_a_class_or_neither():
+    wrong = []
+    for module in modules():
+        for kind in vars(module).values():
+            if not inspect.isclass(kind) or kind.__module__ != module.__name__:
+                continue
+            for name, value in vars(kind).items():
+                function = getattr(value, "__func__", value)
+                own = f"{kind.__qualname__}.{name}"
+                if not inspect.isfunction(function) or function.__qualname__ != own or name.startswith("__"):
+                    continue
+                first = next(iter(inspect.signature(function).parameters), None)
+                expected = "cls" if isinstance(value, classmethod) else "self"
+                if (first == expected) == isinstance(value, staticmethod):
+                    wrong.append(f"{module.__name__}.{kind.__name__}.{name}")
+    assert not wrong
+
+
 if __name__ == "__main__":
     WRITTEN.write_text(json.dumps(defaults(), indent=1, sort_keys=True) + "\n")
     WRITTEN_CONSTANTS.write_text(json.dumps(constants(), indent=1, sort_keys=True) + "\n")
