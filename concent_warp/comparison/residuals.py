@@ -133,7 +133,9 @@ def _sensor_residual(
     predicted = read(name, channel.time)
     kind, unit = kind_and_unit(compiled, row)
     value = rotation_between(predicted, channel.value) if kind == "orientation" else channel.value - predicted
-    error = np.linalg.norm(value, axis=1)
+    known = np.isfinite(channel.value)
+    size = int(known.any(axis=0).sum()) if kind != "orientation" else value.shape[1]
+    error = np.linalg.norm(value, axis=1) if kind == "orientation" else _norm(value, size)
     if noise is None or channel.noise_std:
         noise = channel_noise(channel, kind)
     std = noise.std if np.isfinite(noise.std) else None
@@ -144,8 +146,8 @@ def _sensor_residual(
         body=body_of(compiled, row),
         time=channel.time,
         value=value,
-        error=_lost(error, predicted, np.asarray(np.isfinite(channel.value).all(axis=1))),
-        noise=None if std is None else rms_noise(std, value.shape[1]),
+        error=_lost(error, predicted, np.asarray(known.any(axis=1))),
+        noise=None if std is None else rms_noise(std, size),
         std=std,
         source=noise.source,
         extent=_extent(channel.value, kind),
@@ -153,9 +155,26 @@ def _sensor_residual(
     )
 
 
+def _norm(value: np.ndarray, size: int) -> np.ndarray:
+    """Return the lengths of vectors (T, dim), NaN where nothing is known of one, shape (T,).
+
+    Of a vector that is known in part, the length is what all `size` components would have if those that are missing
+    were like those that are not.
+    """
+    length = np.linalg.norm(value, axis=1)
+    count = np.isfinite(value).sum(axis=1)
+    part = (count > 0) & ~np.isfinite(length) & ~np.isinf(value).any(axis=1)
+    length[part] = np.sqrt(np.nansum(value[part] ** 2, axis=1) * (size / count[part]))
+    return length
+
+
 def _extent(value: np.ndarray, kind: Kind) -> float:
     """Return how far readings (T, dim) move: diagonal of their box, of orientations the largest turn from the first."""
-    valid = value[np.asarray(np.isfinite(value).all(axis=1))]
+    known = np.isfinite(value)
+    if kind != "orientation":
+        ranges = [float(np.ptp(column[here])) for column, here in zip(value.T, known.T, strict=True) if here.any()]
+        return float(np.linalg.norm(ranges)) if ranges else 0.0
+    valid = value[np.asarray(known.all(axis=1))]
     if not len(valid):
         return 0.0
     if kind == "orientation":

@@ -278,10 +278,24 @@ def _main_phase(time: np.ndarray, error: np.ndarray, phases: Sequence[Phase]) ->
     return max(weight, key=lambda name: weight[name]) if weight else None
 
 
+def whole_rows(value: np.ndarray) -> np.ndarray:
+    """Return the rows (T, dim) of which anything is known, the mean of a component in place of what is missing in it.
+
+    A component that is missing throughout is 0.
+    """
+    known = np.isfinite(value)
+    rows = value[np.asarray(known.any(axis=1))]
+    missing = ~np.isfinite(rows)
+    if missing.any():
+        mean = [column[here].mean() if here.any() else 0.0 for column, here in zip(value.T, known.T, strict=True)]
+        rows = np.where(missing, mean, rows)
+    return rows
+
+
 def _direction(residual: Residual, rows: np.ndarray, cfg: WorstSpanCfg) -> tuple[str, tuple[float, ...]]:
     """Return where the measurement lies as seen from the model, in words and as a vector of length 0 to 1."""
     value = residual.value[rows]
-    value = value[np.asarray(np.isfinite(value).all(axis=1))]
+    value = whole_rows(value)
     if not len(value) or not (size := float(np.sqrt((value**2).sum(axis=1).mean()))):
         return "", ()
     mean = value.mean(axis=0) / size

@@ -24,10 +24,12 @@ def check_data(recording: Recording, cfg: CheckDataCfg | None = None) -> list[st
                 found.append(
                     f"{where}: {int(long.sum())} gaps of up to {steps.max():.3g} s between samples {usual:.3g} s apart."
                 )
-            known = np.isfinite(channel.value).all(axis=1)
+            value, measured = channel.value, np.isfinite(channel.value).any(axis=0)
+            value = value if measured.all() else value[:, measured]
+            known = np.isfinite(value).all(axis=1)
             if (share := 1 - known.mean()) > cfg.max_missing_share:
                 found.append(f"{where}: {100 * share:.0f} % of the samples are missing.")
-            values = channel.value[known]
+            values = value[known]
             if len(values) > 10 and np.ptp(values, axis=0).max() == 0.0:
                 found.append(f"{where}: the reading never changes.")
             stated = channel.noise_std

@@ -10,7 +10,7 @@ step / sqrt(12).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -91,6 +91,8 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
     stated = [c.noise_std for c in channels if c.noise_std]
     if stated:
         return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
+    if kind != "orientation" and any(map(_is_partial, channels)):
+        return _noise_of_components(channels, kind, cfg)
     pieces = [piece for c in channels for piece in _finite_pieces(c.value)]
     if sum(len(piece) for piece in pieces) < cfg.min_readings:
         return Noise(np.nan, "unknown")
@@ -103,6 +105,26 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
         return Noise(floor, "resolution")
     size = max(float(np.abs(piece).max()) for piece in pieces)
     return found if found.std > cfg.rounding * size else Noise(np.nan, "unknown")
+
+
+def _is_partial(channel: Channel) -> bool:
+    """Return whether some components of a sample are missing and others are not."""
+    known = np.isfinite(np.asarray(channel.value, dtype=float).reshape(len(channel.value), -1))
+    return bool((known.any(axis=1) & ~known.all(axis=1)).any())
+
+
+def _noise_of_components(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg) -> Noise:
+    """Return the root mean square of the noises of the components, each from its own readings, as `pooled_noise`."""
+    found = []
+    for column in range(channels[0].value.shape[1]):
+        parts = [replace(c, value=c.value[:, [column]]) for c in channels]
+        if any(np.isfinite(part.value).any() for part in parts):
+            found.append(pooled_noise(parts, kind, cfg))
+    known = [noise for noise in found if np.isfinite(noise.std)]
+    if not known:
+        return Noise(np.nan, "unknown")
+    largest = max(known, key=lambda noise: noise.std)
+    return Noise(float(np.sqrt(np.mean([noise.std**2 for noise in known]))), largest.source)
 
 
 def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:

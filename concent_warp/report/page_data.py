@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.units import SHOWN, unit_shown, words
-from concent_warp.comparison.worst_spans import WorstSpan
+from concent_warp.comparison.worst_spans import WorstSpan, whole_rows
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.headline import headline_channel
@@ -78,8 +78,8 @@ def _place_data(comparison: Comparison, number: int, place: WorstSpan) -> dict[s
     shift = next((r for r in found if r is not None and r.kind in ("position", "points")), None)
     arrow = None
     if shift is not None:
-        within = (shift.time >= place.start) & (shift.time <= place.end) & np.isfinite(shift.value).all(axis=1)
-        arrow = shift.value[within].mean(axis=0).tolist() if within.any() else None
+        within = whole_rows(shift.value[(shift.time >= place.start) & (shift.time <= place.end)])
+        arrow = within.mean(axis=0).tolist() if len(within) else None
     return {
         "number": number,
         "demonstration": place.demonstration,

@@ -70,8 +70,8 @@ def commands(model: mujoco.MjModel, demonstration: Demonstration, steps: int, st
 def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[np.ndarray, np.ndarray]:
     """Return the state at time 0, qpos (nq,) and qvel (nv,).
 
-    What the recording does not say is taken from the first valid sample of joint and frame sensors, else from the
-    model's reference pose; velocities are then zero.
+    What the recording does not say is taken from the first valid sample of joint and frame sensors, of positions for
+    each component, else from the model's reference pose; velocities are then zero.
     """
     if demonstration.qpos is not None and len(demonstration.qpos) != model.nq:
         raise RecordingError(
@@ -93,8 +93,9 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
     qpos = model.qpos0.copy()
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-        first = channel.value[np.isfinite(channel.value).all(axis=1)]
-        if row < 0 or not len(first):
+        known = np.isfinite(channel.value)
+        first = channel.value[known.all(axis=1)]
+        if row < 0 or not known.any():
             continue
         kind, target = model.sensor_type[row], model.sensor_objid[row]
         if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
@@ -107,8 +108,9 @@ def initial_state(model: mujoco.MjModel, demonstration: Demonstration) -> tuple[
             continue
         address = model.jnt_qposadr[joint]
         if kind == mujoco.mjtSensor.mjSENS_FRAMEPOS:
-            qpos[address : address + 3] = first[0]
-        elif kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
+            for k in np.flatnonzero(known.any(axis=0)):
+                qpos[address + k] = channel.value[known[:, k], k][0]
+        elif kind == mujoco.mjtSensor.mjSENS_FRAMEQUAT and len(first):
             qpos[address + 3 : address + 7] = first[0] / np.linalg.norm(first[0])
     return qpos, qvel
 

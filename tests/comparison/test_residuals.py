@@ -113,10 +113,33 @@ def test_orientation_error_is_the_angle_and_its_value_the_rotation_vector(engine
 
 def test_missing_samples_have_no_error(engine, exact):
     value = exact.measured["cube_position"].value.copy()
-    value[3:7, 1] = np.nan
+    value[3:7] = np.nan
     error = found(engine, change(exact, "cube_position", value=value))["cube_position"].error
     assert np.isnan(error[3:7]).all()
     assert np.isfinite(np.delete(error, slice(3, 7))).all()
+
+
+def test_components_are_missing_one_by_one(engine, exact):
+    """A vector known in part has the error that it would have if what is missing were like what is not."""
+    value = exact.measured["cube_position"].value + np.array([0.03, 0.03, 0.03])
+    value[3:7, 1] = np.nan
+    value[7] = [np.nan, np.nan, value[7, 2]]
+    value[9] = np.nan
+    r = found(engine, change(exact, "cube_position", value=value))["cube_position"]
+    assert np.delete(r.error, 9) == pytest.approx(0.03 * np.sqrt(3), abs=1e-5)
+    assert np.isnan(r.error[9])
+
+
+def test_a_channel_of_heights_alone_has_the_error_and_the_noise_of_heights(engine, exact):
+    value = exact.measured["cube_position"].value + np.array([0.5, 0.5, 0.03])
+    rng = np.random.default_rng(0)
+    value += 1e-3 * rng.normal(size=value.shape)
+    value[:, :2] = np.nan
+    r = found(engine, change(exact, "cube_position", value=value))["cube_position"]
+    assert r.error == pytest.approx(np.full(len(TIME), 0.03), abs=5e-3)
+    assert r.noise == pytest.approx(1e-3, rel=0.3)
+    assert r.noise == r.std
+    assert r.extent == pytest.approx(np.ptp(value[:, 2]))
 
 
 def test_a_diverged_model_is_infinitely_off_and_not_left_out(engine, exact):

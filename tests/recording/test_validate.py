@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,8 +208,47 @@ def test_a_clock_since_1970_is_refused(recording):
         validate(only(recording, measured={"elbow_angle": Channel(time, np.zeros((50, 1)))}))
 
 
-def falling(t):
-    return np.stack([0 * t, 0 * t, 0.02 - 4.9 * t**2], axis=1)
+def falling(t, height=0.02):
+    return np.stack([0 * t, 0 * t, height - 4.9 * t**2], axis=1)
+
+
+def with_drag(t):
+    """Return a fall from 47 m that reaches 95 % of a final speed of 35 m/s."""
+    return np.stack([0 * t, 0 * t, 47 - 35**2 / 9.81 * np.log(np.cosh(9.81 * t / 35))], axis=1)
+
+
+DROP = np.arange(300) * 0.01
+NOISE = 2e-3 * np.random.default_rng(0).normal(size=(300, 3))
+FRAMES = np.arange(90) / 30
+FALLS = {
+    "a ball that falls from 47 m": (DROP, falling(DROP, 47)),
+    "with air drag and noise": (DROP, with_drag(DROP) + NOISE),
+    "seen by a camera at 30 Hz": (FRAMES, falling(FRAMES, 47) + NOISE[:90]),
+    "whose height alone was measured": (DROP, falling(DROP, 47) * [np.nan, np.nan, 1]),
+    "with missing components": (DROP, np.where(np.arange(900).reshape(300, 3) % 7, falling(DROP, 47), np.nan)),
+    "thrown up 60 m": (DROP * 2.3, np.stack([0 * DROP, 0 * DROP, 2 + 34 * DROP * 2.3 - 4.9 * (DROP * 2.3) ** 2], 1)),
+}
+
+
+@pytest.mark.parametrize(("time", "value"), FALLS.values(), ids=FALLS.keys())
+def test_a_fall_from_a_height_is_no_unit_error(recording, time, value):
+    start: dict[str, Any] = {"qpos": np.array([0.1, 0.02, 0.0, 0, 47, 1, 0, 0, 0])}
+    fall = only(recording, measured={"block_position": Channel(time, value)}, **start)
+    assert is_sound(fall)
+    for factor in (0.3, 3.0, 1000.0):
+        scaled = Channel(time, value * factor)
+        beyond = float(np.nanquantile(np.abs(scaled.value[:, 2]), 0.25)) > 30
+        if beyond:
+            assert not is_sound(only(recording, measured={"block_position": scaled}))
+    still = Channel(time, np.tile([0.0, 0, 47], (len(time), 1)))
+    assert not is_sound(only(recording, measured={"block_position": still}, **start))
+
+
+def test_a_recording_of_heights_alone_is_read(recording):
+    heights = Channel(DROP, falling(DROP, 3) * [np.nan, np.nan, 1])
+    assert is_sound(only(recording, measured={"block_position": heights}))
+    in_millimetres = Channel(DROP, np.tile([np.nan, np.nan, 400.0], (300, 1)))
+    assert not is_sound(only(recording, measured={"block_position": in_millimetres}))
 
 
 SLOW, LONG = np.arange(40) * 2.0, np.arange(800) * 0.1

@@ -236,7 +236,7 @@ def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np
     """Return how far two sets of readings are apart in units of noise, shape (count,)."""
     found = np.empty(window.count)
     for r, a, b in zip(window.readings, first, second, strict=True):
-        found[r.rows] = ((turn(b, a) if r.orientation else a - b) / r.std).ravel()
+        found[r.rows] = r.residuals((turn(b, a) if r.orientation else a - b) / r.std)
     return found
 
 

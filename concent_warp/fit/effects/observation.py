@@ -72,14 +72,21 @@ class Reading:
 
     channel: str
     rows: slice
-    """Their residuals among those of the window; each sample has one for each component, one after the other."""
+    """Their residuals among those of the window; each sample has one for each measured component, one after the
+    other."""
     time: np.ndarray
     """Times [s] from the window's start, shape (T,)."""
     value: np.ndarray
-    """Measured values, shape (T, dim)."""
+    """Measured values, shape (T, dim); NaN where a component was not measured."""
     std: float
     """Standard deviation of the noise of a component (of the rotation vector, for orientations)."""
     orientation: bool
+    known: np.ndarray | None = None
+    """Which components were measured, shape (T, dim) bool, where some were not; these have no residual."""
+
+    def residuals(self, value: np.ndarray) -> np.ndarray:
+        """Return what (T, dim) is for the components that were measured, one after the other."""
+        return value.ravel() if self.known is None else value[self.known]
 
 
 @dataclass(frozen=True)
@@ -189,7 +196,7 @@ class ObservedRecording:
                 continue
             channel = d.measured[name]
             inside = (channel.time >= start - 1e-9) & (channel.time <= end + 1e-9)
-            inside &= np.isfinite(channel.value).all(axis=1)
+            inside &= np.isfinite(channel.value).any(axis=1)
             if not inside.any():
                 continue
             orientation = int(m.sensor_type[m.sensor(name).id]) in map(int, UNIT_QUATERNION_SENSORS)
@@ -197,10 +204,12 @@ class ObservedRecording:
             if orientation:
                 value = value / np.linalg.norm(value, axis=1, keepdims=True)
             dim = 3 if orientation else value.shape[1]
-            size = dim * len(value)
+            finite = np.isfinite(value)
+            known = None if finite.all() else finite
+            size = dim * len(value) if known is None else int(known.sum())
             time = channel.time[inside]
-            readings.append(Reading(name, slice(count, count + size), time - start, value, std, orientation))
-            clock.append(np.repeat(time, dim))
+            readings.append(Reading(name, slice(count, count + size), time - start, value, std, orientation, known))
+            clock.append(np.repeat(time, dim if known is None else known.sum(axis=1)))
             count += size
         if not count:
             return None

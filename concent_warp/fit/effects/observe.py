@@ -59,7 +59,7 @@ def channel_noises(model: Model, recording: Recording, cfg: ObservationCfg | Non
                 expected=int(m.sensor_dim[row]),
                 found=[c.value.shape[1] for c in channels],
             )
-        if sum(int(np.isfinite(c.value).all(axis=1).sum()) for c in channels) < 2:
+        if sum(int(np.isfinite(c.value).any(axis=1).sum()) for c in channels) < 2:
             continue
         kind, unit = kind_and_unit(m, row)
         std = pooled_noise(channels, kind).std

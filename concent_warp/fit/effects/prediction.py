@@ -248,7 +248,7 @@ class Prediction:
         for r in w.readings:
             predicted = read(r.channel, r.time + w.start)
             value = turn(predicted, r.value) if r.orientation else r.value - predicted
-            residual[r.rows] = np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most).ravel()
+            residual[r.rows] = r.residuals(np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most))
         return np.clip(residual, -most, most)
 
     def residuals(self, trials: Sequence[SimulationRequest]) -> list[np.ndarray]:

@@ -27,6 +27,23 @@ class ClockCheckCfg:
 
 
 @dataclass(frozen=True)
+class FallCfg:
+    """Thresholds above which a motion is taken for a free fall."""
+
+    min_share: float = 0.25
+    """Least share of a track in which its acceleration is that of gravity [-]."""
+    max_error: float = 0.25
+    """Largest deviation of that acceleration from gravity, as a share of it [-]: air drag at half the final speed."""
+    span: float = 0.25
+    """Length of the pieces of which each acceleration is estimated [s], or `min_samples` periods if these are more:
+    noise of 5 mm at 30 Hz leaves an error of 0.8 m/s^2."""
+    min_samples: int = 6
+    """Fewest samples of such a piece [-]."""
+    margin: float = 1.5
+    """Distance that the demonstration may reach, as a multiple of the largest in the fall [-]."""
+
+
+@dataclass(frozen=True)
 class UnitCheckCfg:
     """Thresholds of the check for millimetres in place of metres and degrees in place of radians."""
 
@@ -42,6 +59,8 @@ class UnitCheckCfg:
     """Position of a slide joint outside its range, in ranges, that is never refused [-]."""
     max_speed: float = 340.0
     """Largest speed [m/s]: that of sound."""
+    fall: FallCfg = field(default_factory=FallCfg)
+    """Free falls, which may be from any height."""
 
 
 @dataclass(frozen=True)

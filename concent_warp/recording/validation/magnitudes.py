@@ -3,7 +3,8 @@
 The bounds (`UnitCheckCfg`) are far outside the values of a sound recording, and they grow with the scene:
 
 - positions: the lower quartile of the distances from the origin is above both `max_distance` and `max_extents` times
-  the extent of the scene. An object that starts near the scene and flies or falls far away stays below it.
+  the extent of the scene. An object that starts near the scene and flies or falls far away stays below it; one that
+  falls from far above is allowed by `falls`.
 - joint angles, and those commanded of a position servo: more than `max_turn` outside the joint's range. Angles of
   joints without limits cannot be judged and are not.
 - joint slides, commanded or measured: more than `max_slide`, and more than `max_slide_ranges` times the range, outside
@@ -30,7 +31,7 @@ SPEED_SENSORS = (
 )
 
 
-def _max_distance(model: mujoco.MjModel, cfg: UnitCheckCfg) -> float:
+def max_distance(model: mujoco.MjModel, cfg: UnitCheckCfg) -> float:
     """Return the distance [m] above which positions in this scene cannot be metres."""
     return max(cfg.max_distance, cfg.max_extents * float(model.stat.extent))
 
@@ -38,13 +39,21 @@ def _max_distance(model: mujoco.MjModel, cfg: UnitCheckCfg) -> float:
 def check_lengths(length: np.ndarray, model: mujoco.MjModel, place: ErrorLocation, cfg: UnitCheckCfg) -> None:
     """Check distances from the origin, or between things, [m], shape (n,), NaN where missing."""
     length = length[np.isfinite(length)]
-    if len(length) and (quartile := float(np.quantile(length, 0.25))) > _max_distance(model, cfg):
+    if len(length) and (quartile := float(np.quantile(length, 0.25))) > max_distance(model, cfg):
         raise place.error(
             "its positions look like millimetres",
-            expected=f"metres, three quarters of them not beyond {_max_distance(model, cfg):.3g} m",
+            expected=f"metres, three quarters of them not beyond {max_distance(model, cfg):.3g} m",
             found=f"{quartile:.4g} m",
             fix="write metres",
         )
+
+
+def _known_length(value: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors (T, 3) as far as their components are known, NaN where none is, shape (T,)."""
+    length = np.linalg.norm(value, axis=1)
+    part = np.isnan(length) & np.isfinite(value).any(axis=1)
+    length[part] = np.sqrt(np.nansum(value[part] ** 2, axis=1))
+    return length
 
 
 def check_positions(qpos: np.ndarray, model: mujoco.MjModel, place: ErrorLocation, cfg: UnitCheckCfg) -> None:
@@ -63,7 +72,7 @@ def check_measurement(
     """Check the unit of a measured channel, shape (T, dim)."""
     kind = model.sensor_type[sensor]
     if kind in POSITION_SENSORS:
-        check_lengths(np.linalg.norm(value, axis=1), model, place, cfg)
+        check_lengths(_known_length(value), model, place, cfg)
     elif kind in DISTANCE_SENSORS:
         check_lengths(np.abs(value[:, 0]), model, place, cfg)
     elif kind == mujoco.mjtSensor.mjSENS_JOINTPOS:

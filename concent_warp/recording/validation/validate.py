@@ -10,6 +10,8 @@ means that the value is unchanged, and a NaN would leave the command undefined.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
@@ -20,6 +22,7 @@ from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
+from concent_warp.recording.validation.falls import units_of_falls
 from concent_warp.recording.validation.images import check_image
 from concent_warp.recording.validation.location import ErrorLocation
 from concent_warp.recording.validation.magnitudes import (
@@ -79,6 +82,7 @@ def _check_demonstration(
     """Check one demonstration against the compiled scene."""
     if demonstration.success is not None and not isinstance(demonstration.success, bool | np.bool_):
         raise place.error("success is not a truth value", expected="True or False", found=demonstration.success)
+    cfg = replace(cfg, units=units_of_falls(demonstration, model, cfg.units))
     _check_initial(demonstration, model, place, cfg)
     for name, channel in demonstration.action.items():
         _check_action(channel, model, name, place.at(f"action/{name}"), cfg)
