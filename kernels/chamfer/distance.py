@@ -271,7 +271,7 @@ def _pairs_of_tensors(
 
     sets = [wp.from_torch(t, dtype=wp.vec3) for t in (compact(a, 2), compact(b, 2)) if t is not None]
     masks = [None if t is None else wp.from_torch(t) for t in (compact(a_valid, 1), compact(b_valid, 1))]
-    return PointSetPairs.of(sets[0], sets[1], masks[0], masks[1])
+    return PointSetPairs.of(sets[0], sets[1], masks[0], masks[1], whole)
 
 
 def _nearest_tensors(pairs: PointSetPairs, device: torch.device) -> list[torch.Tensor]:

@@ -70,9 +70,21 @@ class PointSetPairs:
 
     @classmethod
     def of(
-        cls, a: wp.array, b: wp.array, a_valid: wp.array | None = None, b_valid: wp.array | None = None
+        cls,
+        a: wp.array,
+        b: wp.array,
+        a_valid: wp.array | None = None,
+        b_valid: wp.array | None = None,
+        leading: Sequence[int] = (),
     ) -> PointSetPairs:
         """Pairs of contiguous arrays of shape (..., points), `wp.vec3` for sets and `wp.bool` for masks.
+
+        Args:
+            a: First sets.
+            b: Second sets.
+            a_valid: False where a point of a is missing.
+            b_valid: Likewise for b.
+            leading: Leading dimensions of the pairs where these are more than those of the arrays: all are repeated.
 
         Raises:
             ValueError: if an array has another shape, type or device.
@@ -92,7 +104,7 @@ class PointSetPairs:
                     f"chamfer: a set needs at least one point and a mask as many as its set; "
                     f"found {name} of shape {tuple(array.shape)} and its set of shape {tuple(partner.shape)}."
                 )
-        whole = broadcast_shape([array.shape[:-1] for array in arrays.values()])
+        whole = broadcast_shape([*(array.shape[:-1] for array in arrays.values()), leading])
         flat: dict[str, Any] = {}
         for name, array in named.items():
             batch = (1, 1) if array is None else batch_of(array.shape[:-1], whole)

@@ -137,7 +137,7 @@ class SplatPlan:
     ) -> None:
         device: Any = arrays.means.device
         worlds, cameras = arrays.camera_poses.shape[:2]
-        images, self._splats = worlds * cameras, arrays.means.shape[0]
+        images, self._splats = worlds * cameras, arrays.means.size
         frame = Frame()
         frame.width, frame.height, frame.antialias = width, height, int(antialias)
         frame.tile = edge = tile or TILES["cuda" if device.is_cuda else "cpu"]

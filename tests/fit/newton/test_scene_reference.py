@@ -456,6 +456,7 @@ def test_gradients_are_those_of_central_differences(simulated):
     worlds = simulated["worlds"]
     for name, step in (("radius", 1e-6), ("friction_scale", 0.01), ("mass_scale", 0.01), ("stiffness_scale", 0.01)):
         value = simulated["given"][name]
+        assert np.abs(simulated["gradient"][name]).max() > 0
         towards = np.sign(simulated["gradient"][name]) * step
         sums = []
         for sign in (1, -1):
