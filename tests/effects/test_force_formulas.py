@@ -242,6 +242,15 @@ def test_load_friction_adds_a_share_of_half_of_what_motor_and_weight_differ_by()
     np.testing.assert_allclose(m.dof_frictionloss, [0.3, 0.1 + 0.3 * load[1]], rtol=1e-12)
 
 
+def test_friction_needs_a_value_for_each_joint():
+    m = mujoco.MjModel.from_xml_string(TWO.format(gear=1, limits=""))
+    d, both = mujoco.MjData(m), np.array([0, 1])
+    stribeck, load = StribeckFriction(both), LoadFriction(both)
+    for model, values in ((stribeck, [0.1, 0.2]), (load, [0.1]), (load, [0.1] * 3)):
+        with pytest.raises(ValueError, match="zip"):
+            model.bound(m, d, np.array(values))
+
+
 def rotor(m: mujoco.MjModel, command: float, q: float, speed: float, ahead: float, play: float) -> tuple[float, float]:
     """Return force of a servo through loose gears (as the link feels it, on average over a step) and the rotor's lead.
 

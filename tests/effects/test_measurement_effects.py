@@ -127,3 +127,9 @@ def test_a_frame_keeps_readings_that_are_no_orientation():
     np.testing.assert_allclose(np.abs(found[3]), [0, 1, 0, 0], atol=1e-12)
     lost = effect.measure(world(BLOCK).compile(), lambda _s, _t: rows[1:3], np.full(6, 0.1))
     np.testing.assert_array_equal(lost("orientation", np.zeros(2)), rows[1:3])
+
+
+@pytest.mark.parametrize("effect", [SensorBias, SensorGain])
+def test_each_sensor_has_a_value_of_its_own(effect):
+    with pytest.raises(ValueError, match="zip"):
+        effect("encoder").measure(world(PENDULUM).compile(), truth, np.array([0.1, 0.2]))
