@@ -1,7 +1,7 @@
 """Contact pairs of the stage that each world is in: features of every slot and the reaching reward.
 
-From the paper, appendix C. Slot i of a stage holds a pair: a robot link or a sphere a, and the spot b of an object that
-the demonstration saw it touch. With x_a, x_b the pair's local points in the world, r_a, r_b their radii and n the
+From the paper, appendix C. Slot i of a stage has a pair: a robot link or a sphere a, and the spot b of an object that
+it touches in the demonstration. With x_a, x_b the pair's local points in the world, r_a, r_b their radii and n the
 outward unit normal of the target surface in the world,
 
     c = x_a - r_a n        contact point: the spot of a's sphere that faces the target
@@ -15,7 +15,7 @@ are in the world frame too. The reward of a world is that of its worst pair, at 
 
     A_far exp(-max_i d_i / sigma_far) + A_near exp(-max_i d_i / sigma_near)
 
-Quaternions are wxyz, held in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
+Quaternions are wxyz, stored in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class PairTable:
     normal: np.ndarray
     """Outward unit normal of the target surface, frame of `body_b`, shape (S, N, 3); zero where it is not known."""
     active: np.ndarray
-    """Whether the slot holds a pair, shape (S, N) bool."""
+    """Whether the slot has a pair, shape (S, N) bool."""
 
     def __post_init__(self) -> None:
         stages_slots = np.shape(self.active)
@@ -70,7 +70,7 @@ class PairTable:
             if value.shape != expected:
                 raise ValueError(f"PairTable: {name} must be of shape {expected}, found {value.shape}.")
             if not np.isfinite(value[self.used]).all():
-                raise ValueError(f"PairTable: {name} holds values that are not finite.")
+                raise ValueError(f"PairTable: {name} has values that are not finite.")
         length = np.linalg.norm(np.asarray(self.normal)[self.used], axis=-1)
         if not ((np.abs(length - 1) < 1e-3) | (length == 0)).all():
             raise ValueError("PairTable: normal must be of length 1, or zero where it is not known.")

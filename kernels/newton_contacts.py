@@ -11,7 +11,7 @@ both radii. The other shape is a point with a radius (a sphere, or the nearest p
 A damper that acts in full at the first touch makes the motion jump with the step in which that happens, which no
 gradient sees. So damping grows with the depth, up to its full value at `onset`.
 
-Newton wants the normal from the first body to the second, -n, and takes material from shapes of bodies; stiffness,
+Newton expects the normal from the first body to the second, -n, and takes material from shapes of bodies; stiffness,
 damping and friction are given for each contact, the shapes' friction being 1.
 """
 

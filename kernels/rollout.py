@@ -4,7 +4,7 @@ A clock of two counters keeps the host out of the loop. `command_kernel` reads `
 ``clock[1]`` for the kernels after it; `record_kernel` reads ``clock[1]`` and leaves the next step in ``clock[0]``. So
 no kernel reads a counter that another of its threads writes.
 
-Quaternions are wxyz, held in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
+Quaternions are wxyz, stored in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ Targets move with bodies, and sphere centres are taken into the target's frame, 
   another plate) or are open (behind the rim of a hole, everything would be inside); on one closed surface both agree.
 - or the spheres of another object, whose distance is that of their union: the least |x - c_j| - r_j.
 
-Quaternions are wxyz, held in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
+Quaternions are wxyz, stored in `wp.quat` as four plain numbers, as in MuJoCo-Warp.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def collision_kernel(
     all_bands = wp.tile_sum(wp.tile(bands))[0]
     all_most = wp.tile_max(wp.tile(most))[0]
     all_ends = wp.tile_max(wp.tile(ends))[0]
-    # The first pair of those as deep as the deepest; any lane that has none stands back.
+    # The first pair of those as deep as the deepest; a lane that has none does not take part.
     first_pair = wp.tile_min(wp.tile(wp.where(most_pair >= 0 and most == all_most, most_pair, t.pair_set.shape[0])))[0]
     if lane == 0:
         penetration[world] = all_depths

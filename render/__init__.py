@@ -2,5 +2,5 @@
 
 `raw` ray-traces the simulation; `networks` paint robot and background; `splats` show the objects and `shadows` their
 shadows; `composite` combines the layers; `filming` writes episodes to a data set of `dataset`; `figure` shows the
-layers; `cameras` holds calibrations.
+layers; `cameras` has calibrations.
 """

@@ -44,8 +44,8 @@ class FrameSelection:
         """
         if not self._kept:
             raise RenderError("there is no frame to show")
-        wanted = [share * (self._count - 1) for share in self._shares]
-        return [min(self._kept, key=lambda kept, at=at: abs(kept[0] - at))[1] for at in wanted]
+        instants = [share * (self._count - 1) for share in self._shares]
+        return [min(self._kept, key=lambda kept, at=at: abs(kept[0] - at))[1] for at in instants]
 
 
 def decomposition(samples: Sequence[Layers], cameras: Sequence[str], path: Path) -> None:

@@ -52,10 +52,10 @@ class PosedWorlds:
 
         self.model, self.worlds, self.device = model, worlds, wp.get_device(device)
         with wp.ScopedDevice(self.device):
-            drawn = _bare(model)
-            data = mjw.make_data(drawn, nworld=worlds, nconmax=1, njmax=1)
+            visible_model = _bare(model)
+            data = mjw.make_data(visible_model, nworld=worlds, nconmax=1, njmax=1)
             try:
-                self.simulator: tuple[Any, Any] = mjw.put_model(drawn), data
+                self.simulator: tuple[Any, Any] = mjw.put_model(visible_model), data
             except NotImplementedError as error:
                 found = " ".join(str(error).split())
                 raise RenderError("MuJoCo-Warp, which traces the images, cannot hold this scene", found=found) from None
@@ -197,10 +197,10 @@ class Launches:
 
 def _bare(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy without what only moves a model, as the ray tracer's simulator may not know it."""
-    drawn = copy.copy(model)
-    drawn.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    drawn.opt.noslip_iterations = 0
-    return drawn
+    visible_model = copy.copy(model)
+    visible_model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    visible_model.opt.noslip_iterations = 0
+    return visible_model
 
 
 def _grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["visual", "spheres"]) -> mujoco.MjModel:

@@ -53,7 +53,7 @@ FIT = FitCfg(
         length=0.05,
     ),
     generations=25,
-    patience=25,
+    plateau_generations=25,
     window=0.1,
     batch=60,
 )

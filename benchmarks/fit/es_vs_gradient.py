@@ -40,7 +40,7 @@ METHODS: tuple[MethodName, ...] = ("es", "gradient+es")
 FIT = FitCfg(
     evolution=EvolutionCfg(population=16, length=0.02, freeze_gripped=False, sigma_decay=0.96),
     generations=40,
-    patience=40,
+    plateau_generations=40,
 )
 """Nothing is grasped in these scenes: a pushing body must not freeze the face that it touches."""
 SLACK = 1.05

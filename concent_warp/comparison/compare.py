@@ -11,7 +11,7 @@ import numpy as np
 
 from concent_warp.comparison.bootstrap import BootstrapCfg
 from concent_warp.comparison.contact_names import ContactPartners
-from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, phases_by_body, stage_phases, tell_a_task
+from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, has_task, phases_by_body, stage_phases
 from concent_warp.comparison.residuals import instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
@@ -103,7 +103,7 @@ def compare(
         except EventsError as error:
             remarks = (f"No contact stages: {error}",)
     stages = {name: sequence.stages for name, sequence in (events or {}).items()}
-    moving = cfg.phases != "none" and not tell_a_task(stages)
+    moving = cfg.phases != "none" and not has_task(stages)
     found = compare_replays(
         named,
         chosen,

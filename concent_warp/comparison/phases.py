@@ -1,6 +1,6 @@
 """Phases of a demonstration: named spans of time.
 
-Contact stages (`concent_warp.events`) tell how a robot brings objects together. Where it does not (`tell_a_task`) - a
+Contact stages (`concent_warp.events`) describe how a robot brings objects together. Where it does not (`has_task`) - a
 toss, a push, a pendulum - the replay is parted by how things move: the contacts that it has and how fast they slip.
 
 | phase | an object, or without any the whole machine |
@@ -108,7 +108,7 @@ class ContactStage(StageLike, Protocol):
         ...
 
 
-def tell_a_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
+def has_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
     """Return whether contact stages, by demonstration, part what a robot does: it opens one of two or more of them."""
     return any(len(found) > 1 and any(ROBOT in s.bodies for s in found) for found in stages.values())
 
@@ -116,7 +116,7 @@ def tell_a_task(stages: Mapping[str, Sequence[ContactStage]]) -> bool:
 def phases_by_body(
     model: Model, compiled: mujoco.MjModel, rollout: Rollout, cfg: MotionPhaseCfg | None = None
 ) -> dict[str | None, tuple[Phase, ...]]:
-    """Return the ways of moving over a replay, without gaps: of each object, or of each moving body where there is no
+    """Return the phases of motion over a replay, without gaps: of each object, or of each moving body where there is no
     object, and under None of all of them together.
 
     Args:

@@ -48,7 +48,7 @@ class Residual:
     noise: float | None
     """Root mean square of `error` that noise alone leaves with a perfect model; None where the noise is not known."""
     std: float | None = None
-    """Standard deviation of the noise of each component of `value`, where it can be told; of points that of one."""
+    """Standard deviation of the noise of each component of `value`, where it is known; of points that of one."""
     source: Source = "unknown"
     """Where the noise is from."""
     extent: float = 0.0
@@ -113,7 +113,7 @@ def instrument_noise(compiled: mujoco.MjModel, demonstrations: Sequence[Demonstr
 def _sensor_residual(
     compiled: mujoco.MjModel, read: Reader, name: str, channel: Channel, where: str, noise: Noise | None = None
 ) -> Residual:
-    """Return the residual of one sensor; `read` tells what it reads at given times in the model's world."""
+    """Return the residual of one sensor; `read` returns its readings at given times in the model's world."""
     row = mujoco.mj_name2id(compiled, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if row < 0:
         names = [compiled.sensor(i).name for i in range(compiled.nsensor)]

@@ -110,7 +110,7 @@ class Comparison:
     span_cfg: WorstSpanCfg = field(default_factory=WorstSpanCfg)
     """Settings with which these were found."""
     staged: bool = True
-    """Whether the phases are contact stages; else they are ways of moving."""
+    """Whether the phases are contact stages; else they are phases of motion."""
     events: Mapping[str, ContactEventSequence] = field(default_factory=dict)
     """Contact event sequences of the last model, by demonstration, where they were extracted."""
     remarks: tuple[str, ...] = ()
@@ -145,7 +145,7 @@ class Comparison:
     def contact_phases(self) -> tuple[str, ...]:
         """Return the phases in which the contact geometry shows: all but `CARRIED`, if any are left.
 
-        None, which stands for all times, where the phases are ways of moving.
+        None, which stands for all times, where the phases are those of motion.
         """
         if not self.staged:
             return ()
@@ -258,7 +258,7 @@ class Comparison:
             "demonstrations": list(self.demonstrations),
             "phases": {d: [asdict(p) for p in self.phases.get(d, ())] for d in self.demonstrations},
             "diverged": [{"model": m, "demonstration": d, "time": t} for (m, d), t in self.diverged.items()],
-            "phases_are": "contact stages" if self.staged else "ways of moving",
+            "phases_are": "contact stages" if self.staged else "phases of motion",
             "headline": {
                 "channel": main[0],
                 "phases": list(main[1]),

@@ -28,7 +28,7 @@ def mean_and_interval(summary: Summary) -> str:
 def _cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table as text.
 
-    Phases are told apart for the channels that are about bodies, and with `every_phase` for all.
+    Phases are listed separately for channels of bodies, and with `every_phase` for all.
 
     Per channel and phase: number of samples, mean error of each model with its 95 % interval, RMS, 95th percentile and
     largest error of the last, noise floor and the RMS error over it; with two models or more also the change

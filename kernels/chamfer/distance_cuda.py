@@ -1,7 +1,7 @@
 """CUDA kernels of the Chamfer distance, written for the instruction count of their inner loops.
 
 A block of threads takes one pair of sets. Each thread keeps some points of the first set in registers and walks
-through the second set, which lies in shared memory; one distance serves both directions. The first set's minima stay in
+through the second set, which is in shared memory; one distance serves both directions. The first set's minima stay in
 registers; the second set's go through one warp reduction (`redux`) per point of the second set. Squared distances are
 never negative, so their bits order like integers: minima are taken on the bits, three operands an instruction on
 Hopper (`VIMNMX3`). With 16 points a thread that makes 7.5 instructions a pair for both directions, counted in the
@@ -22,7 +22,7 @@ from typing import Any
 import warp as wp
 
 SHARED_POINTS = 1024
-"""Most points that the second set of the one-pass kernel may have: they lie in a block's shared memory."""
+"""Most points that the second set of the one-pass kernel may have: they are stored in a block's shared memory."""
 
 
 @dataclass(frozen=True)

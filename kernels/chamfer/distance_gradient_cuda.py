@@ -1,8 +1,8 @@
-"""CUDA kernels of the gradient of the Chamfer distance: which point is nearest, and what pulls at a point.
+"""CUDA kernels of the gradient of the Chamfer distance: nearest points, and the gradient at a point.
 
-The search goes through the other set eight points at a time and notes only in which eight the nearest lies; the point
-itself is found at the end. The pull on a point is gathered, not added up by atomics, so that sums do not depend on the
-order of threads.
+The search goes through the other set eight points at a time and stores only in which eight the nearest is; the point
+itself is found at the end. The gradient at a point is gathered, not added up by atomics, so that sums do not depend on
+the order of threads.
 """
 
 from __future__ import annotations

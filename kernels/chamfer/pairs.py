@@ -39,7 +39,7 @@ def broadcast_shape(shapes: Sequence[Sequence[int]]) -> tuple[int, ...]:
 
 
 def batch_of(leading: Sequence[int], whole: Sequence[int]) -> tuple[int, int] | None:
-    """Divisor and modulus that take a flat index of `whole` to one of `leading`, where two numbers can say it.
+    """Divisor and modulus that take a flat index of `whole` to one of `leading`, where two numbers suffice.
 
     That is so where the dimensions that `leading` spreads over lie before or after those it has, not between them.
     """

@@ -18,9 +18,9 @@ from .projection import Frame
 
 wp.set_module_options({"enable_backward": False})
 
-MOST = wp.constant(0.999)
+MAX_OPACITY = wp.constant(0.999)
 """Largest opacity at a pixel."""
-DONE = wp.constant(1.0e-4)
+MIN_TRANSMITTANCE = wp.constant(1.0e-4)
 """Transmittance below which nothing more is blended."""
 
 
@@ -86,13 +86,13 @@ def blend(
         shape = lists.shape[k]
         power = exponent(place, shape, x, y)
         if power < shape[3]:
-            a = wp.min(place[3] * wp.exp(-power), MOST)
+            a = wp.min(place[3] * wp.exp(-power), MAX_OPACITY)
             weight = through * a
             light += weight * lists.colour[k]
             distance += weight * place[2]
             through *= 1.0 - a
             end = j + 1
-            if through < DONE:
+            if through < MIN_TRANSMITTANCE:
                 break
     covered = 1.0 - through
     rgb[image, row, column] = light
@@ -149,14 +149,14 @@ def blend_gradient(
         if power < shape[3]:
             falloff = wp.exp(-power)
             plain = place[3] * falloff
-            a = wp.min(plain, MOST)
+            a = wp.min(plain, MAX_OPACITY)
             through /= 1.0 - a
             weight = through * a
             worth = wp.dot(lists.colour[k], to_rgb) + place[2] * to_distance
             to_a = through * worth + (end_through * to_alpha - behind) / (1.0 - a)
             behind += weight * worth
             to_place = wp.vec4(0.0, 0.0, weight * to_distance, 0.0)
-            if plain < MOST:
+            if plain < MAX_OPACITY:
                 to_power = -a * to_a
                 dx = place[0] - x
                 dy = place[1] - y

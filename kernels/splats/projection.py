@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import warp as wp
 
-BLUR = wp.constant(0.3)
+PIXEL_VARIANCE = wp.constant(0.3)
 """Added to the variance along both axes of an image [px^2]."""
-FAINTEST = wp.constant(1.0 / 255.0)
+MIN_OPACITY = wp.constant(1.0 / 255.0)
 """Least opacity that counts."""
-NEAREST = wp.constant(0.01)
+MIN_DEPTH = wp.constant(0.01)
 """Least depth [m]."""
-BESIDE = wp.constant(0.3)
+JACOBIAN_MARGIN = wp.constant(0.3)
 """Beyond the image by this share of half its extent, the Jacobian is taken at the border: it grows without bounds."""
 
 
@@ -163,13 +163,13 @@ def project(
     p = to_camera * (above + origin - pose_position(scene.camera_pose, world, camera))
     z = p[2]
     tiles = wp.int32(0)
-    if z > NEAREST:
+    if z > MIN_DEPTH:
         fx = scene.pinhole[world, camera, 0]
         fy = scene.pinhole[world, camera, 1]
         cx = scene.pinhole[world, camera, 2]
         cy = scene.pinhole[world, camera, 3]
-        beside_x = BESIDE * 0.5 * float(frame.width) / fx
-        beside_y = BESIDE * 0.5 * float(frame.height) / fy
+        beside_x = JACOBIAN_MARGIN * 0.5 * float(frame.width) / fx
+        beside_y = JACOBIAN_MARGIN * 0.5 * float(frame.height) / fy
         u = wp.clamp(p[0] / z, -cx / fx - beside_x, (float(frame.width) - cx) / fx + beside_x)
         v = wp.clamp(p[1] / z, -cy / fy - beside_y, (float(frame.height) - cy) / fy + beside_y)
         q = rotation[i]
@@ -182,21 +182,21 @@ def project(
         # The determinant as a Lagrange identity: the difference of products would lose all digits of needles.
         normal = wp.cross(row_x, row_y)
         sharp = wp.dot(normal, normal)
-        det = sharp + BLUR * (xx + yy) + BLUR * BLUR
+        det = sharp + PIXEL_VARIANCE * (xx + yy) + PIXEL_VARIANCE * PIXEL_VARIANCE
         strength = opacity[i]
         if frame.antialias != 0:
             strength *= wp.sqrt(wp.max(sharp, 1.0e-12) / det)
-        if strength > FAINTEST:
-            faint = wp.log(strength / FAINTEST)
+        if strength > MIN_OPACITY:
+            faint = wp.log(strength / MIN_OPACITY)
             x = fx * p[0] / z + cx
             y = fy * p[1] / z + cy
             reach = tile_bounds(
-                x, y, wp.sqrt(2.0 * faint * (xx + BLUR)), wp.sqrt(2.0 * faint * (yy + BLUR)), frame
+                x, y, wp.sqrt(2.0 * faint * (xx + PIXEL_VARIANCE)), wp.sqrt(2.0 * faint * (yy + PIXEL_VARIANCE)), frame
             )  # fmt: skip
             tiles = (reach[1] - reach[0]) * (reach[3] - reach[2])
             if tiles > 0:
                 place[k] = wp.vec4(x, y, z, strength)
-                shape[k] = wp.vec4((yy + BLUR) / det, -xy / det, (xx + BLUR) / det, faint)
+                shape[k] = wp.vec4((yy + PIXEL_VARIANCE) / det, -xy / det, (xx + PIXEL_VARIANCE) / det, faint)
                 colour[k] = colour_seen(harmonics, i, wp.transpose(turn) * wp.normalize(p))
                 bounds[k] = reach
     count[k] = tiles

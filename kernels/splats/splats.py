@@ -101,10 +101,10 @@ class SplatPlan:
         arrays: what to render.
         width: width of the images [px].
         height: their height [px].
-        capacity: pairs of Gaussian and tile that there is room for, in all images together; `pairs` tells what it took.
+        capacity: most pairs of Gaussian and tile in all images together; `pairs` has the number used.
         tile: edge of a tile [px], by default what is quickest.
         antialias: take back the opacity that small Gaussians gain where they are blurred to the width of a pixel.
-        margin: how far behind the surface that `hidden` tells of a Gaussian may be [m].
+        margin: largest distance of a Gaussian behind the surface in `hidden` [m].
         gradient: also make the buffers of `backward`.
     """
 
@@ -118,7 +118,7 @@ class SplatPlan:
     pairs: wp.array
     """Pairs of Gaussian and tile in an image, int32, shape (images,)."""
     overflow: wp.array
-    """How many of them found no room, int32, shape (images,)."""
+    """How many of them did not fit, int32, shape (images,)."""
     gradients: dict[str, wp.array]
     """Written by `backward`: means, quats, scales, opacities, harmonics, as in `SplatArrays`; and `pixels`, that of the
     projected places, `wp.vec4`, shape (images * N,): x, y [1/px], depth and opacity."""
@@ -166,7 +166,7 @@ class SplatPlan:
             new(rows, wp.vec3),
         )
         self._bounds, self._count, self._end = new(rows, wp.vec4i), new(rows, wp.int32), new(rows, wp.int32)
-        # The sort wants room for as many again.
+        # The sort needs room for as many again.
         self._key, self._order = new(2 * capacity, wp.int64), new(2 * capacity, wp.int32)
         self._lists.order, self._lists.first = self._order, new(self._tiles + 1, wp.int32)
         self._bits = DEPTH_BITS + (self._tiles + 1).bit_length()

@@ -11,22 +11,22 @@ import struct
 
 import warp as wp
 
-from .projection import NEAREST, Frame
+from .projection import MIN_DEPTH, Frame
 
 wp.set_module_options({"enable_backward": False})
 
 DEPTH_BITS = 24
 """Bits of a depth in a key: enough from 0.01 m to 600 m with all but the three lowest bits."""
-SHIFT = wp.constant(wp.int64(DEPTH_BITS))
-DEEPEST = wp.constant(2**DEPTH_BITS - 1)
-LEAST = wp.constant(struct.unpack("<i", struct.pack("<f", NEAREST))[0])
+TILE_SHIFT = wp.constant(wp.int64(DEPTH_BITS))
+MAX_DEPTH_KEY = wp.constant(2**DEPTH_BITS - 1)
+MIN_DEPTH_BITS = wp.constant(struct.unpack("<i", struct.pack("<f", MIN_DEPTH))[0])
 """The bits of the least depth."""
 
 
 @wp.func
 def depth_key(depth: float) -> int:
     """The depth as an integer that grows with it."""
-    return wp.min((wp.cast(depth, int) - LEAST) >> 3, DEEPEST)
+    return wp.min((wp.cast(depth, int) - MIN_DEPTH_BITS) >> 3, MAX_DEPTH_KEY)
 
 
 @wp.kernel
@@ -64,7 +64,7 @@ def emit(
         for row in range(reach[2], reach[3]):
             for column in range(reach[0], reach[1]):
                 if at < capacity:
-                    key[at] = (wp.int64(first + row * frame.columns + column) << SHIFT) | depth
+                    key[at] = (wp.int64(first + row * frame.columns + column) << TILE_SHIFT) | depth
                     value[at] = k
                 at += 1
 
@@ -74,14 +74,14 @@ def pad(end: wp.array[int], beyond: wp.int64, key: wp.array[wp.int64]):
     """Give what is not used the number of a tile after the last."""
     i = wp.tid()
     if i >= end[end.shape[0] - 1]:
-        key[i] = beyond << SHIFT
+        key[i] = beyond << TILE_SHIFT
 
 
 @wp.kernel
 def find_tiles(key: wp.array[wp.int64], capacity: int, first: wp.array[int]):
     """Where a tile's keys begin in the sorted list, by bisection; those of the next begin where they end."""
     tile = wp.tid()
-    sought = wp.int64(tile) << SHIFT
+    sought = wp.int64(tile) << TILE_SHIFT
     low = wp.int32(0)
     high = wp.int32(capacity)
     while low < high:

@@ -52,7 +52,7 @@ class EpisodeLayout:
             raise RenderError("images of this size make no video", expected="even, at least 16 x 16", found=self.size)
 
     def check(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """Refuse a frame that is not as the layout says.
+        """Raise unless a frame agrees with the layout.
 
         Raises:
             RenderError: An image, the state or the action has another shape or type, or is not finite.
@@ -78,7 +78,7 @@ class EpisodeWriter(Protocol):
         ...
 
     def save(self, *, success: bool = True) -> None:
-        """Make it part of the data set; `success` tells whether the task was done, for formats that have rewards."""
+        """Make it part of the data set; `success` is whether the task was done, for formats that have rewards."""
         ...
 
     def drop(self) -> None:
@@ -102,7 +102,7 @@ class DatasetWriter(Protocol):
         ...
 
     def finish(self) -> int:
-        """Pack what is staged, so that the data set can be read; return how many episodes it holds."""
+        """Pack what is staged, so that the data set can be read; return how many episodes it has."""
         ...
 
 

@@ -1,6 +1,6 @@
 """LeRobotDataset v3.0: many episodes a file, videos beside tables, as the lerobot package reads it.
 
-Files (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): `data/` holds the numbers of all frames, `videos/` the
+Files (https://huggingface.co/docs/lerobot/lerobot-dataset-v3): `data/` has the numbers of all frames, `videos/` the
 images of each camera, `meta/episodes/` where each episode lies in both, with its statistics, `meta/tasks.parquet` the
 texts, `meta/stats.json` the statistics of all, `meta/info.json` the features. The table of episodes decides what a data
 set holds; everything else of it can be written again from the tables.
@@ -47,7 +47,7 @@ class LeRobotWriter:
 
         Args:
             folder: Its folder.
-            layout: What a frame holds.
+            layout: Contents of a frame.
             codec: Of the videos.
             video_mb: Size at which staged videos are packed to a file [MB].
 

@@ -1,4 +1,4 @@
-"""Statistics of features as LeRobotDataset wants them: of each episode, and of all episodes from those."""
+"""Statistics of features as LeRobotDataset defines them: of each episode, and of all episodes from those."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class FlowNetwork(nn.Module):
             nn.Sequential(nn.Linear(POSE, embedding), nn.SiLU(), nn.Linear(embedding, embedding)) if cfg.posed else None
         )
         self.entry = nn.Conv2d(3 * IMAGES, cfg.width, 3, padding=1)
-        # What stands still in the image has a place, which convolutions alone do not know.
+        # Static parts of the image depend on their position, of which convolutions are independent.
         self.place = nn.Parameter(torch.zeros(1, cfg.width, cfg.size, cfg.size))
         self.down, self.up, self.smaller, self.larger = (nn.ModuleList() for _ in range(4))
         kept, now = [cfg.width], cfg.width

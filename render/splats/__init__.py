@@ -1,5 +1,5 @@
 """Gaussian splats of objects.
 
-`splats` holds and stores them, `rasterise` renders them, `fit` optimises them from the images of `views` and the
+`splats` represents and stores them, `rasterise` renders them, `fit` optimises them from the images of `views` and the
 initial points of `initial`; `cfg` has the settings.
 """

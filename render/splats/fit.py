@@ -5,7 +5,7 @@ Colours are compared premultiplied, and opacity with the masks, so that what is 
     loss = (1 - s) mean |rgb - rgb*| + s (1 - SSIM) / 2 + m mean |alpha - mask|
 
 by Adam, each parameter at a rate of its own. Now and then the Gaussians whose places in the images pull hardest are
-split in two along their longest axis, and faint ones are taken out. Nothing is drawn at random after the start: a fit
+split in two along their longest axis, and faint ones are taken out. Nothing is random after the start: a fit
 that goes on from a checkpoint ends where it would have ended.
 """
 

@@ -23,7 +23,7 @@ PAIR_CAPACITY_RATIO = 2.0
 
 
 class Layer(NamedTuple):
-    """Splats alone, to be laid over what is behind: image = rgb + (1 - alpha) * background."""
+    """Splats alone, to be composited over a background: image = rgb + (1 - alpha) * background."""
 
     rgb: torch.Tensor
     """Light of the splats, premultiplied by alpha, shape (W, C, H, W, 3); colours may be above 1."""
@@ -98,7 +98,7 @@ class Rasteriser:
                 found=f"{[len(o) for o in objects]} splats, images {(worlds, cameras, height, width)}",
             )  # fmt: skip
         wp.init()
-        # "cuda" becomes "cuda:0", as Warp wants a number.
+        # "cuda" becomes "cuda:0", as Warp needs a number.
         self.device, self.width, self.height = torch.zeros(0, device=device).device, width, height
         self.worlds, self.cameras = worlds, cameras
         self._options = {"tile": tile, "antialias": antialias, "margin": margin, "gradient": gradient}
@@ -147,7 +147,7 @@ class Rasteriser:
         lost = int(self.overflow.sum())
         if lost:
             raise RenderError(
-                "splats were left out of images for want of room", expected=f"at most {self.plan.capacity} pairs",
+                "splats were left out of images for lack of memory", expected=f"at most {self.plan.capacity} pairs",
                 found=self.plan.capacity + lost,
                 fix=f"give the rasteriser a capacity of {-(-int(self.pairs.sum()) // self.plan.images)} or more",
             )  # fmt: skip

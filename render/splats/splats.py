@@ -82,7 +82,7 @@ class Splats:
     def read(path: Path | str, *, scale: float = 1.0, device: str | torch.device = "cpu") -> Splats:
         """Read a 3DGS ``.ply``, with a factor from the file's unit to metres.
 
-        Raises `SceneError` where the file is missing, broken or holds no splats.
+        Raises `SceneError` where the file is missing, broken or has no splats.
         """
         read = read_splats(Path(path)).scaled(scale)
         values = (read.mean, read.rotation, read.scale, read.opacity, read.harmonics)

@@ -1,6 +1,6 @@
 """Posed images of an object, in the ``transforms.json`` format of NeRF data sets.
 
-A folder holds ``transforms.json`` and images. The file has, at the top or in each frame, the pinhole camera: ``fl_x``,
+A folder has ``transforms.json`` and images. The file has, at the top or in each frame, the pinhole camera: ``fl_x``,
 ``fl_y``, ``cx``, ``cy`` [px], or ``camera_angle_x``, the horizontal field of view [rad]; and ``frames``, each with
 ``file_path`` and ``transform_matrix``, the camera-to-world matrix [m] of a camera that looks along -z with y up
 (OpenGL, Blender and MuJoCo). Images are RGBA, alpha the mask of the object, or RGB.
@@ -79,7 +79,7 @@ class SplatViews:
         return SplatViews(rgba, self.poses, intrinsics, self.masked)
 
     def write(self, folder: Path) -> None:
-        """Write the images as PNG and the file that tells of them; this comes last."""
+        """Write the images as PNG and the file that lists them; this comes last."""
         import cv2
 
         folder.mkdir(parents=True, exist_ok=True)

@@ -227,7 +227,7 @@ def test_without_stages_the_ways_of_moving_are_the_phases():
     found = compare_replays({"m": model(6)}, recorded(model(2)), "mujoco")
     assert set(found.phase_names) == {"free"}
     assert found.contact_phases() == ()
-    assert found.to_json()["phases_are"] == "ways of moving"
+    assert found.to_json()["phases_are"] == "phases of motion"
 
 
 def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):

@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from concent_warp.comparison.phases import Phase, phases_by_body, stage_phases, tell_a_task
+from concent_warp.comparison.phases import Phase, has_task, phases_by_body, stage_phases
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
@@ -131,10 +131,10 @@ class Stage(Phase):
 
 def test_stages_tell_a_task_where_a_robot_opens_one_of_several():
     pick, align = Stage("pick", 0.5, 1), Stage("align", 1, 2, ("block", "box"))
-    assert tell_a_task({"demo_0": (), "demo_1": (pick, align)})
-    assert not tell_a_task({"demo_0": (pick,)})
-    assert not tell_a_task({"demo_0": (align, align)})
-    assert not tell_a_task({})
+    assert has_task({"demo_0": (), "demo_1": (pick, align)})
+    assert not has_task({"demo_0": (pick,)})
+    assert not has_task({"demo_0": (align, align)})
+    assert not has_task({})
 
 
 def test_two_objects_have_phases_of_their_own_and_the_livelier_one_tells_those_of_the_demonstration():

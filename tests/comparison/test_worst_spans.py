@@ -193,7 +193,7 @@ def test_places_are_in_the_json_with_their_sentence(pushed):
     assert [p["sentence"] for p in document["worst_spans"]] == [
         p.sentence(demonstration=True) for p in pushed.worst_spans
     ]
-    assert document["phases_are"] == "ways of moving"
+    assert document["phases_are"] == "phases of motion"
     assert document["summaries"][0]["ratio"] > 3
 
 

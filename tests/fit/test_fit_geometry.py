@@ -113,14 +113,16 @@ def test_settings_survive_the_checkpoint_as_json():
 
 
 def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
-    cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), patience=2)
+    cfg = replace(CFG, evolution=replace(CFG.evolution, sigma=1e-9), plateau_generations=2)
     result = fit_geometry(swollen, drop, cfg, engine="mujoco")
     assert result.stopped == "error fell by less than 0.02 of itself in 2 generations"
     assert len(result.history) == 3
 
 
 def test_small_gains_add_up_before_the_fit_ends(drop, swollen):
-    search = Search(swollen, cut(swollen, [drop[0]], CFG), replace(CFG, patience=3, least_gain=0.05), "mujoco")
+    search = Search(
+        swollen, cut(swollen, [drop[0]], CFG), replace(CFG, plateau_generations=3, least_gain=0.05), "mujoco"
+    )
 
     def seen(generation: int, loss: float, held_out: float) -> int:
         search.evolution.generation = generation

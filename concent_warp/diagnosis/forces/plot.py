@@ -28,7 +28,7 @@ def plot_location(location: UnexplainedForces, model: Model, path: Path) -> None
     Args:
         location: What was found.
         model: The model that it was found in, for the shapes of its objects.
-        path: The image; its suffix tells the format.
+        path: The image; its suffix determines the format.
     """
     import matplotlib.pyplot as plt
 

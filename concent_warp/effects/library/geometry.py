@@ -142,7 +142,7 @@ def _extent(m: mujoco.MjModel, geom: int) -> np.ndarray:
 def _write(
     body: mujoco.MjsBody, geom: mujoco.MjsGeom, position: np.ndarray, quaternion: np.ndarray, size: np.ndarray
 ) -> None:
-    """Give a geom position and orientation in the frame of its body, however the MJCF told them, and a size."""
+    """Give a geom position and orientation in the frame of its body, however the MJCF gives them, and a size."""
     if geom.frame is not None:
         geom.set_frame(body.add_frame())
     geom.fromto = np.full(6, np.nan)

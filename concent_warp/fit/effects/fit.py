@@ -279,8 +279,8 @@ def _remarks(
         for j in range(k):
             if abs(correlation[k, j]) > cfg.max_correlation and not {k, j} & unknown:
                 found.append(
-                    f"{parameters[j].name} and {parameters[k].name} act so alike in this recording that it tells "
-                    f"little of each by itself (correlation {correlation[k, j]:.3f})."
+                    f"{parameters[j].name} and {parameters[k].name} act so alike in this recording that it determines "
+                    f"neither well by itself (correlation {correlation[k, j]:.3f})."
                 )
     return found
 

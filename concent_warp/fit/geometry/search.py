@@ -29,7 +29,7 @@ class GeometrySearchCfg:
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
     generations: int = 70
     """Generations at most."""
-    patience: int = 20
+    plateau_generations: int = 20
     """Generations without progress after which the search ends: neither the lowest distance over the frames of the fit
     nor the one over the held-out frames has fallen by `least_gain`. Chosen on seeds of the shape sorter that no page
     reports: shorter ones stop on the flat stretch after the first generations."""
@@ -213,8 +213,10 @@ class Search:
         self.history.append(self.entry(survey, sigma, float(np.median(losses.fit))))
         if evolution.generation >= cfg.generations:
             self.stopped = f"all {cfg.generations} generations done"
-        elif evolution.generation - self.last_gain > cfg.patience:
-            self.stopped = f"error fell by less than {cfg.least_gain:.3g} of itself in {cfg.patience} generations"
+        elif evolution.generation - self.last_gain > cfg.plateau_generations:
+            self.stopped = (
+                f"error fell by less than {cfg.least_gain:.3g} of itself in {cfg.plateau_generations} generations"
+            )
         if self.stopped is not None:
             self.note(self.survey([*segments, *self.held_out]))
             self.history[-1]["best"] = self.best

@@ -3,7 +3,7 @@
 A step follows the gradient in the metric of the evolution strategy's noise: its covariance times the gradient, so that
 faces move together and single touched spheres do not. It is normalised, since gradients grow with the horizon. Each
 start keeps its best iterate, goes back to it where the loss rises or is not finite, and shortens its step. A weight on
-the displacement holds the geometry near the prior. Newton's optimum is not MuJoCo's: several iterates of each start are
+the displacement keeps the geometry near the prior. Newton's optimum is not MuJoCo's: several iterates of each start are
 scored again in MuJoCo, and the best of those counts.
 """
 
@@ -41,8 +41,8 @@ class GradientCfg:
     most `largest_step`."""
     largest_step: float = 1.5e-3
     """Longest first step that is chosen by itself [m]."""
-    patience: int = 4
-    """Steps in which no start got better by 3 %, after which the descent ends."""
+    plateau_iterations: int = 4
+    """Steps in which no start got better by 3 %, after which the descent ends [-]. Empirical."""
     smallest_step: float = 2e-5
     """A start whose steps are shorter is finished [m]."""
     prior: float = 5.0
@@ -229,7 +229,7 @@ def descend(
     state.now = bounded(state.best + state.step[:, None, None] * state.direction)
     goes_on = (state.step > cfg.smallest_step) & np.isfinite(state.lowest)
     state.lows.append(float(state.lowest.min()))
-    stale = len(state.lows) > cfg.patience and state.lows[-1] > 0.97 * state.lows[-1 - cfg.patience]
+    stale = len(state.lows) > cfg.plateau_iterations and state.lows[-1] > 0.97 * state.lows[-1 - cfg.plateau_iterations]
     state.finished = len(state.losses) >= cfg.iterations or stale or not goes_on.any()
 
 

@@ -1,4 +1,4 @@
-"""How long gradients stay meaningful, estimated from the observed motion of the objects.
+"""Length of the windows over which gradients are useful, estimated from the observed motion of the objects.
 
 Gradients grow with the number of impacts that they pass through. An object that is pushed or settles keeps its tilt:
 gradients serve for seconds. One that tumbles changes it, and each corner that hits the ground multiplies them: there
@@ -23,16 +23,19 @@ from concent_warp.recording.recording import Demonstration
 
 @dataclass(frozen=True)
 class HorizonCfg:
-    """How long gradients are trusted."""
+    """Lengths of the windows over which gradients are computed.
 
-    tilt: float = 0.35
-    """Change of an object's tilt above which it tumbles [rad]."""
-    tumbling: float = 0.25
-    """Length of a window of a demonstration in which something tumbles [s]."""
-    calm: float = 3.0
-    """Longest stretch where nothing does [s]."""
-    most: int = 24
-    """Windows at most; more are thinned out evenly."""
+    "Empirical" values were set on recordings of pushed, settling and tumbling cubes.
+    """
+
+    tumbling_tilt: float = 0.35
+    """Change of an object's tilt above which it counts as tumbling [rad]: 20 degrees."""
+    tumbling_window: float = 0.25
+    """Length of a window of a demonstration in which an object tumbles [s]. Empirical: a few impacts."""
+    calm_window: float = 3.0
+    """Longest window of a demonstration in which none does [s]. Empirical."""
+    max_windows: int = 24
+    """Most windows [-]; more are thinned out evenly."""
 
 
 def gradient_segments(
@@ -48,9 +51,9 @@ def gradient_segments(
 
     Args:
         model: Model with contact geometry.
-        segments: What the fit simulates; those that are held out are left out.
+        segments: Segments that the fit simulates; held-out ones are left out.
         demonstrations: Where they come from, one for each; empty where they are windows already.
-        cfg: How long gradients are trusted.
+        cfg: Settings.
         held_out: Share of the frames that are held out, in blocks.
         block: Length of these blocks [s].
     """
@@ -61,14 +64,14 @@ def gradient_segments(
         used = segment
         if segment.held_out is None:
             used = replace(segment, targets=tuple(_without(t, t.held_out(held_out, block)) for t in segment.targets))
-        limit = cfg.tumbling if max(map(_tilt, segment.targets)) > cfg.tilt else cfg.calm
+        limit = cfg.tumbling_window if max(map(_tilt, segment.targets)) > cfg.tumbling_tilt else cfg.calm_window
         if len(segment.ctrl) * model.scene.model.opt.timestep <= 1.2 * limit:
             result.append(used)
             continue
         found = _windows_of(model, demonstrations[i], limit, used) if demonstrations else []
         result += found or [shortened(model.scene.model, used, limit)]
-    if len(result) > cfg.most:
-        result = [result[k] for k in np.linspace(0, len(result) - 1, cfg.most).round().astype(int)]
+    if len(result) > cfg.max_windows:
+        result = [result[k] for k in np.linspace(0, len(result) - 1, cfg.max_windows).round().astype(int)]
     return result
 
 

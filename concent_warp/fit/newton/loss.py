@@ -79,14 +79,14 @@ class NewtonLoss:
 
         poses = self.worlds.forward(parameters)[torch.as_tensor(self.rows, device=self.worlds.torch_device)]
         poses = poses.detach().clone().requires_grad_()
-        fit, held = self._means(poses)
+        fit, held_out = self._means(poses)
         fit.sum().backward()
         assert poses.grad is not None
         by = self.worlds.backward(poses.grad, self.rows)
         self.simulations += 2 * self.worlds.worlds
         gone = ~torch.isfinite(poses.detach()).all(dim=3).all(dim=2).all(dim=0).view(self.count, -1).all(dim=1)
         lost = gone.cpu().numpy()
-        losses = [np.where(lost, np.inf, x.detach().cpu().numpy().astype(float)) for x in (fit, held)]
+        losses = [np.where(lost, np.inf, x.detach().cpu().numpy().astype(float)) for x in (fit, held_out)]
         for value in by.values():
             value[lost] = np.nan
         return Gradients(losses[0], losses[1], by)
@@ -112,7 +112,7 @@ class RecordingGradient:
     loss: float
     """Mean Chamfer distance as simulated in Newton [m]."""
     mujoco_loss: float
-    """The same in MuJoCo [m]: how far both agree says how far the gradient is to be trusted."""
+    """The same in MuJoCo [m]: the gradient is reliable as far as the two agree."""
     position: np.ndarray
     """d loss / d sphere centre [m/m], shape (S, 3)."""
     radius: np.ndarray
@@ -145,8 +145,8 @@ def recording_gradient(
         model: Model with contact geometry.
         recording: What was commanded and observed.
         demonstrations: Names of the demonstrations; all by default.
-        segments: Stretches to simulate instead of whole demonstrations, such as `fit.windows.windows` makes: a gradient
-            through a second of tumbling says nothing.
+        segments: Stretches to simulate instead of whole demonstrations, such as `fit.windows.windows` makes: gradients
+            through a second of tumbling are useless.
         squared: Squared form of the Chamfer distance, in m^2 then.
         cfg: How Newton simulates contacts.
         device: Where to simulate; by default CUDA where there is a device.

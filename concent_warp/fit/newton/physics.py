@@ -2,8 +2,8 @@
 
 A contact of that solver is a spring with a damper, and friction a damper up to Coulomb's limit. All act explicitly, so
 that the stiffest motion of a body bounds the time step. With contacts at r_i from the centre of mass, M the body's
-6 x 6 inertia and J_i = [1, -[r_i]x], the largest eigenvalue L of M^-1 sum_i J_i^T J_i says how strongly all contacts
-together act on the body [1/kg]. The rules are
+6 x 6 inertia and J_i = [1, -[r_i]x], the largest eigenvalue L of M^-1 sum_i J_i^T J_i is the strength of all
+contacts together [1/kg]. The rules are
 
     dt^2 ke L <= max_spring_number,    dt kd L <= max_damper_number,    dt kf L <= max_damper_number.
 

@@ -4,7 +4,7 @@ One candidate for each of them descends by itself, all as parallel worlds of the
 of the slope in the logarithm of its factor, keeps its best iterate, and shortens its step where the loss rises, is not
 finite, or the slope turns. The loss is that of equation 1, as `fit.newton_loss` differentiates it.
 
-Factors are relative to Newton's own contacts. What they are worth in MuJoCo is for MuJoCo to say.
+Factors are relative to Newton's own contacts. Their effect in MuJoCo has to be evaluated in MuJoCo.
 """
 
 from __future__ import annotations
@@ -23,9 +23,6 @@ from concent_warp.fit.newton.worlds import Parameters
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 
-FRICTION, STIFFNESS, MASS = (0.2, 5.0), (0.25, 2.0), (0.7, 2.0)
-"""Smallest and largest factors; contacts stay stable within them."""
-
 
 @dataclass(frozen=True)
 class FactorCfg:
@@ -37,20 +34,28 @@ class FactorCfg:
     """First step, of the logarithm of a factor."""
     smallest_step: float = 0.03
     """A factor whose steps are shorter is finished."""
-    gain: float = 0.05
-    """Share by which a factor must lower the loss, or it counts as 1."""
+    min_gain: float = 0.05
+    """Share by which a factor must lower the loss; otherwise it counts as 1 [-]. Empirical."""
+    friction_range: tuple[float, float] = (0.2, 5.0)
+    """Smallest and largest factor on friction [-]."""
+    stiffness_range: tuple[float, float] = (0.25, 2.0)
+    """Smallest and largest factor on stiffness [-]: contacts stay stable within them."""
+    mass_range: tuple[float, float] = (0.7, 2.0)
+    """Smallest and largest factor on masses [-]: contacts stay stable within them."""
     disagreement: float = 5.0
-    """How many times farther from what was observed the model may be in Newton than in MuJoCo: beyond that Newton tells
-    of another motion, as of a grasp that slips."""
+    """How many times farther from what was observed the model may be in Newton than in MuJoCo: beyond that
+    Newton simulates another motion, as of a grasp that slips [-]. Empirical."""
     device: str | None = None
     """Where Newton runs, "cpu" or "cuda:0"; None takes CUDA where there is a device."""
     horizon: HorizonCfg = field(default_factory=HorizonCfg)
+    """Windows over which gradients are computed."""
     newton: NewtonCfg = field(default_factory=lambda: NewtonCfg(shortest_step=5e-5))
+    """How contacts are simulated."""
 
 
 @dataclass(frozen=True)
 class Factors:
-    """What gradients lead to; 1 where they lead nowhere."""
+    """Factors by gradients; 1 where a factor does not lower the loss."""
 
     friction: float
     """On the friction of all contacts [-]."""
@@ -84,7 +89,7 @@ class FactorDescent:
         """
         self.cfg = cfg = cfg or FactorCfg()
         segments = _stretches(model, recording, cfg.horizon)
-        self.scene = newton_scene(model, segments, cfg.newton, lightest=MASS[0])
+        self.scene = newton_scene(model, segments, cfg.newton, lightest=cfg.mass_range[0])
         self.loss = NewtonLoss(self.scene, 2 + len(self.scene.moving), device=cfg.device)
         geometry = model.geometry
         assert geometry is not None
@@ -94,7 +99,7 @@ class FactorDescent:
         self._position = np.repeat(geometry.position[None], count, axis=0)
         # Effects that the model has set the friction of geoms, not of the geometry.
         self._friction = np.repeat(m.geom_friction[of_geom, 0][None], count, axis=0)
-        limits = np.log([FRICTION, STIFFNESS, *(MASS for _ in self.scene.moving)])
+        limits = np.log([cfg.friction_range, cfg.stiffness_range, *(cfg.mass_range for _ in self.scene.moving)])
         self._low, self._high = limits.T
 
     def parameters(self, factor: np.ndarray) -> Parameters:
@@ -147,7 +152,7 @@ class FactorDescent:
             now = np.clip(best + step * direction, self._low, self._high)
             if not ((step > cfg.smallest_step) & (now != best)).any():
                 break
-        factor = np.where(lowest < (1 - cfg.gain) * before, np.exp(best), 1.0)
+        factor = np.where(lowest < (1 - cfg.min_gain) * before, np.exp(best), 1.0)
         names = [body.name for body in self.scene.moving]
         return Factors(
             float(factor[0]),
@@ -161,7 +166,7 @@ class FactorDescent:
         )
 
     def _agree(self, newton: float, mujoco: float) -> None:
-        """Check that both simulators tell of the same motion, by the distances of the model from it [m]."""
+        """Check that both simulators simulate the same motion, by the distances of the model from it [m]."""
         if not newton <= self.cfg.disagreement * mujoco:
             raise EngineError(
                 "Newton simulates another motion than MuJoCo, so that its gradients are of no use",

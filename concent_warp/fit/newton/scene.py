@@ -154,7 +154,7 @@ def _moving_bodies(model: Model, m: mujoco.MjModel) -> list[int]:
 
 
 def _padded_commands(segments: Sequence[Segment]) -> np.ndarray:
-    """Return the commands of all segments, padded by holding the last, shape (n, K, nu)."""
+    """Return the commands of all segments, padded with the last, shape (n, K, nu)."""
     steps = max(len(s.ctrl) for s in segments)
     return np.stack([np.pad(s.ctrl, ((0, steps - len(s.ctrl)), (0, 0)), mode="edge") for s in segments])
 
@@ -173,7 +173,7 @@ def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: floa
     Args:
         model: Model with contact geometry.
         moving: Ids of the simulated bodies.
-        states: States to look at, shape (T, nq).
+        states: States in which pairs are searched for, shape (T, nq).
         reach: Distance between surfaces [m].
     """
     from concent_warp.kernels.newton_contacts import KINDS, LARGER, OTHER, OWN, SPHERE

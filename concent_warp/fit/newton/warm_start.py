@@ -60,7 +60,7 @@ class GradientWarmStart:
             progress: Called with the iteration, the lowest loss [m] and the time left [s].
 
         Raises:
-            ModelError: The file holds another state.
+            ModelError: The file has another state.
         """
         search, cfg = self.search, self.cfg
         segments = gradient_segments(
@@ -88,7 +88,7 @@ class GradientWarmStart:
             self.descend(state, loss, keep)
         best, after = self.judged(state)
         if best is None:
-            return self.without_help("gradients do not help here: Newton tells of another motion", state.losses)
+            return self.without_help("gradients do not help here: Newton simulates another motion", state.losses)
         text = (
             f"best iterate {1e3 * self.metres(after):.2f} mm in MuJoCo, start {1e3 * self.metres(self.before):.2f} mm"
         )

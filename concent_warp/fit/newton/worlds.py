@@ -72,7 +72,7 @@ class NewtonWorlds:
         self._graphs: dict[str, Any] = {}
 
     def _build(self, newton: Any) -> Any:
-        """Return Newton's model: bodies, each with one shape that holds the material."""
+        """Return Newton's model: bodies, each with one shape that has the material."""
         import warp as wp
 
         scene, physics = self.scene, self.scene.physics
@@ -354,7 +354,7 @@ class NewtonWorlds:
         """Return the rows of the simulated bodies in an array of poses, without a copy."""
         import warp as wp
 
-        # Torch's default stream and Warp's wait for one another, so that neither needs to be told.
+        # Torch's default stream and Warp's wait for one another, so that neither needs to be synchronised.
         shape = (array.shape[0], self.worlds, len(self.scene.bodies), 7)
         return wp.to_torch(array, requires_grad=False).view(shape)[:, :, : len(self.scene.moving)]
 

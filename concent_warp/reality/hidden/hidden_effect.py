@@ -62,7 +62,7 @@ def drives(rig: Rig) -> tuple[Drive, ...]:
         kp, kv = m.actuator_gainprm[a, 0], -m.actuator_biasprm[a, 2]
         limit = float(m.actuator_forcerange[a, 1]) if m.actuator_forcelimited[a] else np.inf
         found.append((m.actuator(a).name, joint, float(kp), float(kv), limit))
-    # Where a drive has no limit, stiffness tells how strong it is.
+    # Where a drive has no limit, its strength follows from its stiffness.
     strength = np.array([f[4] for f in found])
     strength = strength if np.isfinite(strength).all() else np.array([f[2] for f in found])
     return tuple(Drive(*f, weight=float(s / strength.max())) for f, s in zip(found, strength, strict=True))

@@ -60,7 +60,7 @@ class SensingCfg:
     depth_dropout: float = 0.5
     """Share of the pixels on an edge that have no depth [-]: half of what they cover is hidden from the second eye."""
     tracking_std: float = 1e-4
-    """Slow wander of the joints against their commands that no encoder tells [rad]."""
+    """Slow deviation of the joints from their commands that no encoder measures [rad]."""
     tracking_time: float = 0.3
     """Correlation time of the wander [s]."""
 

@@ -2,7 +2,7 @@
 
 What it can tell is limited by the cloud: the distance is right near a surface that the points cover densely, and to a
 few point spacings at edges. Inside it is the distance to the plane of the nearest surface, which near a concave edge is
-less than the true depth. Sides are told by what can be seen from around the object, as a scan sees it: a part never
+less than the true depth. The outward side is that from which a point is visible, as in a scan: a part never
 recorded has no inside, and where a wall is thinner than a few spacings some points (about 1 in 20) come out reversed. A
 box of 70 mm with a hole and a floor of 5 mm wants about 5,000 points.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 NEIGHBOURS = 12
 """Points that a local plane is fitted to."""
 VIEWS = 48
-"""Places around the object from which the sides are told."""
+"""Places around the object from which visibility is determined."""
 FLIP = 100.0
 """Radius of the sphere that turns the cloud inside out, in distances of the farthest point: larger sees more."""
 SHARINGS = 2

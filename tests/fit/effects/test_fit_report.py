@@ -189,7 +189,7 @@ def test_parameters_that_act_alike_are_remarked_once(size, alike):
     correlation = np.eye(3)
     correlation[2, 0] = correlation[0, 2] = size
     found = remarks(*names, correlation=correlation)
-    text = f"a and c act so alike in this recording that it tells little of each by itself (correlation {size:.3f})."
+    text = f"a and c act so alike in this recording that it determines neither well by itself (correlation {size:.3f})."
     assert found == ([text] if alike else [])
     unknown = [fitted("a", 1.0, 99.0), *names[1:]]
     assert remarks(*unknown, correlation=correlation) == ["The recording hardly determines a."]

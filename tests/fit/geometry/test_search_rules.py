@@ -144,7 +144,7 @@ def test_the_search_ends_after_all_generations_and_judges_the_last_estimate(swol
 
 
 def test_the_search_ends_where_nothing_is_gained_for_some_generations(swollen, segment):
-    cfg = replace(CFG, generations=20, patience=2, evolution=replace(CFG.evolution, flat_start=False))
+    cfg = replace(CFG, generations=20, plateau_generations=2, evolution=replace(CFG.evolution, flat_start=False))
     search = written(swollen, segment, cfg)
     while search.stopped is None:
         search.step()

@@ -24,7 +24,7 @@ from tests.fit.conftest import HALF, corner_spheres
 GEOMETRY = corner_spheres(HALF)
 EVERY = np.ones(len(GEOMETRY), dtype=bool)
 GOAL = np.tile([1e-3, 0.0, -2e-3], (len(GEOMETRY), 1))
-CFG = GradientCfg(iterations=30, prior=0.0, patience=30)
+CFG = GradientCfg(iterations=30, prior=0.0, plateau_iterations=30)
 
 
 def metric(swelling=0.0) -> Metric:
@@ -91,7 +91,7 @@ def test_the_descent_ends_where_nothing_gets_better_by_three_percent_in_some_ste
         values = iter(1.0 - slope * np.arange(100))
         return lambda p: SimpleNamespace(loss=np.full(1, next(values)), by={"position": np.ones_like(p.position)})
 
-    cfg = replace(CFG, iterations=20, patience=4)
+    cfg = replace(CFG, iterations=20, plateau_iterations=4)
     assert len(run(started(), level(0.001), cfg).losses) == 5
     assert len(run(started(), level(0.02), cfg).losses) == 20
 

@@ -385,7 +385,7 @@ def test_a_motion_that_newton_simulates_otherwise_ends_the_descent_at_its_first_
     result = warm(cfg=GradientCfg(iterations=6)).run(None, False, None)
     assert not result.helped
     assert len(result.losses) == 1
-    assert "Newton tells of another motion" in result.remark
+    assert "Newton simulates another motion" in result.remark
     gradients["mujoco"], gradients["count"] = 4e-3 * 0.9 / 4.99, 0
     searched = Searched()
     searched.losses = lambda position: np.full(len(position), 1e-3)

@@ -191,7 +191,7 @@ def cut_windows_to(monkeypatch: Any, found: Any) -> list[Any]:
 
 def test_a_stretch_within_the_limit_is_taken_whole_and_a_longer_one_is_cut(block, monkeypatch):
     calls = cut_windows_to(monkeypatch, [])
-    cfg = HorizonCfg(tilt=0.35, tumbling=0.25, calm=3.0)
+    cfg = HorizonCfg(tumbling_tilt=0.35, tumbling_window=0.25, calm_window=3.0)
 
     def lengths(one: BodyTarget, seconds: float, **options: Any) -> list[int]:
         found = gradient_segments(block, [segment(one, seconds, **options)], options.pop("shown", ()), cfg)
@@ -234,9 +234,9 @@ def test_held_out_frames_and_segments_are_left_out(block):
 
 def test_many_stretches_are_thinned_out_evenly(block):
     segments = [replace(segment(target(frames=3), 0.1, held_out=False), name=str(k)) for k in range(11)]
-    found = gradient_segments(block, segments, (), HorizonCfg(most=4))
+    found = gradient_segments(block, segments, (), HorizonCfg(max_windows=4))
     assert [s.name for s in found] == ["0", "3", "7", "10"]
-    assert gradient_segments(block, segments, (), HorizonCfg(most=11)) == segments
+    assert gradient_segments(block, segments, (), HorizonCfg(max_windows=11)) == segments
 
 
 def test_what_a_demonstration_has_not_seen_is_not_seen_in_its_windows(block, monkeypatch):
@@ -266,7 +266,7 @@ def test_the_beginning_of_a_segment_ends_with_a_whole_step(block):
 
 GEOMETRY = corner_spheres(HALF)
 BASE = GEOMETRY.position
-CFG = GradientCfg(prior=3.0, patience=2, iterations=9, smallest_step=1e-4)
+CFG = GradientCfg(prior=3.0, plateau_iterations=2, iterations=9, smallest_step=1e-4)
 
 
 def stub_metric() -> Any:
