@@ -436,6 +436,21 @@ def test_candidates_do_not_influence_one_another(scene, simulated):
             np.testing.assert_allclose(found[name][0], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max() + 1e-9)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_seed_that_is_not_finite_counts_as_no_gradient(simulated, value):
+    import torch
+
+    worlds, rows = simulated["worlds"], simulated["rows"]
+    poses(worlds, **simulated["given"])
+    seed = simulated["seed"].copy()
+    seed[3, 1, 1, 2] = 0.0
+    expected = worlds.backward(torch.as_tensor(seed), rows)
+    seed[3, 1, 1, 2] = value
+    found = worlds.backward(torch.as_tensor(seed), rows)
+    for name in NAMES:
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
 def test_chunks_do_not_change_a_rollout_nor_its_gradients(scene, simulated, monkeypatch):
     import torch
 
