@@ -58,7 +58,7 @@ def test_object_from_mesh_rests_on_its_spheres_in_plain_mujoco_too(run, tmp_path
     assert data.body("ring").xpos[2] == pytest.approx(0.006, abs=2e-4)
 
 
-def test_arm_of_six_joints_is_told_that_its_tool_weighs_twice_as_much(run):
+def test_tool_of_an_arm_of_six_joints_is_found_to_weigh_twice_as_much(run):
     said = run("robots/six_joint_arm.py")
     assert min(value for (value,) in errors(said).values()) > 2
     (factor,) = re.findall(r"^mass of tool: ([\d.]+) x the model's$", said, re.MULTILINE)

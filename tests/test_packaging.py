@@ -32,7 +32,7 @@ def wheel(root: Path, rooms: dict[str, Path], tmp_path_factory: pytest.TempPathF
     return built
 
 
-def test_wheel_holds_every_file_of_the_four_rooms_under_one_name(wheel, rooms):
+def test_wheel_has_every_file_of_the_four_rooms_under_one_name(wheel, rooms):
     expected = set()
     for package, folder in rooms.items():
         for path in folder.rglob("*"):

@@ -142,7 +142,7 @@ def test_default_settings_are_those_that_are_written_down():
     assert not different, "if this is on purpose: python -m tests.test_settings"
 
 
-def test_what_holds_data_is_frozen():
+def test_what_has_data_is_frozen():
     found = dict(dataclasses_of_the_library())
     assert len(found) > 150
     loose = {name.split(".")[1] for name, kind in found.items() if not kind.__dataclass_params__.frozen}

@@ -89,7 +89,7 @@ def test_what_was_hidden_is_named_and_its_value_found(printed):
     assert any("Missing: joint_friction" in text for text in printed.values())
 
 
-def test_the_front_page_tells_the_same_figures():
+def test_the_front_page_shows_the_same_figures():
     front = (ROOT / "README.md").read_text()
     (found,) = re.findall(r"Missing: joint_friction \(torque\[hinge\] (.*? N m)\)", PAGE)
     assert f"# joint friction, {found}\n" in front

@@ -31,7 +31,7 @@ def test_cases_are_ordered_by_the_seeds_that_all_have(train_table1):
     assert "In the order found" not in apart
 
 
-def test_what_is_hidden_tells_rows_apart(train_table1):
+def test_what_is_hidden_distinguishes_rows(train_table1):
     late = [row("unaware", 6, 90, hidden=["actuator_delay=0.1"]), row("aware", 6, 150, hidden=["actuator_delay=0.1"])]
     later = [row("unaware", 6, 20, hidden=["actuator_delay=0.2"])]
     rows = [row("ours", 6, 180), *late, *later]
@@ -46,7 +46,7 @@ def test_what_is_hidden_tells_rows_apart(train_table1):
     assert "added (actuator_delay=0.1), 75.0% > ours, an effect hidden (actuator_delay=0.1), 45.0%." in text
 
 
-def test_lead_scale_and_time_of_training_tell_rows_apart(train_table1):
+def test_lead_scale_and_time_of_training_distinguish_rows(train_table1):
     rows = [row("ours", 0, 100), row("ours", 0, 120, lead=0.5), row("ours", 0, 140, seconds=150)]
     assert len({train_table1.named(one, "insert") for one in rows}) == 3
     lines = [line for line in train_table1.page(rows, "insert").splitlines() if line.startswith("| default settings")]

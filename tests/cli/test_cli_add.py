@@ -93,7 +93,7 @@ def test_the_list_has_every_effect_with_units_and_with_a_model_where_each_may_ac
         ([], "EFFECT is missing"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence_and_nothing_is_written(arguments, words, swing, tmp_path, capsys):
+def test_what_is_wrong_is_reported_in_one_sentence_and_nothing_is_written(arguments, words, swing, tmp_path, capsys):
     assert add(swing, *arguments, "-o", str(tmp_path / "m.toml")) == 2
     error = capsys.readouterr().err
     assert words in error

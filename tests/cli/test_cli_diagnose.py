@@ -49,7 +49,7 @@ def angle():
     return swung(seconds=1.0).demonstrations[0].measured["angle"]
 
 
-def test_the_verdict_is_said_in_sentences_with_a_table(swing, capsys):
+def test_the_verdict_is_reported_in_sentences_with_a_table(swing, capsys):
     assert diagnose(swing / "demo.h5", "--model", str(swing / "scene.xml")) == 0
     said = capsys.readouterr().out
     assert "An effect is missing, and the data identify it" in said
@@ -127,7 +127,7 @@ def test_without_a_checkpoint_an_interruption_says_what_would_have_helped(swing,
 
 
 @pytest.mark.parametrize("case", ["nothing measured", "one sample", "all missing", "clock backwards"])
-def test_recordings_that_say_nothing_are_an_error_of_one_line(case, tmp_path, capsys):
+def test_recordings_that_have_no_information_are_an_error_of_one_line(case, tmp_path, capsys):
     path = tmp_path / "demo.h5"
     channel = angle()
     words = "too little was measured"
@@ -151,7 +151,7 @@ def test_recordings_that_say_nothing_are_an_error_of_one_line(case, tmp_path, ca
     assert "Traceback" not in out + error
 
 
-def test_readings_that_are_all_noise_are_said_to_be_and_no_effect_explains_them(tmp_path, capsys):
+def test_readings_that_are_all_noise_are_reported_to_be_and_no_effect_explains_them(tmp_path, capsys):
     channel = angle()
     noise = np.random.default_rng(2).normal(0, 1, channel.value.shape)
     path = with_angle(tmp_path / "demo.h5", Channel(channel.time, noise, NOISE))

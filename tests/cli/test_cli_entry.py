@@ -70,7 +70,7 @@ def test_an_unknown_option_ends_with_code_2(bench, capsys):
         (["record", "--out", "new/r.h5", "--robot", "nowhere.xml"], "no such robot"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence_and_nothing_is_left_behind(
+def test_what_is_wrong_is_reported_in_one_sentence_and_nothing_is_left_behind(
     arguments, words, bench, tmp_path, monkeypatch, capsys
 ):
     for path in bench.iterdir():
@@ -100,7 +100,7 @@ def test_a_reader_that_closes_the_pipe_causes_no_traceback():
     assert done.stderr == ""
 
 
-def test_a_place_that_cannot_be_written_is_said_in_one_sentence(bench, capsys):
+def test_a_place_that_cannot_be_written_is_reported_in_one_sentence(bench, capsys):
     assert main(["geometry", str(bench / "demo.h5"), "--out", "/proc/nowhere/model.toml"]) == 2
     error = capsys.readouterr().err
     assert "/proc/nowhere" in error

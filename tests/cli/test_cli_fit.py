@@ -53,7 +53,7 @@ def test_the_resolved_settings_are_beside_the_results(run):
     assert {"concent-warp", "mujoco", "python"} <= set(document["versions"])
 
 
-def test_gradients_are_tried_and_it_is_said_whether_they_helped(bench, tmp_path, capsys):
+def test_gradients_are_tried_and_it_is_reported_whether_they_helped(bench, tmp_path, capsys):
     more = ("--method", "gradient+es", "--fit.gradient.starts", "2", "--fit.gradient.iterations", "3")
     assert fit(bench, tmp_path / "run", *more, "--fit.generations", "1") == 0
     found = json.loads((tmp_path / "run" / "history.json").read_text())

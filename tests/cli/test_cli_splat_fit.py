@@ -46,7 +46,7 @@ def test_finished_fit_is_kept_unless_asked_and_resumes_to_nothing(block, tmp_pat
     assert "other settings" in capsys.readouterr().err
 
 
-def test_what_is_no_image_folder_is_said_in_one_sentence(tmp_path, capsys):
+def test_what_is_no_image_folder_is_reported_in_one_sentence(tmp_path, capsys):
     assert main(["splat-fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
     message = capsys.readouterr().err
     assert "no posed images" in message
@@ -54,7 +54,7 @@ def test_what_is_no_image_folder_is_said_in_one_sentence(tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-def test_device_that_is_not_there_is_said_in_one_sentence(block, tmp_path, capsys):
+def test_device_that_is_not_there_is_reported_in_one_sentence(block, tmp_path, capsys):
     assert main(["splat-fit", str(block), "--out", str(tmp_path / "run"), "--device", "toaster:7"]) == 2
     message = capsys.readouterr().err
     assert "no such device" in message

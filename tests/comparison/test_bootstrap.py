@@ -37,7 +37,7 @@ def test_blocks_are_longer_for_slower_errors_and_at_most_a_quarter():
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.9])
-def test_interval_covers_the_true_mean_about_as_often_as_it_says(keep):
+def test_interval_covers_the_true_mean_about_as_often_as_stated(keep):
     rng = np.random.default_rng(3)
     hits = 0
     for _ in range(120):

@@ -130,7 +130,7 @@ def test_main_channel_is_a_body_position_before_a_joint(comparison):
     assert comparison.main_channel() == "cart"
 
 
-def test_json_is_valid_and_holds_every_channel_phase_and_model(comparison):
+def test_json_is_valid_and_has_every_channel_phase_and_model(comparison):
     document = json.loads(json.dumps(comparison.to_json(), allow_nan=False))
     keys = {(s["model"], s["channel"], s["phase"]) for s in document["summaries"]}
     assert len(keys) == 2 * 2 * 4
@@ -217,7 +217,7 @@ def test_a_summary_can_be_of_some_demonstrations(comparison):
     assert comparison.difference("rail", (), ("demo_1",)).mean < comparison.difference("rail", (), ("demo_0",)).mean < 0
 
 
-def test_without_any_stage_times_are_not_told_apart():
+def test_without_any_stage_times_are_not_distinguished():
     found = compare_replays({"m": model(2)}, recorded(model(2)), "mujoco", phases={"demo_0": ()})
     assert found.phase_names == ()
     assert found.to_json()["headline"]["phases"] == []
@@ -230,7 +230,7 @@ def test_without_stages_the_ways_of_moving_are_the_phases():
     assert found.to_json()["phases_are"] == "phases of motion"
 
 
-def test_summaries_tell_how_far_above_the_noise_the_error_is(comparison):
+def test_summaries_report_how_far_above_the_noise_the_error_is(comparison):
     wrong, right = (comparison.summarise(name, "rail") for name in ("wrong", "right"))
     assert wrong.ratio == pytest.approx(wrong.rms / wrong.noise)
     assert right.ratio == pytest.approx(1, rel=0.15)

@@ -44,21 +44,21 @@ def on_the_rim():
     return partners()
 
 
-def test_a_named_geom_and_its_side_are_told(on_the_rim):
+def test_a_named_geom_and_its_side_are_reported(on_the_rim):
     touching = on_the_rim.of("block", 0.1, 0.3)
     assert touching.names == ("box's rim (+z side)",)
     assert touching.point == pytest.approx((0, 0, -0.02), abs=1e-3)
 
 
-def test_the_other_side_of_a_contact_is_told_too(on_the_rim):
+def test_the_other_side_of_a_contact_is_reported_too(on_the_rim):
     assert on_the_rim.of("box", 0.1, 0.3).names[0].startswith("block (-z")
 
 
-def test_spheres_of_a_contact_geometry_are_told_by_their_body():
+def test_spheres_of_a_contact_geometry_are_identified_by_their_body():
     assert partners(spheres=True).of("block", 0.1, 0.3).names[0].startswith("box (")
 
 
-def test_what_falls_free_touches_nothing_and_a_brush_is_not_told():
+def test_what_falls_free_touches_nothing_and_a_brush_is_not_reported():
     falling = partners(height=0.5)
     assert falling.of("block", 0.0, 0.2) is None
     assert falling.of("block", 0.0, 0.3) is None

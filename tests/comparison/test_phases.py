@@ -129,7 +129,7 @@ class Stage(Phase):
     bodies: tuple[str, str] = ("robot", "block")
 
 
-def test_stages_tell_a_task_where_a_robot_opens_one_of_several():
+def test_stages_describe_a_task_where_a_robot_opens_one_of_several():
     pick, align = Stage("pick", 0.5, 1), Stage("align", 1, 2, ("block", "box"))
     assert has_task({"demo_0": (), "demo_1": (pick, align)})
     assert not has_task({"demo_0": (pick,)})

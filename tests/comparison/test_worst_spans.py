@@ -106,7 +106,7 @@ def test_a_diverged_replay_is_the_worst_place_and_stays_json():
     assert found[1].peak == pytest.approx(1, abs=0.03)
 
 
-def test_without_known_noise_a_place_is_told_in_units():
+def test_without_known_noise_a_place_is_reported_in_units():
     exact = replace(residual(bump(1, 0.1, 0.02)), noise=None, std=None)
     place = next(_channel_spans(exact, (), None, "d", CFG))
     assert place.ratio is None

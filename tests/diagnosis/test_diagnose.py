@@ -49,7 +49,7 @@ def test_rejected_effects_come_with_a_reason(found):
     assert {f.step for f in rejected} <= {0, 1}
 
 
-def test_a_model_that_lacks_nothing_is_told_so_with_what_would_have_been_seen():
+def test_a_complete_model_is_reported_with_what_would_have_been_detected():
     recording = swung(damping=0.0)
     found = diagnose(drawing(recording), recording, CFG)
     assert found.verdict == "none_needed"
@@ -95,7 +95,7 @@ def test_one_sample_is_an_error():
 
 
 @pytest.mark.parametrize("stated", [True, False])
-def test_readings_that_are_all_noise_are_said_to_be(stated):
+def test_readings_that_are_all_noise_are_reported_to_be(stated):
     recording = swung()
     channel = recording.demonstrations[0].measured["angle"]
     value = np.random.default_rng(5).normal(0, 1.0, channel.value.shape)

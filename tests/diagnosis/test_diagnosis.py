@@ -71,13 +71,13 @@ def test_nothing_found_comes_with_what_would_have_been_seen():
     assert "joint_friction 0.002 N m" in said[1]
 
 
-def test_what_no_effect_explains_is_said_with_its_share():
+def test_what_no_effect_explains_is_reported_with_its_share():
     said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment=EXPERIMENT).sentences()
     assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
     assert said[-1] == "Next experiment: swing faster: a and b then differ by 4.0 x noise (angle)."
 
 
-def test_the_headline_tells_of_effects_beside_what_none_explains():
+def test_the_headline_names_effects_beside_what_none_explains():
     assert diagnosis().headline == VERDICTS["effect"]
     assert diagnosis(verdict="none_of_these", effects=()).headline == VERDICTS["none_of_these"]
     partly = diagnosis(verdict="none_of_these").headline
@@ -88,7 +88,7 @@ def test_doubts_about_the_data_come_first():
     assert diagnosis(issues=("a gap of 1 s.",)).sentences()[0] == "a gap of 1 s."
 
 
-def test_json_holds_plain_types_and_no_infinity():
+def test_json_has_plain_types_and_no_infinity():
     found = diagnosis(effects=(finding("actuator_saturation", 0.5, parameters=(LIMIT,)),), versions={"concent": "1"})
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
     (parameter,) = document["effects"][0]["parameters"]

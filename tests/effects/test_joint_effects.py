@@ -63,7 +63,7 @@ def test_stribeck_friction_holds_at_rest_and_fades_with_speed():
     np.testing.assert_allclose([cart.qpos[-1, 0], cart.qvel[-1, 0]], expected, rtol=1e-3)
 
 
-def test_stribeck_friction_slows_a_cart_as_its_law_says_and_not_with_a_lag():
+def test_stribeck_friction_slows_a_cart_as_its_formula_predicts_and_not_with_a_lag():
     """Where friction falls with speed, a lag of half a step grows from slip to slip."""
     cart = move(world(CART, Stribeck("rail"), 4.0, 0.3), 0.12, qvel=[0.3])
 

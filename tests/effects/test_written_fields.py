@@ -121,7 +121,7 @@ def test_delay_interpolates_what_was_commanded_before(delay):
     assert late is not ctrl
 
 
-def test_delay_and_lag_are_told_for_their_actuators():
+def test_delay_and_lag_are_reported_for_their_actuators():
     for values in ([0.02], [-0.02]):
         expected = [max(values[0], 0.0), 0.0, max(values[0], 0.0)]
         delay, none = ActuatorDelay("c", "a").delay_and_lag(compiled(), np.array(values))

@@ -91,14 +91,14 @@ def test_a_slow_creep_is_not_rest():
     assert noise.std == pytest.approx(STD, rel=0.3)
 
 
-def test_exact_readings_say_nothing_of_the_noise():
+def test_exact_readings_have_no_information_about_the_noise():
     assert channel_noise(Channel(TIME, np.zeros((len(TIME), 1))), "joint").source == "unknown"
     assert (
         channel_noise(Channel(TIME, 1 + 1e-16 * moving(np.random.default_rng(6), white)), "joint").source == "unknown"
     )
 
 
-def test_gaps_are_bridged_and_too_few_readings_say_nothing():
+def test_gaps_are_bridged_and_too_few_readings_have_no_information():
     rng = np.random.default_rng(5)
     value = moving(rng, white)
     value[::10] = np.nan

@@ -33,7 +33,7 @@ def test_the_same_demonstration_gives_the_same_bytes(task: Task, insertion: Cont
     assert extract(task.model, demonstration, fresh).to_json() == insertion.to_json()
 
 
-def test_the_file_says_what_it_is_and_holds_no_negative_zero(saved: Path):
+def test_the_file_says_what_it_is_and_has_no_negative_zero(saved: Path):
     document = json.loads(saved.read_text())
     assert (document["format"], document["version"]) == ("concent-events", 1)
     assert "-0.0," not in saved.read_text()

@@ -150,7 +150,7 @@ def test_a_recording_that_observes_nothing_is_refused(drop, swollen):
         fit_geometry(swollen, blind, CFG)
 
 
-def test_spheres_are_laid_on_the_objects_of_a_model_without_any(drop, swollen):
+def test_spheres_are_placed_on_the_objects_of_a_model_without_any(drop, swollen):
     bare = swollen.with_geometry(None)
     start = ContactGeometryCfg(count=24, candidates=500)
     found = fit_geometry(bare, drop, replace(CFG, generations=1), start=start, engine="mujoco")

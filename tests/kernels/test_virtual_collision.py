@@ -237,7 +237,7 @@ def test_sphere_deep_inside_is_seen_though_it_is_small(device):
     assert collision.severe.numpy()[0] == 1
 
 
-def test_inside_of_overlapping_plates_and_their_hole_are_told_apart():
+def test_inside_of_overlapping_plates_and_their_hole_are_distinguished():
     plates = [trimesh.creation.box(2 * np.array(half)).apply_translation(centre) for centre, half in PLATES]
     rng = np.random.default_rng(3)
     points = rng.uniform((-0.05, -0.05, -0.01), (0.05, 0.05, 0.04), (3000, 3)).astype(np.float32).astype(float)

@@ -118,7 +118,7 @@ def test_weights_of_drives_are_shares_of_the_strongest_and_grippers_are_left_out
 
 
 @pytest.mark.parametrize("name", sorted(MAGNITUDES))
-def test_every_sized_effect_can_be_built_into_its_rig_and_tells_the_truth(name: str):
+def test_every_sized_effect_can_be_built_into_its_rig_and_reports_its_truth(name: str):
     rig: Rig = RIGS[name]
     for effect, values in MAGNITUDES[name].items():
         made = hidden(effect, values[1], rig)

@@ -90,7 +90,7 @@ def test_torsional_friction_stops_a_spin_after_its_torque():
 
 
 @pytest.mark.parametrize(("name", "factor"), [("mass", 1.4), ("inertia", 1.4)])
-def test_mass_and_inertia_scale_what_they_say(name: str, factor: float):
+def test_mass_and_inertia_scale_what_they_name(name: str, factor: float):
     rig = RIGS["tumble"]
     drawn, world = rig.world().compile(), rig.world([hidden(name, factor, rig).effect]).compile()
     box = drawn.body("box").id

@@ -39,7 +39,7 @@ def test_photographs_show_one_object_with_its_pattern_from_all_sides(taken):
         assert not image[..., 3][[0, -1]].any()
 
 
-def test_noise_is_drawn_from_the_seed(world, taken):
+def test_noise_is_sampled_from_the_seed(world, taken):
     noisy = PhotographsCfg(count=6, size=48, rgb_std=4.0)
     first, again, other = (photographs(world, "block", noisy, seed=seed).rgba for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)

@@ -54,7 +54,7 @@ def test_expert_puts_the_block_into_the_hole_on_every_seed(shown):
 @pytest.mark.parametrize(
     ("effect", "magnitude"), [("backlash", 0.005), ("joint_compliance", 0.003), ("gravity_compensation", -0.2)]
 )
-def test_expert_succeeds_with_drives_that_are_not_as_drawn_and_starts_at_rest(shown, effect, magnitude):
+def test_expert_succeeds_with_drives_that_are_not_nominal_and_starts_at_rest(shown, effect, magnitude):
     cfg, plain, _ = shown
     world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, ((effect, magnitude),))
     recording, truths = record(cfg, [0], effects=tuple(one.effect for one in world.hidden()))

@@ -41,7 +41,7 @@ def test_channels_have_clocks_of_their_own_and_tell_their_noise():
     assert all(channel.noise_std for channel in measured.values())
 
 
-def test_noise_has_the_std_that_it_tells():
+def test_noise_has_the_stated_std():
     instrument = Instrument(100.0, 3e-3, 1e-3)
     time = np.arange(40000) / 100
     noise = instrument.noise(time, 3, np.random.default_rng(0))

@@ -28,7 +28,7 @@ SCRIPT = """
 
 @pytest.mark.parametrize("size", [0, 1, 500, 2_000, 8_000, 20_000])
 @pytest.mark.parametrize("old", [True, False])
-def test_a_full_disk_is_said_in_one_sentence_and_leaves_the_old_file(tmp_path, recording, size, old):
+def test_a_full_disk_is_reported_in_one_sentence_and_leaves_the_old_file(tmp_path, recording, size, old):
     source, out = tmp_path / "source.h5", tmp_path / "out" / "recording.h5"
     out.parent.mkdir()
     write_hdf5(recording, source)

@@ -8,7 +8,7 @@ from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 
 
-def test_the_kind_is_told_from_the_path(tmp_path, recording):
+def test_the_kind_follows_from_the_path(tmp_path, recording):
     import torch
 
     rows = torch.zeros(5, 13)

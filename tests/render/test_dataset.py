@@ -129,7 +129,7 @@ def test_data_set_grows_after_it_was_finished(tmp_path):
     check(tmp_path / "LeRobotWriter", [0, 1, 2, 3])
 
 
-def test_robomimic_file_holds_every_frame_exactly(tmp_path):
+def test_robomimic_file_has_every_frame_exactly(tmp_path):
     writer = RobomimicWriter(tmp_path, LAYOUT)
     write(writer, range(3))
     writer.finish()
@@ -163,7 +163,7 @@ def test_robomimic_rewards_no_failure(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_video_that_nobody_wants_is_closed_without_a_fuss(tmp_path, count):
+def test_video_without_a_reader_is_closed_without_an_error(tmp_path, count):
     video = VideoWriter(tmp_path / "film.mp4", 10, LAYOUT.size)
     for t in range(count):
         video.add(frame(0, t)[0]["base"])

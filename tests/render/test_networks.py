@@ -133,7 +133,7 @@ def test_images_of_another_size_are_refused():
         RenderTraining([pairs()], replace(CFG, network=replace(SMALL, size=32)))
 
 
-def test_networks_that_are_not_there_or_broken_are_said_in_a_sentence(tmp_path):
+def test_networks_that_are_not_there_or_broken_are_reported_in_a_sentence(tmp_path):
     with pytest.raises(RenderError, match="no trained networks"):
         Painter.load(tmp_path)
     (tmp_path / "checkpoint.pt").write_bytes(b"no networks")

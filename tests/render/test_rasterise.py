@@ -78,7 +78,7 @@ def test_worlds_are_rendered_as_alone(pair):
             torch.testing.assert_close(one[0], of_many[world], rtol=0, atol=0)
 
 
-def test_room_is_measured_at_first_and_want_of_it_is_said():
+def test_room_is_measured_at_first_and_lack_of_it_is_reported():
     objects, camera = poses((0.0, 0, 0))[None], poses((0.0, 0, 0.4))
     rasteriser = Rasteriser([ball([1.0, 0, 0])], 64, 64, capacity=50)
     rasteriser.render(objects, camera, intrinsics_of(10.0, 64, 64))

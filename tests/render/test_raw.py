@@ -127,7 +127,7 @@ def test_wrist_camera_moves_with_the_hand_and_poses_are_those_of_mujoco(sorter):
         assert min(np.abs(pose[3:] - expected).max(), np.abs(pose[3:] + expected).max()) < 1e-4
 
 
-def test_camera_that_is_not_there_is_said_in_one_sentence(sorter):
+def test_camera_that_is_not_there_is_reported_in_one_sentence(sorter):
     with pytest.raises(RenderError, match=r"no such camera.*base.*found \['side'\]"):
         RawCamera(PosedWorlds(sorter[0], 1), ["side"], SIZE)
     with pytest.raises(SceneError, match="no such camera"):

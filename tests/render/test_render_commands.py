@@ -111,7 +111,7 @@ def test_data_set_is_gone_on_with(folder, capsys):
         (("--recording", "held.h5", "--networks", "net", "--size", "96"), "images of another size"),
     ],
 )
-def test_what_cannot_be_rendered_is_said_in_one_sentence(folder, options, said, monkeypatch, capsys):
+def test_what_cannot_be_rendered_is_reported_in_one_sentence(folder, options, said, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main(["render", "--out", "bad", "--device", "cpu", *options]) == 2
     lines = capsys.readouterr().err.strip().splitlines()

@@ -61,7 +61,7 @@ def test_what_stands_before_the_table_hides_the_shadow_and_the_table_does_not():
     assert not shadows.render(pose, ABOVE, INTRINSICS, table - 0.1).any()
 
 
-def test_lights_of_new_episodes_are_drawn_and_others_stay():
+def test_lights_of_new_episodes_are_sampled_and_others_stay():
     shadows = Shadows([ball(50)], 16, 16, 4, generator=torch.Generator().manual_seed(3))
     before = shadows.directions.clone(), shadows.strengths.clone()
     shadows.sample_lights(torch.tensor([True, False, True, False]))
@@ -72,7 +72,7 @@ def test_lights_of_new_episodes_are_drawn_and_others_stay():
     assert torch.equal(again.directions, before[0])
 
 
-def test_drawn_lights_keep_within_their_bounds():
+def test_sampled_lights_keep_within_their_bounds():
     shadows = Shadows([ball(50)], 16, 16, 500, cfg=ShadowCfg(elevation=(40.0, 60.0), strength=(0.2, 0.3)))
     elevation = torch.rad2deg(torch.asin(-shadows.directions[..., 2]))
     assert 40 <= elevation.min() < 42

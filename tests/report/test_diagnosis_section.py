@@ -69,7 +69,7 @@ def test_a_group_is_never_told_as_one_winner():
 @pytest.mark.parametrize(
     ("verdict", "said"), [("none_needed", "No discrepancy was detected"), ("none_of_these", "none of the effects")]
 )
-def test_no_effect_is_said_in_words(verdict, said):
+def test_no_effect_is_reported_in_words(verdict, said):
     section = diagnosis_section({"verdict": verdict, "effects": [], "detectable": NAMED["detectable"]})
     assert said in words_of(section)
     assert ("<details open>" in section) == (verdict == "none_needed")

@@ -115,7 +115,7 @@ def test_the_schedule_is_that_of_the_events(case, data):
         assert bars == expected
 
 
-def test_the_replay_holds_simulated_and_measured_poses_at_the_same_times(case, data):
+def test_the_replay_has_simulated_and_measured_poses_at_the_same_times(case, data):
     d = data["demonstrations"][0]
     names = [body["name"] for body in data["bodies"]]
     time = unpacked(d["motion"]["time"])
@@ -183,7 +183,7 @@ def test_a_place_points_from_the_model_to_the_measurement(case, data):
         assert p["arrow"] == pytest.approx(r.value[rows].mean(axis=0), abs=5e-4)
 
 
-def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
+def test_a_model_as_good_as_the_noise_is_reported_to_be_so(tmp_path):
     m = Scene(PENDULUM).model
     d = mujoco.MjData(m)
     d.qpos[0] = 1
@@ -203,7 +203,7 @@ def test_a_model_as_good_as_the_noise_is_said_to_be_so(tmp_path):
     assert embedded(tmp_path / "r.html")["places"] == []
 
 
-def test_unexplained_forces_are_told_and_drawn_where_there_are_any(case, text, data, tmp_path):
+def test_unexplained_forces_are_reported_and_drawn_where_there_are_any(case, text, data, tmp_path):
     assert "at its &lt;-x&gt; face" in text
     assert [f["label"] for f in data["forces"]] == ["0.412 N, slide"]
     assert 'id="forces-view"' in text
@@ -217,7 +217,7 @@ def test_unexplained_forces_are_told_and_drawn_where_there_are_any(case, text, d
     assert 'id="lacking"' not in (tmp_path / "r.html").read_text()
 
 
-def test_spheres_are_told_apart_by_what_became_of_them(case, data):
+def test_spheres_are_distinguished_by_what_became_of_them(case, data):
     geometry = data["geometry"]
     state = np.array(geometry["state"])
     assert (state == "moved").sum() == case.moved

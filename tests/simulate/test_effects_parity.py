@@ -132,7 +132,7 @@ def test_every_effect_changes_the_motion_alike_on_a_gpu(names):
     assert_parity(*all_at_once("cuda:0", names))
 
 
-def test_engines_agree_on_a_model_that_holds_many_effects():
+def test_engines_agree_on_a_model_that_has_many_effects():
     model = Model(Scene(SCENE))
     for cls in [effect_classes()[name] for name in ON_MOTION]:
         targets = cls.targets(model.compile())

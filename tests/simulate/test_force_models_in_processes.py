@@ -49,7 +49,7 @@ def test_few_steps_stay_where_they_are(monkeypatch):
     assert not run(3).diverged.any()
 
 
-def test_an_error_in_another_process_is_told_as_here(monkeypatch):
+def test_an_error_in_another_process_is_reported_as_here(monkeypatch):
     monkeypatch.setattr(mujoco_engine, "MIN_STEPS", 1)
     effect = effect_class("load_friction")("hinge")
     engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3)

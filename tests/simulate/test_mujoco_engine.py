@@ -68,7 +68,7 @@ def test_what_does_not_vary_is_the_models_own_after_a_run_that_varied_it(model, 
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
-def test_record_holds_what_follows_from_its_own_state(integrator, ctrl):
+def test_record_has_what_follows_from_its_own_state(integrator, ctrl):
     engine = MujocoEngine(make_model(integrator))
     rollout = engine.run(Variants(1), ctrl, contacts="all")
     m = engine.compiled

@@ -68,7 +68,7 @@ def test_geoms_that_touched_are_the_same_in_both_engines(engine, warp_engine, ct
     np.testing.assert_array_equal(touched, engine.run(variants, ctrl, contacts="touched", record=[]).touched)
 
 
-def test_record_holds_what_follows_from_its_own_state(warp_engine, ctrl):
+def test_record_has_what_follows_from_its_own_state(warp_engine, ctrl):
     rollout = warp_engine.run(Variants(1), ctrl).numpy()
     m = warp_engine.compiled
     for row in (0, 3, 60, 120, STEPS):

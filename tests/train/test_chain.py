@@ -198,7 +198,7 @@ def test_saved_chain_is_gone_on_with_exactly(chain, drawn):
         environment.restore(state)
 
 
-def test_evaluation_tells_how_many_targets_were_met_in_order(chain):
+def test_evaluation_reports_how_many_targets_were_met_in_order(chain):
     cfg = replace(CHAIN, worlds=4, reset=replace(CHAIN.reset, free=1.0, place=(0.0, 0.0)))
     states = sample_reset_states(chain, cfg.reset, 0, count=6)
     environment = make_environment(chain, cfg, states, device="cpu")
@@ -211,7 +211,7 @@ def test_evaluation_tells_how_many_targets_were_met_in_order(chain):
     assert "in order: pick 66.7%, align 66.7%, insert 66.7%" in found.sentence()
 
 
-def test_single_stage_knows_no_chain():
+def test_single_stage_has_no_chain():
     task = make_task(SETTINGS)
     assert task.demonstrated is None
     assert task.chained == (task.stage,)

@@ -135,7 +135,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(trained, tmp_path, caps
 
 
 @commands
-def test_weights_of_another_shape_are_said_in_one_sentence(trained, tmp_path, capsys, command):
+def test_weights_of_another_shape_are_reported_in_one_sentence(trained, tmp_path, capsys, command):
     run = copied(trained, tmp_path)
 
     def narrow(document):

@@ -66,7 +66,7 @@ def test_commands_are_followed_as_the_effects_have_it(delayed_task):
         np.testing.assert_allclose(torch.cat(acted)[:-1, world], expected[:-1], atol=2e-6)
 
 
-def test_worlds_that_begin_anew_forget_what_was_commanded(delayed_task):
+def test_worlds_that_begin_anew_clear_what_was_commanded(delayed_task):
     lag = np.full((2, delayed_task.compiled.nu), 0.1)
     follower = CommandFilter(CommandDynamics(lag, (lag,)), 0.005, DECIMATION, "cpu")
     old, new = torch.zeros(2, delayed_task.compiled.nu), torch.ones(2, delayed_task.compiled.nu)
@@ -106,7 +106,7 @@ def test_each_world_moves_by_its_own_delay_and_lag(delayed_task, engine):
     np.testing.assert_allclose(physics.qpos.numpy(), expected, rtol=0, atol=2e-6 if engine == "mujoco" else 2e-4)
 
 
-def test_saved_state_holds_what_was_commanded(delayed_task, states):
+def test_saved_state_has_what_was_commanded(delayed_task, states):
     cfg = replace(SETTINGS, worlds=3, randomisation=RandomisationCfg(delay=(0.05, 0.1), lag=(0.0, 0.05)))
     environment = make_environment(delayed_task, cfg, states, device="cpu")
     act = torch.ones(3, environment.num_actions)
@@ -124,7 +124,7 @@ def test_saved_state_holds_what_was_commanded(delayed_task, states):
     torch.testing.assert_close(environment.step(0 * act)[0]["policy"], again, rtol=0, atol=0)
 
 
-def test_drawn_delay_is_of_the_arm_alone(task):
+def test_sampled_delay_is_of_the_arm_alone(task):
     cfg = replace(SETTINGS, worlds=4, randomisation=RandomisationCfg(delay=(0.05, 0.05)), decimation=2)
     physics = _make_physics(task, cfg, device="cpu")
     physics.qpos[:] = torch.as_tensor(task.replay.qpos[0])

@@ -74,7 +74,7 @@ def test_nothing_is_drawn_where_it_is_not_wanted_or_not_known(varied):
     assert not unknown.fields
 
 
-def test_fields_are_those_of_models_with_the_drawn_values(varied):
+def test_fields_are_those_of_models_with_the_sampled_values(varied):
     found = sample_world_effects(varied, WORLDS, 0, sample=True)
     assert set(found.fields) >= {"dof_damping", "body_mass"}
     for world in range(WORLDS):

@@ -221,7 +221,7 @@ def test_randomised_fields_differ_between_worlds_and_are_used(task):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_drawn_joint_friction_holds_the_arm(task, engine):
+def test_sampled_joint_friction_holds_the_arm(task, engine):
     cfg = replace(SETTINGS.randomisation, joint_friction=(50.0, 60.0))
     moved = []
     for randomisation in (SETTINGS.randomisation, cfg):

@@ -27,7 +27,7 @@ def acted(environment: Environment) -> torch.Tensor:
 
 @pytest.mark.parametrize("force_model", [False, True])
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_wrench_moves_the_body_that_it_acts_on_as_newton_says(task, engine, force_model):
+def test_wrench_moves_the_body_that_it_acts_on_as_newton_predicts(task, engine, force_model):
     m, body, steps = task.compiled, task.objects[0], 5
     effect = effect_class("stribeck_friction")(m.joint(int(task.robot.joint[0])).name)
     acting = effect.force_model(m)

@@ -117,6 +117,6 @@ def test_folders_are_replaced_only_on_demand_and_only_such(folder, tmp_path, cap
         (["--pretrained", "dishwasher"], "no such policy comes with the package; expected one of ['pick_align_insert'"),
     ],
 )
-def test_policy_that_is_not_told_apart_is_refused(options, sentence, capsys):
+def test_policy_that_is_not_distinguished_is_refused(options, sentence, capsys):
     assert main(["evaluate", *options]) == 2
     assert sentence in capsys.readouterr().err

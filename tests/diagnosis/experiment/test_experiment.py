@@ -84,7 +84,7 @@ def frictions() -> dict[str, Model]:
     }
 
 
-def test_frictions_alike_at_one_speed_are_told_apart_by_another():
+def test_frictions_alike_at_one_speed_are_distinguished_by_another():
     recording = one_speed()
     found = suggest_experiment(frictions(), recording)
     assert found is not None
@@ -108,7 +108,7 @@ def test_sentence_says_what_to_do_and_by_how_much_hypotheses_differ():
     assert found.sentence.endswith(" noise (rail position).")
 
 
-def test_friction_of_a_twist_is_told_from_sliding_friction_by_a_spin():
+def test_friction_of_a_twist_is_distinguished_from_sliding_friction_by_a_spin():
     plain = Model(Scene(BLOCK))
     m = plain.compile()
     twist = TorsionalFriction("block")
@@ -124,12 +124,12 @@ def test_friction_of_a_twist_is_told_from_sliding_friction_by_a_spin():
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_hypotheses_that_predict_the_same_are_not_told_apart(count):
+def test_hypotheses_that_predict_the_same_are_not_distinguished(count):
     model = Model(Scene(CART)).add(JointFriction("rail"), [0.5])
     assert suggest_experiment({f"h{k}": model for k in range(count)}, one_speed()) is None
 
 
-def test_slope_is_told_from_a_throw_the_other_way_round():
+def test_slope_is_distinguished_from_a_throw_the_other_way_round():
     plain = Model(Scene(BLOCK))
     tilt = plain.add(GravityTilt(), [0.0, 0.02])
     friction = plain.add(SlidingFriction("block"), [0.3 + 0.02])

@@ -419,7 +419,7 @@ def test_trajectories_of_drives_have_their_parts_in_units_of_their_ranges():
         assert (motion.qvel == 0).all()
 
 
-def test_a_single_drive_is_told_with_its_range_and_speeds():
+def test_a_single_drive_is_reported_with_its_range_and_speeds():
     known = bench(turning=False)
     drives = Drives.of(known)
     assert drives is not None

@@ -243,7 +243,7 @@ BODIES = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body name="fix
   <body name="slider"><joint type="slide"/><geom size=".1"/></body><body name="frame"/></worldbody></mujoco>"""
 
 
-def test_robots_are_told_from_free_and_fixed_bodies():
+def test_robots_are_distinguished_from_free_and_fixed_bodies():
     m = mujoco.MjModel.from_xml_string(BODIES)
     moved = {m.body(b).name for b in range(1, m.nbody) if _moved_by_joints(m, b)}
     assert moved == {"link", "tip", "slider"}

@@ -66,7 +66,7 @@ def test_force_of_a_joint_is_the_friction_at_each_time(rubbing):
     ],
     ids=["viscous", "constant", "weaker drive"],
 )
-def test_what_a_force_depends_on_is_told_with_its_size(torque, feature, slope):
+def test_what_a_force_depends_on_is_reported_with_its_size(torque, feature, slope):
     pattern = located(swing(torque, rate=True)).joints[0].dependences.patterns[0]
     assert pattern.feature == feature
     assert pattern.slope == pytest.approx(slope, rel=0.1)
@@ -97,7 +97,7 @@ def test_arrows_are_in_the_frame_of_the_body(pushed_in_flight):
     assert angle_between(np.array(arrow["vector"]), FORCE) < 3
 
 
-def test_push_on_a_sliding_block_is_found_on_its_face_and_its_height_is_not_told():
+def test_push_on_a_sliding_block_is_found_on_its_face_and_its_height_is_not_reported():
     phase = of(located(throw((-0.4, 0, 0), (0.045, 0.012, 0.0), speed=1.2), LocateForcesCfg()).bodies[0], "slide")
     assert phase.significant
     assert phase.frame == "block"
@@ -131,7 +131,7 @@ def test_without_anything_hidden_a_block_shows_no_force():
     assert all(body.ratio < 1.5 for body in found)
 
 
-def test_nothing_found_is_said_with_what_would_have_been_seen():
+def test_nothing_found_is_reported_with_what_would_have_been_seen():
     found = located(swing(lambda _: 0.0, duration=2))
     assert found.arrows() == []
     assert "no more than noise; smallest detectable steady force:" in found.sentences()[0]

@@ -88,7 +88,7 @@ def test_too_few_blocks_test_nothing():
     assert found.p == 1
 
 
-def test_windows_that_tell_nothing_are_left_out():
+def test_windows_that_have_no_information_are_left_out():
     rng = np.random.default_rng(6)
     table = features(rng)
     force = table["speed"] + 0.1 * rng.standard_normal((K, 1))

@@ -121,7 +121,7 @@ def test_without_orientation_the_force_is_known_and_the_torque_is_not():
     assert np.isnan(found.force[:, 3:]).all()
 
 
-def test_windows_with_too_few_readings_tell_nothing():
+def test_windows_with_too_few_readings_have_no_information():
     recording = swing(lambda _: 0.0, duration=2)
     channel = recording[0].measured["angle"]
     kept = (channel.time < 0.8) | (channel.time > 1.2)

@@ -291,13 +291,13 @@ def test_a_push_is_placed_where_its_line_meets_the_face_that_it_presses():
     np.testing.assert_allclose(pull.point, [-0.03, 0.025, -0.005], atol=2e-3)
 
 
-def test_a_push_through_the_centre_of_mass_is_said_to_be():
+def test_a_push_through_the_centre_of_mass_is_reported_to_be():
     found, _ = placed([0.05, 0.0, 0.0], [-1.0, 0, 0])
     assert found is not None
     assert found.through_center
 
 
-def test_a_line_that_misses_the_body_is_said_by_how_much():
+def test_the_distance_of_a_line_that_misses_the_body_is_reported():
     found, _ = placed([0.0, 0.0, 0.08], [-1.0, 0, 0])
     assert found is not None
     low, high = np.array([-0.03, -0.03, -0.02]), np.array([0.05, 0.03, 0.02])

@@ -48,7 +48,7 @@ def test_effects_asked_for_are_the_only_ones():
         candidates(cube, set(), ["air_drga"])
 
 
-def test_labels_tell_apart_what_shares_a_name():
+def test_labels_distinguish_what_shares_a_name():
     friction = effect_class("joint_friction")
     one, other, world = friction("a"), friction("b", "c"), effect_class("air_drag")()
     assert label(one, [one, world]) == "joint_friction"

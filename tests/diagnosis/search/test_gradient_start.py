@@ -104,7 +104,7 @@ def test_factors_are_turned_into_the_values_of_effects():
         np.testing.assert_allclose(_scaled(effect, np.array(null), _factor_of(effect, found)), value)
 
 
-def test_what_gradients_cannot_do_is_said_before_anything_is_fitted(slid):
+def test_what_gradients_cannot_do_is_reported_before_anything_is_fitted(slid):
     model, recording = slid
 
     def never(*said):

@@ -102,7 +102,7 @@ def test_held_out_errors_of_many_samples_are_those_of_each():
             assert held.own()[b] == pytest.approx(expected)
 
 
-def test_the_prior_holds_what_is_not_determined():
+def test_the_prior_determines_what_the_data_do_not():
     sums, blocks, _ = random_sums(6, 1)
     weak = Sums(sums.normal * 1e-3, sums.slope, sums.square)
     found = HeldOut(weak, blocks).own()
@@ -139,7 +139,7 @@ def test_fourteen_signs_are_enumerated_and_fifteen_are_sampled():
 
 
 @pytest.mark.parametrize("demonstrations", [7, 8, 9])
-def test_the_bootstrap_draws_blocks_or_eight_demonstrations_and_more(demonstrations):
+def test_the_bootstrap_resamples_blocks_or_eight_demonstrations_and_more(demonstrations):
     rng = np.random.default_rng(demonstrations)
     count = 3 * demonstrations
     gain, error = rng.normal(1, 1, count), rng.uniform(1, 3, count)

@@ -115,7 +115,7 @@ def test_the_interval_of_an_even_gain_is_a_point_and_widens_with_scatter():
     assert 0.2 < high - low < 0.7  # 4 x 0.5 / sqrt(20) = 0.45
 
 
-def test_where_there_are_demonstrations_enough_whole_ones_are_drawn():
+def test_where_there_are_demonstrations_enough_whole_ones_are_resampled():
     rng = np.random.default_rng(0)
     gain = np.repeat(rng.normal(1, 1, 8), 5)  # equal within each demonstration
     group = np.repeat(np.arange(8), 5)

@@ -57,7 +57,7 @@ def test_where_it_does_not_all_is_simulated(windows):
     np.testing.assert_array_equal(found, prediction.residuals([trial])[0])
 
 
-def test_what_is_not_hoped_for_is_not_tried(windows):
+def test_what_may_not_fade_is_not_tested(windows):
     prediction = prediction_of(windows, STRONG)
     _, faded, _, _ = near(prediction, hoped=False)
     assert not faded

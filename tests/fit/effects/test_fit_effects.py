@@ -36,7 +36,7 @@ def test_values_and_intervals_are_in_the_model_and_survive_saving(recording, tmp
     assert added.intervals == ((damping.low, damping.high),)
 
 
-def test_the_fall_of_the_error_is_told_by_channel(recording):
+def test_the_fall_of_the_error_is_reported_by_channel(recording):
     fitted = fit_effects(model_with(recording, "joint_damping"), recording)
     assert fitted.before > 3
     assert fitted.after == pytest.approx(1.0, abs=0.1)
@@ -54,7 +54,7 @@ def test_a_fit_that_begins_at_the_noise_is_not_said_to_have_failed(recording):
         model = fitted.model
 
 
-def test_intervals_cover_the_truth_about_as_often_as_they_say():
+def test_intervals_cover_the_truth_about_as_often_as_stated():
     covered = []
     for seed in range(12):
         recording = swung(seconds=1.0, seed=seed)
@@ -63,7 +63,7 @@ def test_intervals_cover_the_truth_about_as_often_as_they_say():
     assert sum(covered) >= 9  # of 12 at 95 %; fewer than 9 has a chance of 1 in 5000
 
 
-def test_an_effect_that_is_not_needed_is_said_to_do_nothing(recording):
+def test_an_effect_that_is_not_needed_is_reported_to_do_nothing(recording):
     fitted = fit_effects(model_with(recording, "joint_damping", "joint_friction"), recording)
     damping, friction = (group[0] for group in fitted.parameters)
     assert damping.excludes_null
@@ -71,7 +71,7 @@ def test_an_effect_that_is_not_needed_is_said_to_do_nothing(recording):
     assert "joint_friction may be absent: within its interval it does nothing." in fitted.remarks
 
 
-def test_what_the_recording_says_nothing_about_is_named(recording):
+def test_what_the_recording_does_not_determine_is_named(recording):
     model = model_with(recording, "joint_damping", "actuator_saturation")
     fitted = fit_effects(model, recording)
     limit = fitted.parameters[1][0]

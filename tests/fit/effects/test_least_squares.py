@@ -31,7 +31,7 @@ def test_an_effect_that_is_not_there_stays_near_its_null_value():
     assert abs(fit.values[0]) < 0.02 * DAMPING
 
 
-def test_two_effects_at_once_are_told_apart():
+def test_two_effects_at_once_are_distinguished():
     fit = solver_for(swung(), "joint_damping", "armature").fit()
     assert fit.values[0] == pytest.approx(DAMPING, rel=0.03)
     assert abs(fit.values[1]) < 5e-5

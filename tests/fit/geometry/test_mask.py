@@ -27,7 +27,7 @@ def test_a_finger_coupled_by_an_equality_belongs_to_the_robot():
     assert robot_bodies(spec.compile()).tolist() == [False, True, True, False]
 
 
-def test_touched_spheres_are_told_apart_by_what_they_touched():
+def test_touched_spheres_are_distinguished_by_what_they_touched():
     sphere_geom = np.array([2, 3, -1])
     robot = np.array([False, True, False])
     touched = np.zeros((4, 3), dtype=bool)

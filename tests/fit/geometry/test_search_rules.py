@@ -117,7 +117,7 @@ def test_an_entry_without_candidates_tells_the_estimate(swollen, segment):
         (False, True, np.sqrt(2e-3 * 8e-3) / 6),
     ],
 )
-def test_the_first_step_is_as_long_as_the_distance_asks_for(swollen, segment, squared, helped, sigma):
+def test_the_first_step_is_as_long_as_the_distance_requires(swollen, segment, squared, helped, sigma):
     cfg = replace(CFG, squared=squared, evolution=replace(CFG.evolution, max_sigma=1.0))
     search = written(swollen, segment, cfg, surveys=[(3e-3, 3e-3)] * 3)
     if helped is not None:
@@ -266,7 +266,7 @@ def test_free_bodies_start_a_little_elsewhere():
     assert search.jittered(segments) is segments
 
 
-def test_progress_tells_the_time_left(swollen, segment):
+def test_progress_reports_the_time_left(swollen, segment):
     search = written(swollen, segment, replace(CFG, generations=10))
     search.history = [{"loss": 5.0}, {"loss": 2.0}]
     search.seconds, search.evolution.generation, search.best, search.simulations = 6.0, 4, 0.5, 77

@@ -366,7 +366,7 @@ def test_gradients_have_to_gain_a_twentieth(gradients, after, helped):
     del gradients
 
 
-def test_distances_and_seconds_are_told_as_they_are(gradients):
+def test_distances_and_seconds_are_reported_as_they_are(gradients):
     searched = Searched()
     found = warm(searched, GradientCfg(iterations=2))
     found.before, found.begun = 4.0, found.begun - 7.0
@@ -404,7 +404,7 @@ def test_a_descent_ends_early_where_its_first_iterates_are_no_better(gradients, 
     assert len(last.losses) == 3
 
 
-def test_what_newton_cannot_simulate_is_said_once(gradients):
+def test_what_newton_cannot_simulate_is_reported_once(gradients):
     for error in (EngineError("too stiff.", where="block"), ModelError("a mesh")):
         gradients["refuse"] = error
         result = warm().run(None, False, None)

@@ -60,7 +60,7 @@ def slippery(model):
     return factors(model, slid(0.2))
 
 
-def test_the_way_on_which_a_block_slides_to_rest_tells_its_friction(slippery):
+def test_the_way_on_which_a_block_slides_to_rest_determines_its_friction(slippery):
     assert slippery.friction * MODEL_FRICTION == pytest.approx(0.2, rel=0.1)
     assert slippery.after["friction"] < 0.2 * slippery.before
     assert slippery.before == pytest.approx(slippery.mujoco, rel=0.1)
@@ -91,7 +91,7 @@ def test_friction_of_an_effect_that_the_model_has_counts(model):
     assert found.before < 1e-3
 
 
-def test_without_geometry_or_observed_objects_or_a_common_motion_it_is_said(model):
+def test_without_geometry_or_observed_objects_or_a_common_motion_it_is_reported(model):
     recording = slid(0.2)
     with pytest.raises(ModelError, match="contact geometry of spheres"):
         factors(replace(model, geometry=None), recording)
