@@ -28,7 +28,7 @@ from concent_warp.effects.library.drives import (
     JointCompliance,
 )
 from concent_warp.effects.library.joints import Armature, JointDamping, JointFriction, JointOffset
-from concent_warp.effects.library.objects import CenterOfMass, Inertia, Mass, Size
+from concent_warp.effects.library.objects import CenterOfMass, Inertia, Mass, Size, keep_inertia
 from concent_warp.effects.library.world import AirDrag, GravityTilt, Wind
 
 TWO = """
@@ -241,6 +241,17 @@ def test_size_scales_capsules_by_their_ends_and_keeps_inertias_however_they_are_
     np.testing.assert_allclose(large.geom_pos, 1.5 * plain.geom_pos, atol=1e-12)
     for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         np.testing.assert_allclose(getattr(large, field), getattr(compiled(xml), field), atol=1e-12)
+
+
+def test_an_inertia_that_is_kept_is_written_into_the_mjcf():
+    spec = world(BLOCK).scene.spec()
+    plain = spec.compile()
+    keep_inertia(spec.body("thing"), plain)
+    spec.geom("thing").size = [0.2, 0.2, 0.2]
+    spec.compile()
+    text = spec.to_xml()
+    assert "<inertial" in text
+    np.testing.assert_allclose(compiled(text).body_inertia, plain.body_inertia, rtol=1e-5)
 
 
 def test_gravity_is_turned_about_x_and_y():
