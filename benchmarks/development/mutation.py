@@ -223,13 +223,14 @@ class Selection:
             return not name.startswith(ALWAYS), not (inside and name.startswith(own)), seconds
 
         able = sorted((name for name, (_, calls) in self.tests.items() if function in calls), key=order)
-        tests, total = [], 0.0
+        tests, counted, total = [], 0.0, 0.0
         for name in able:
-            seconds = self.tests[name][0]
-            if tests and total + seconds > budget and not name.startswith(ALWAYS):
+            seconds, always = self.tests[name][0], name.startswith(ALWAYS)
+            if tests and counted + seconds > budget and not always:
                 continue
             tests.append(name)
             total += seconds
+            counted += 0.0 if always else seconds
         return tests, total
 
 
