@@ -1,18 +1,30 @@
-"""Reading of NumPy's ``.npz`` files that may be damaged or hostile: arrays of numbers and text, of bounded size."""
+"""NumPy's ``.npz`` files: written atomically, and read within bounds, for they may be damaged or hostile."""
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from concent_warp.errors import ConcentError
+from concent_warp.files import new_file
 from concent_warp.limits import limits, raising
 
 KINDS = "biufU"
 """Kinds of arrays that are read: truth values, numbers and text; no objects, which only a pickle can hold."""
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Write arrays to an ``.npz`` file atomically, see `files.new_file`.
+
+    Raises:
+        ConcentError: The file cannot be written, as on a full disk; an earlier one is unchanged.
+    """
+    with new_file(path) as partial, partial.open("wb") as file:
+        (np.savez_compressed if compressed else np.savez)(file, **arrays)
 
 
 def read_arrays(

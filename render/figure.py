@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from concent_warp.errors import RenderError
+from concent_warp.files import new_file
 from concent_warp.render.composite import Layers
 
 COLUMNS = ("raw simulation", "hybrid composite", "robot and background", "objects", "object shadows")
@@ -73,9 +74,8 @@ def decomposition(samples: Sequence[Layers], cameras: Sequence[str], path: Path)
                 axis.set_title(COLUMNS[k], fontsize=9)
             if k == 0:
                 axis.set_ylabel(f"{cameras[c]} camera", fontsize=9)
-    partial = path.with_name(f".partial-{path.name}")
-    figure.savefig(partial, format=path.suffix.lstrip(".") or "png")
-    partial.replace(path)
+    with new_file(path) as partial:
+        figure.savefig(partial, format=path.suffix.lstrip(".") or "png")
 
 
 def _columns(sample: Layers, camera: int) -> list[np.ndarray]:

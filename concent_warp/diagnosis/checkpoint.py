@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -17,6 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from concent_warp.array_file import write_arrays
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint
@@ -128,10 +128,7 @@ def _save(path: Path, result: Any) -> None:
     """Write a result atomically."""
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps(_to_tree(result, arrays))
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("wb") as file:
-        np.savez(file, tree=np.array(text), **arrays)  # pyright: ignore[reportArgumentType]
-    partial.replace(path)
+    write_arrays(path, {"tree": np.array(text), **arrays})
 
 
 def _load(path: Path, base: Model) -> Any:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.events.sequence import ContactEventSequence, ContactInterval, Stage
+from concent_warp.files import new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,9 +73,8 @@ def plot_schedule(sequence: ContactEventSequence, path: Path | None = None, titl
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(GREY)
     if path is not None:
-        partial = path.with_name(f".{path.name}.partial")
-        figure.savefig(partial, format=path.suffix.lstrip(".") or "png", dpi=160)
-        partial.replace(path)
+        with new_file(path) as partial:
+            figure.savefig(partial, format=path.suffix.lstrip(".") or "png", dpi=160)
     return figure
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.decode import decode
+from concent_warp.files import write_text
 
 FORMAT = "concent-events"
 VERSION = 1
@@ -159,10 +160,7 @@ class ContactEventSequence:
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file, in one piece or not at all; the same sequence gives the same bytes."""
-        path = Path(path)
-        partial = path.with_name(f".{path.name}.partial")
-        partial.write_text(self.to_json(), encoding="utf-8")
-        partial.replace(path)
+        write_text(Path(path), self.to_json())
 
     def to_json(self) -> str:
         """Return the text of the JSON file, one record a line."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from concent_warp.array_file import write_arrays
+
 if TYPE_CHECKING:
     import mujoco
 
@@ -41,7 +43,4 @@ def save_rollout(rollout: Rollout, compiled: mujoco.MjModel, path: Path, variant
         arrays["contact/geom"] = names[log.geom[mine]]
         for name in ("step", "position", "normal", "distance", "force"):
             arrays[f"contact/{name}"] = getattr(log, name)[mine]
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-    partial.replace(path)
+    write_arrays(path, arrays, compressed=True)

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from concent_warp.array_file import write_arrays
 from concent_warp.errors import RenderError
 from concent_warp.render.splats.cfg import SplatFitCfg
 from concent_warp.render.splats.initial import first_splats
@@ -247,10 +248,7 @@ class SplatFit:
             state = self._adam.state[value]
             content |= {f"{name}.{kind}": state[kind].cpu().numpy() for kind in MOMENTS}
         content["pull"] = self._pull.cpu().numpy()
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("wb") as file:
-            np.savez(file, **content)
-        partial.replace(path)
+        write_arrays(path, content)
 
     def resume(self, path: Path) -> None:
         """Return the fit of a checkpoint that `save` wrote.

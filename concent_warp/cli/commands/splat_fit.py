@@ -13,7 +13,7 @@ import tyro
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
-from concent_warp.files import write_text
+from concent_warp.files import write_bytes, write_text
 from concent_warp.render.splats.cfg import SplatFitCfg
 from concent_warp.run_folder import CHECKPOINT, run_folder, write_settings
 
@@ -125,7 +125,5 @@ def _write_results(fit: SplatFit, folder: Path) -> list[Score]:
             f"{psnr[1]:.1f} dB over the object alone"
         )
         picture = np.hstack([fit.picture(v) for v in fit.held_out[:MOST_PICTURES]])
-        partial = folder / f".partial_{PICTURE}"
-        cv2.imwrite(str(partial), picture[..., ::-1])
-        partial.replace(folder / PICTURE)
+        write_bytes(folder / PICTURE, cv2.imencode(Path(PICTURE).suffix, picture[..., ::-1])[1].tobytes())
     return scores

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.files import new_file
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -45,10 +47,9 @@ def plot_location(location: UnexplainedForces, model: Model, path: Path) -> None
         _draw_body(axes, m, name, [arrow for arrow in arrows if arrow["body"] == name])
     for i, joint in enumerate(joints):
         _draw_joint(figure.add_subplot(grid[bool(bodies) + i, :]), joint, last=i == len(joints) - 1)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    figure.savefig(partial, dpi=130)
+    with new_file(path) as partial:
+        figure.savefig(partial, format=path.suffix.lstrip(".") or "png", dpi=130)
     plt.close(figure)
-    partial.replace(path)
 
 
 def _draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, Any]]) -> None:

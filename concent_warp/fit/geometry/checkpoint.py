@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from concent_warp.array_file import write_arrays
 from concent_warp.errors import ModelError
 
 
@@ -44,10 +45,7 @@ class Checkpoint:
         path.parent.mkdir(parents=True, exist_ok=True)
         content: dict[str, Any] = {name: getattr(self, name) for name in self.ARRAYS}
         content |= {name: np.array(json.dumps(getattr(self, name))) for name in self.TEXTS}
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("wb") as file:
-            np.savez(file, **content)
-        partial.replace(path)
+        write_arrays(path, content)
 
     @staticmethod
     def load(path: Path) -> Checkpoint:

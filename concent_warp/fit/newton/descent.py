@@ -19,6 +19,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from concent_warp.array_file import write_arrays
 from concent_warp.errors import ModelError
 from concent_warp.fit.geometry.perturbation import rbf
 from concent_warp.fit.newton.horizon import HorizonCfg
@@ -92,18 +93,10 @@ class Descent:
         """Write the state in one piece, with what it belongs to."""
         path.parent.mkdir(parents=True, exist_ok=True)
         kept = np.array(self.kept).reshape(-1, *self.now.shape[1:])
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("wb") as file:
-            np.savez(
-                file,
-                **{name: getattr(self, name) for name in ("now", "best", "direction", "lowest", "step")},
-                kept=kept,
-                kept_start=np.array(self.kept_start, dtype=int),
-                finished=self.finished,
-                losses=np.array(json.dumps([self.losses, self.lows])),
-                identity=np.array(json.dumps(identity)),
-            )
-        partial.replace(path)
+        content = {name: getattr(self, name) for name in ("now", "best", "direction", "lowest", "step")}
+        content |= {"kept": kept, "kept_start": np.array(self.kept_start, dtype=int), "finished": self.finished}
+        content |= {"losses": np.array(json.dumps([self.losses, self.lows]))}
+        write_arrays(path, content | {"identity": np.array(json.dumps(identity))})
 
     @staticmethod
     def load(path: Path, identity: dict[str, Any]) -> Descent:

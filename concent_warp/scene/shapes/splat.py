@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.errors import SceneError
+from concent_warp.files import write_bytes
 from concent_warp.scene.shapes.cloud import without_outliers
 from concent_warp.scene.shapes.ply import PlyHeader, read_vertices
 
@@ -135,6 +136,4 @@ def write_splats(splats: GaussianSplats, path: Path) -> None:
     }
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {size}\n"
     header += "".join(f"property float {name}\n" for name in columns) + "end_header\n"
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(header.encode() + np.stack([*columns.values()], axis=1).astype("<f4").tobytes())
-    partial.replace(path)
+    write_bytes(path, header.encode() + np.stack([*columns.values()], axis=1).astype("<f4").tobytes())

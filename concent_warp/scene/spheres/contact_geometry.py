@@ -13,7 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from concent_warp.array_file import read_arrays
+from concent_warp.array_file import read_arrays, write_arrays
 from concent_warp.errors import ModelError
 
 GROUP = 3
@@ -122,19 +122,8 @@ class ContactGeometry:
 
     def save(self, path: str | Path) -> None:
         """Write an ``.npz`` file, in one piece or not at all."""
-        path = Path(path)
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                bodies=np.array(self.bodies),
-                body=self.body,
-                position=self.position,
-                radius=self.radius,
-                mass=self.mass,
-                friction=self.friction,
-            )
-        partial.replace(path)
+        arrays = {name: getattr(self, name) for name in ("body", "position", "radius", "mass", "friction")}
+        write_arrays(Path(path), {"bodies": np.array(self.bodies), **arrays}, compressed=True)
 
     @staticmethod
     def load(path: Path) -> ContactGeometry:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ModelError
+from concent_warp.files import write_text
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
@@ -72,10 +73,7 @@ def _export_mjcf(model: Exportable) -> str:
 
 def save_mjcf(model: Exportable, path: Path) -> None:
     """Write `_export_mjcf` to a file, in one piece or not at all."""
-    text = _export_mjcf(model)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    partial.replace(path)
+    write_text(path, _export_mjcf(model))
 
 
 def _geoms_of(body: ET.Element) -> Iterator[ET.Element]:
