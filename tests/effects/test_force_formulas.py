@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.effects.library.contact_forces import SMOOTH, AdhesionForce, AnisotropicForce, _outermost
+from concent_warp.effects.library.contact_forces import FADE_SPEED, AdhesionForce, AnisotropicForce, _outermost
 from concent_warp.effects.library.friction_forces import LoadFriction, StribeckFriction
 from concent_warp.effects.library.gear_forces import BacklashForce, Gear
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownJointForce
@@ -43,7 +43,7 @@ def grain(m: mujoco.MjModel, d: mujoco.MjData, body: int, ratio: float) -> np.nd
         velocity, normal = jacobian @ d.qvel, contact.frame[:3]
         velocity -= normal * (normal @ velocity)
         size = -(ratio - 1) * contact.friction[0] * force[0] * velocity[1]
-        total += jacobian.T @ np.array([0, size / np.sqrt(velocity @ velocity + SMOOTH**2), 0])
+        total += jacobian.T @ np.array([0, size / np.sqrt(velocity @ velocity + FADE_SPEED**2), 0])
     return total
 
 

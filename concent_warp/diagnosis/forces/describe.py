@@ -50,11 +50,11 @@ def joint_sentence(found: JointForce) -> str:
         length = "rad" if found.unit == "N m" else "m"
         return f"{head}; it {_pattern_words(found.dependences, found.unit, length)}."
     if found.significant:
-        return f"{head}; it follows none of the features{_where_words(found)}."
+        return f"{head}; it follows none of the features{_time_words(found)}."
     return f"{head}, no more than noise; smallest detectable steady force: {found.detectable:.2g} {found.unit}."
 
 
-def _where_words(found: JointForce) -> str:
+def _time_words(found: JointForce) -> str:
     """Return when a force is largest, in words."""
     worst = max(found.series, key=lambda s: np.nanmax(np.abs(s.force) / s.std, initial=0))
     k = int(np.nanargmax(np.abs(worst.force) / worst.std))

@@ -30,12 +30,12 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
                 if not target:
                     continue
             effect = kind(*target)
-            if not _held(model, effect):
+            if not _has_effect(model, effect):
                 found.append(effect)
     return found
 
 
-def _held(model: Model, effect: Effect) -> bool:
+def _has_effect(model: Model, effect: Effect) -> bool:
     """Return whether a model has an effect already, on some of its target."""
     return any(
         a.effect.name == effect.name and (not effect.target or set(a.effect.target) & set(effect.target))

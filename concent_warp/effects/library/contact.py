@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce
-from concent_warp.effects.library.drives import GRIPS
+from concent_warp.effects.library.drives import GRIP_FACTORS
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
     fingers,
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
 SLIDING, TORSIONAL, ROLLING = 0, 1, 2
-NEXT_TO_NOTHING = 1e-5
+MIN_FRICTION = 1e-5
 """MuJoCo's smallest friction coefficient."""
 COULOMB = f"Coulomb friction in MuJoCo's contacts, the larger of the two geoms' coefficients ({MUJOCO})"
 
@@ -67,7 +67,7 @@ class FrictionEffect(SurfaceEffect):
         for geom in _colliding(spec.geoms):
             for column, needed in ((TORSIONAL, 4), (ROLLING, 6)):
                 if geom.condim < needed <= self.condim:
-                    geom.friction[column] = NEXT_TO_NOTHING
+                    geom.friction[column] = MIN_FRICTION
         for geom in raised:
             geom.condim = self.condim
 
@@ -85,8 +85,8 @@ class FrictionEffect(SurfaceEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the largest coefficient, and all others in proportion."""
         geoms = self.geoms(m)
-        share = np.maximum(m.geom_friction[geoms, self.column], NEXT_TO_NOTHING)
-        m.geom_friction[geoms, self.column] = np.maximum(values[0] * share / share.max(), NEXT_TO_NOTHING)
+        share = np.maximum(m.geom_friction[geoms, self.column], MIN_FRICTION)
+        m.geom_friction[geoms, self.column] = np.maximum(values[0] * share / share.max(), MIN_FRICTION)
 
 
 class SlidingFriction(FrictionEffect):
@@ -273,7 +273,7 @@ class PadFriction(Effect):
         among = np.concatenate([self.geoms(m), *held])
         among = among[(m.geom_contype[among] != 0) | (m.geom_conaffinity[among] != 0)]
         null = float(m.geom_friction[among, SLIDING].max())
-        scan = tuple(null * x for x in GRIPS)
+        scan = tuple(null * x for x in GRIP_FACTORS)
         return (Parameter("coefficient", "-", null, 0.0, 5.0, 0.3 * null, scan=scan),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -282,7 +282,7 @@ class PadFriction(Effect):
 
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set it."""
-        m.geom_friction[self.geoms(m), SLIDING] = max(float(values[0]), NEXT_TO_NOTHING)
+        m.geom_friction[self.geoms(m), SLIDING] = max(float(values[0]), MIN_FRICTION)
 
 
 def _collides(m: mujoco.MjModel, body: int) -> bool:

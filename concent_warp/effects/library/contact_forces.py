@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import warp as wp
 
 GEOM = mujoco.mjtGeom
-SMOOTH = 2e-3
-"""Sliding speed [m/s] below which the force fades out."""
+FADE_SPEED = 2e-3
+"""Sliding speed below which the force fades out [m/s], v0 of its formula: friction without it is discontinuous."""
 
 
 class AnisotropicForce(ForceModel):
@@ -72,7 +72,7 @@ class AnisotropicForce(ForceModel):
                 vx, vy, vz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
                 into = nx * vx + ny * vy + nz * vz
                 vx, vy, vz = vx - into * nx, vy - into * ny, vz - into * nz
-                speed = math.sqrt(vx * vx + vy * vy + vz * vz + SMOOTH**2)
+                speed = math.sqrt(vx * vx + vy * vy + vz * vz + FADE_SPEED**2)
                 force = -extra * float(contact.friction[i, 0]) * load * vy / speed
                 x, _, z = middle[body].tolist()
                 applied[body] += (0.0, force, 0.0, (z - pz) * force, 0.0, (px - x) * force)
@@ -87,7 +87,7 @@ class AnisotropicForce(ForceModel):
 
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        force_models.anisotropic(m, d, *self._device, values, SMOOTH)
+        force_models.anisotropic(m, d, *self._device, values, FADE_SPEED)
 
 
 class AdhesionForce(ForceModel):

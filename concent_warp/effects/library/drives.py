@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 FORCE_SENSOR = "concent_force_{}"
 """Sensor that is added for an actuator whose force an effect needs to know."""
 
-GRIPS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
-"""Factors of the grip force to try: the object slips only in a narrow range of them."""
+GRIP_FACTORS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
+"""Factors on the grip force that are scanned [-]: the object slips only in a narrow range of them."""
 
 
 class DriveEffect(Effect):
@@ -109,7 +109,7 @@ class GripForce(ActuatorGain):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One factor for all."""
-        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIPS),)
+        return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIP_FACTORS),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
         """Gain, bias and limit of the force."""

@@ -19,13 +19,13 @@ SHAPES = (
 )
 """Shapes that can be moved and resized."""
 FACES = ("x+", "y+", "z+", "x-", "y-", "z-")
-SKIN = 1.5
-"""Spheres whose centre lies within this many radii of a face move with it as a whole."""
-SMALL = 0.5
-"""Shapes smaller than this share of the body along each axis are moved and keep their size."""
-LEAST = 0.1
-"""Share of its size that a shape keeps at least."""
-ALIGNED = 1e-6
+FACE_DEPTH = 1.5
+"""Distance from a face, in radii, below which a sphere moves with the face [-]."""
+MAX_MOVED_SIZE = 0.5
+"""Size of a shape over that of the body along each axis below which it is moved and not resized [-]."""
+MIN_SIZE = 0.1
+"""Least size of a resized shape over its nominal one [-]."""
+AXIS_TOLERANCE = 1e-6
 """Largest entry, off 0 and 1, of the rotation of a shape whose axes are those of the body."""
 
 
@@ -99,13 +99,13 @@ class Offsets:
         position, size, reach = m.geom_pos[geom], m.geom_size[geom].copy(), _extent(m, geom)
         quaternion = m.geom_quat[geom]
         axes = np.abs(_rotation(m, geom))
-        small = (reach < SMALL * (self.high - self.low) / 2).all()
-        aligned = m.geom_type[geom] == SPHERE or np.abs(axes - axes.round()).max() < ALIGNED
+        small = (reach < MAX_MOVED_SIZE * (self.high - self.low) / 2).all()
+        aligned = m.geom_type[geom] == SPHERE or np.abs(axes - axes.round()).max() < AXIS_TOLERANCE
         if small or not aligned:
-            return position + self.at(position, SKIN * reach), quaternion, size
+            return position + self.at(position, FACE_DEPTH * reach), quaternion, size
         ends = self.at(position + reach), self.at(position - reach)
         grown = _resized(int(m.geom_type[geom]), size, axes.round().T @ (ends[0] - ends[1]) / 2)
-        return position + (ends[0] + ends[1]) / 2, quaternion, np.maximum(grown, LEAST * size)
+        return position + (ends[0] + ends[1]) / 2, quaternion, np.maximum(grown, MIN_SIZE * size)
 
 
 def _resized(kind: int, size: np.ndarray, change: np.ndarray) -> np.ndarray:

@@ -14,10 +14,10 @@ from concent_warp.effects.select import SINGLE, dof_of, joints_by_type, typical_
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
-STIFF = 1.5
-"""Time constant of friction constraints in time steps; MuJoCo's default creeps."""
-IMPEDANCE = 0.99
-"""Of friction constraints: with MuJoCo's default, 0.9, a joint at rest creeps at a speed that shows in stick-slip."""
+TIME_CONSTANT_STEPS = 1.5
+"""Time constant of friction constraints in time steps [-]; with MuJoCo's default, joints at rest creep."""
+FRICTION_IMPEDANCE = 0.99
+"""Impedance of friction constraints [-]: with MuJoCo's default, 0.9, a joint at rest creeps visibly in stick-slip."""
 MUJOCO = "MuJoCo documentation, chapters Computation and Modeling"
 
 
@@ -58,8 +58,8 @@ class DryFriction(JointEffect):
         for n in self.target:
             joint = spec.joint(n)
             if not joint.frictionloss:
-                joint.solref_friction = [STIFF * spec.option.timestep, 1.0]
-                joint.solimp_friction[:2] = IMPEDANCE
+                joint.solref_friction = [TIME_CONSTANT_STEPS * spec.option.timestep, 1.0]
+                joint.solimp_friction[:2] = FRICTION_IMPEDANCE
 
 
 class JointFriction(DryFriction):

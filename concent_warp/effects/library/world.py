@@ -11,12 +11,12 @@ from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import free_bodies, name
 from concent_warp.scene.spheres.contact_geometry import GROUP as SPHERES
 
-AIR = 1.2
+AIR_DENSITY = 1.2
 """Density of air at 20 degrees [kg/m^3]."""
-TURNING = 2
-"""Which of the fluid coefficients is that of drag against turning."""
-SPECK = 1e-5
-"""Radius of what the air does not act on [m]."""
+ROTATIONAL_DRAG = 2
+"""Index of the fluid coefficient of drag against rotation."""
+MIN_RADIUS = 1e-5
+"""Radius of bodies on which no drag acts [m]: their drag is negligible."""
 
 
 class GravityTilt(Effect):
@@ -74,11 +74,11 @@ class AirEffect(Effect):
                 for geom in drawn or body.geoms:
                     geom.fluid_ellipsoid = True
                     if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
-                        geom.fluid_coefs[TURNING] = 0.0
+                        geom.fluid_coefs[ROTATIONAL_DRAG] = 0.0
             elif not any(geom.fluid_ellipsoid for geom in body.geoms):
                 body.add_geom(
                     type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                    size=[SPECK, 0, 0],
+                    size=[MIN_RADIUS, 0, 0],
                     mass=0,
                     contype=0,
                     conaffinity=0,
@@ -134,4 +134,4 @@ class Wind(AirEffect):
     def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
         """Set the wind."""
         m.opt.wind = values
-        m.opt.density = max(m.opt.density, AIR)
+        m.opt.density = max(m.opt.density, AIR_DENSITY)

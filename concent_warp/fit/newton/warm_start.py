@@ -86,7 +86,7 @@ class GradientWarmStart:
                     progress(len(state.losses), self.metres(float(state.lowest.min())), left)
 
             self.descend(state, loss, keep)
-        best, after = self.judged(state)
+        best, after = self.best_in_mujoco(state)
         if best is None:
             return self.without_help("gradients do not help here: Newton simulates another motion", state.losses)
         text = (
@@ -112,7 +112,7 @@ class GradientWarmStart:
             if count == 1 and min(state.losses[0]) > cfg.disagreement * mujoco_loss(loss.objective, loss.scene):
                 state.kept, state.kept_start, state.finished = [], [], True
             if count == cfg.probe and not state.finished:
-                state.finished = self.judged(state)[1] >= self.before
+                state.finished = self.best_in_mujoco(state)[1] >= self.before
             keep((time.perf_counter() - begun) / (count - before) * (cfg.iterations - count))
         search.simulations += loss.simulations
 
@@ -155,7 +155,7 @@ class GradientWarmStart:
             return self.cfg.step
         return min(self.metres(self.before) / 3, self.cfg.largest_step)
 
-    def judged(self, state: Descent) -> tuple[np.ndarray | None, float]:
+    def best_in_mujoco(self, state: Descent) -> tuple[np.ndarray | None, float]:
         """Return the best iterate in MuJoCo, in the strategy's channels, shape (S, C), and its distance [m]."""
         search = self.search
         iterates = chosen_iterates(state, self.cfg.rescored)

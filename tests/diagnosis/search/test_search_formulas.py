@@ -15,7 +15,7 @@ from concent_warp.diagnosis.search import evidence, screening
 from concent_warp.diagnosis.search import unknown_force as module
 from concent_warp.diagnosis.search.baseline import quiet_noise_ratios
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import _held, label
+from concent_warp.diagnosis.search.candidates import _has_effect, label
 from concent_warp.diagnosis.search.evidence import (
     _log_errors,
     _plausibility,
@@ -305,7 +305,7 @@ def test_labels_have_targets_where_names_are_shared():
     assert [label(e, [one, two, three]) for e in (one, two, three)] == ["a(x)", "a(x, ...)", "b"]
     model: Any = SimpleNamespace(effects=[SimpleNamespace(effect=one)])
     others = (one, two, three, effect("a", "z"), effect("a"))
-    assert [_held(model, e) for e in others] == [True, True, False, False, True]
+    assert [_has_effect(model, e) for e in others] == [True, True, False, False, True]
 
 
 def test_folds_of_forces_are_dealt_in_turn():

@@ -193,7 +193,7 @@ class Searched:
         self.model = SimpleNamespace(with_geometry=lambda geometry: ("model", geometry))
         self.full, self.simulations, self.seconds = "full", 100, 10.0
         self.surveyed: list[Any] = []
-        self.judged: list[Any] = []
+        self.best_in_mujoco: list[Any] = []
         self.losses: Any = lambda position: np.abs(position - GEOMETRY.position).sum(axis=(1, 2))
 
     def survey(self, segments: Any) -> Survey:
@@ -207,7 +207,7 @@ class Searched:
 
     def objective(self, engine: Any, segments: Any) -> Any:
         def losses(candidates: Any) -> Losses:
-            self.judged.append((engine, segments, candidates.position))
+            self.best_in_mujoco.append((engine, segments, candidates.position))
             value = self.losses(candidates.position)
             return Losses(value, 3 * value)
 
@@ -271,15 +271,15 @@ def test_iterates_are_judged_by_the_mean_over_all_frames():
     found = warm(searched)
     found.start[:, 3] = 0.5
     state = start_descent(np.zeros((2, 8, 3)), 1e-3)
-    assert found.judged(state) == (None, np.inf)
+    assert found.best_in_mujoco(state) == (None, np.inf)
     assert searched.simulations == 100
     state.kept = [np.full((8, 3), v) for v in (3e-4, 1e-4, 2e-4)]
     state.kept_start = [1, 1, 1]
-    values, after = found.judged(state)
+    values, after = found.best_in_mujoco(state)
     np.testing.assert_allclose(values[:, :3], 2e-4)
     np.testing.assert_array_equal(values[:, 3], 0.5)
     assert after == pytest.approx(2 * 24 * 2e-4)
-    ((engine, segments, position),) = searched.judged
+    ((engine, segments, position),) = searched.best_in_mujoco
     assert (engine, segments) == ("full", found.segments)
     np.testing.assert_allclose(position, GEOMETRY.position + np.array([4e-4, 2e-4, 3e-4])[:, None, None])
     assert searched.simulations == 100 + 3 * 3
@@ -398,7 +398,7 @@ def test_a_descent_ends_early_where_its_first_iterates_are_no_better(gradients, 
     searched.losses = lambda position: np.full(len(position), loss)
     result = warm(searched, GradientCfg(iterations=6, probe=3)).run(None, False, None)
     assert len(result.losses) == steps
-    assert len(searched.judged) == 2
+    assert len(searched.best_in_mujoco) == 2
     del gradients
     last = warm(searched, GradientCfg(iterations=3, probe=3)).run(None, False, None)
     assert len(last.losses) == 3
