@@ -313,7 +313,7 @@ def test_a_contact_counts_for_the_joints_that_carry_it():
 
 def test_features_of_joints_are_weighted_means_over_each_window():
     m = mujoco.MjModel.from_xml_string(ARM)
-    count, cfg = 6, FeatureCfg()
+    count, cfg = 6, FeatureCfg(rate_step=0.018)  # nearly two steps
     ctrl = np.random.default_rng(0).normal(0, 0.3, (40, 2))
 
     def path(time):
@@ -340,10 +340,10 @@ def test_features_of_joints_are_weighted_means_over_each_window():
     for k, t in enumerate(instants):
         now = int(t / 0.01)
         forces = []
-        for row in (max(now - 1, 0), now):
+        for row in (max(now - 2, 0), now):
             error = ctrl[row] - qpos[k]
             forces.append(np.array([30, 9]) * error - np.array([2, 1]) * qvel[k])
-        drive[k], rate[k] = forces[1], (forces[1] - forces[0]) / 0.01
+        drive[k], rate[k] = forces[1], (forces[1] - forces[0]) / 0.02
         d.qpos[:], d.qvel[:] = qpos[k], 0
         mujoco.mj_forward(m, d)
         load[k] = d.qfrc_bias - d.qfrc_gravcomp

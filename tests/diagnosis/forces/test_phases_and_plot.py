@@ -302,6 +302,8 @@ def test_arrows_end_where_forces_act_and_the_picture_holds_them(figures):
     assert axes.get_title() == "block"
     assert axes.get_xlabel() == "x [mm]"
     assert len(axes.lines) == 12
+    edges = np.abs([line.get_data_3d() for line in axes.lines])
+    np.testing.assert_allclose(edges.max(axis=(0, 2)), [100, 100, 50])
     bare: Any = plt.figure().add_subplot(projection="3d")
     _draw_body(bare, m, "block", [])
     assert bare.get_title() == "block: no unexplained force with a place"
