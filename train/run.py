@@ -17,6 +17,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.train.cfg import SETTINGS, TrainCfg
+from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
@@ -125,9 +126,17 @@ def train_run(
         task, device, seed = run.task(), process.device(device), process.seed(run.cfg.seed)
         check_worlds(task, run.cfg.environment, device)  # before much is computed
         states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
-        environment = make_environment(task, run.cfg.environment, states, device=device, seed=seed)
-        trainer = Trainer(environment, run.cfg, folder, process)
+
+        def make(buffers: tuple[int, int] | None = None) -> Environment:
+            cfg = run.cfg.environment
+            if buffers is not None:
+                cfg = replace(cfg, nconmax=buffers[0], njmax=buffers[1])
+            return make_environment(task, cfg, states, device=device, seed=seed)
+
+        environment = make()
+        trainer = Trainer(environment, run.cfg, folder, process, make)
         environment.reset()
+        del environment  # the trainer's alone, which frees it where it needs another one
         if resume and folder is not None:
             trainer.resume(folder / CHECKPOINT)
         elif begin_with is not None:

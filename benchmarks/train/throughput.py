@@ -208,8 +208,7 @@ class Bench:
             held = bare_rounds(environment, cfg.simulation_steps, args.steps, 2)
         return {
             **facts(task, cfg),
-            "nconmax": warp_physics(environment).nconmax,
-            "njmax": warp_physics(environment).njmax,
+            **dict(zip(("nconmax", "njmax"), warp_physics(environment).buffers or (), strict=True)),
             "environment_ms": rounds,
             "bare_ms": bare,
             "bare_held_ms": held,

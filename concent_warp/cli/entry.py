@@ -6,6 +6,7 @@ import inspect
 import os
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -109,12 +110,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] not in COMMANDS:
         print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
         return ERROR
-    code = _run(arguments[0], arguments[1:])
+    written, warnings.formatwarning = warnings.formatwarning, _one_line
+    try:
+        code = _run(arguments[0], arguments[1:])
+    finally:
+        warnings.formatwarning = written
     try:
         sys.stdout.flush()
     except BrokenPipeError:
         return _leave_pipe()
     return code
+
+
+def _one_line(message: Warning | str, *place: object) -> str:
+    """Return a warning as one line, without the place in the code."""
+    del place
+    return f"concent: {' '.join(str(message).split())}\n"
 
 
 def _leave_pipe() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -69,14 +70,23 @@ def evaluate(
     run = policy.run
     task = run.task()
     states = run.evaluation_states(task, episodes, seed)
-    torch.manual_seed(seed)
     settings = replace(run.cfg.environment, worlds=min(episodes, run.cfg.environment.worlds))
-    if world == "reality":
-        environment = reality_environment(task, settings, states, cfg)
-    else:
-        environment = make_environment(task, settings, states, device=device)
-    states_seen = EpisodeStates(len(videos))
-    found = run_episodes(environment, policy.act_in(environment), states, progress=progress, watch=states_seen)
+    while True:
+        torch.manual_seed(seed)
+        if world == "reality":
+            environment = reality_environment(task, settings, states, cfg)
+        else:
+            environment = make_environment(task, settings, states, device=device)
+        states_seen = EpisodeStates(len(videos))
+        environment.read_log()
+        found = run_episodes(environment, policy.act_in(environment), states, progress=progress, watch=states_seen)
+        share, buffers = environment.read_log()["overflow"], environment.buffers
+        if share:
+            repeated = "the scene needs more memory (<size memory>)" if buffers is None else "the episodes are repeated"
+            warnings.warn(f"contacts were dropped in {share:.2%} of the steps: {repeated}", stacklevel=2)
+        if not share or buffers is None:
+            break
+        settings = replace(settings, nconmax=2 * buffers[0], njmax=2 * buffers[1])
     if videos:
         _write_videos(videos, states_seen, reality_world(task, settings, cfg), task, states, environment.control_step)
     return replace(found, videos=tuple(videos))

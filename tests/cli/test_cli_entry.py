@@ -1,13 +1,14 @@
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import fields
 from importlib import import_module
 
 import pytest
 import tyro
 
-from concent_warp.cli import main
+from concent_warp.cli import entry, main
 from concent_warp.cli.entry import COMMANDS, EXAMPLES
 
 HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "trimesh", "scipy")
@@ -42,6 +43,21 @@ def test_no_arguments_show_the_help_and_version_the_version(capsys):
     assert "usage: concent" in capsys.readouterr().out
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("concent 0.")
+
+
+def test_a_warning_is_one_line_without_a_place_in_the_code(monkeypatch, capsys):
+    def warn(*command):
+        warnings.warn(f"{command[0]}: contacts\nwere dropped", stacklevel=1)
+        return 0
+
+    monkeypatch.setattr(entry, "_run", warn)
+    before = warnings.formatwarning
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda *a: sys.stderr.write(warnings.formatwarning(*a[:4]))
+        assert main(["fit"]) == 0
+    assert capsys.readouterr().err == "concent: fit: contacts were dropped\n"
+    assert warnings.formatwarning is before
 
 
 def test_an_unknown_command_is_named_with_the_known_ones(capsys):

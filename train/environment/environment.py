@@ -246,6 +246,11 @@ class Environment(VecEnv):
         parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
         return {name: part.reshape(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
 
+    @property
+    def buffers(self) -> tuple[int, int] | None:
+        """Contacts and constraint rows of a world that there is room for; None if the simulator makes room itself."""
+        return self.physics.buffers
+
     def state(self) -> dict[str, torch.Tensor]:
         """Return the state of all worlds by name, without random number generators."""
         return {name: value.clone() for name, value in self._state().items()}

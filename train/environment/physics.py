@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 """Warnings after which MuJoCo resets a world to its reference pose."""
+DROPPED = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+"""Warnings that contacts or constraints were dropped for lack of memory."""
 
 
 class Physics(Protocol):
@@ -54,6 +56,8 @@ class Physics(Protocol):
     """Overflow flags of the simulator, shape (N,) int."""
     dropping: int
     """Mask of the flags of contacts dropped for lack of buffer capacity."""
+    buffers: tuple[int, int] | None
+    """Contacts and constraint rows of a world that there is room for; None where the simulator makes room itself."""
     memory: dict[str, torch.Tensor]
     """Further state by name, for checkpoints."""
 
@@ -134,7 +138,8 @@ class MujocoPhysics:
         self.mocap = torch.from_numpy(places[0]), torch.from_numpy(places[1])
         self._places = places
         self.site = torch.zeros(worlds, model.nsite, 3)
-        self.overflow, self.dropping = torch.zeros(worlds, dtype=torch.int32), 0
+        self.overflow, self.dropping = torch.zeros(worlds, dtype=torch.int32), 1
+        self.buffers: tuple[int, int] | None = None
         arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
         self._arrays = [tensor.numpy() for tensor in arrays]
 
@@ -190,6 +195,9 @@ class MujocoPhysics:
             self._read(i, d)
             if any(d.warning[kind].number for kind in UNSTABLE):
                 self._arrays[0][i] = np.nan
+            for kind in DROPPED:
+                if d.warning[kind].number:
+                    d.warning[kind].number, self.overflow[i] = 0, 1
 
     def update_poses(self) -> None:
         """Compute the poses from the generalised positions."""
@@ -251,7 +259,8 @@ class WarpPhysics:
         from concent_warp.simulate.warp_engine import largest
         from concent_warp.simulate.warp_model import WorldModel, check_drag
 
-        self.model, self.worlds, self.nconmax, self.njmax = model, worlds, nconmax, njmax
+        self.model, self.worlds = model, worlds
+        self.buffers: tuple[int, int] | None = (nconmax, njmax)
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
         edited = sorted({name for force_model, _ in force_models for name in force_model.edits})

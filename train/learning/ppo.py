@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import random
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
 from concent_warp.checkpoint_file import check_state, read_checkpoint, write_checkpoint
+from concent_warp.checks import check_at_least
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
@@ -46,6 +49,8 @@ class TrainingEnvironment(Protocol):
     def diverged_state(self) -> dict[str, np.ndarray] | None: ...  # noqa: D102
     def state(self) -> dict[str, torch.Tensor]: ...  # noqa: D102
     def restore(self, state: dict[str, torch.Tensor]) -> None: ...  # noqa: D102
+    @property
+    def buffers(self) -> tuple[int, int] | None: ...  # noqa: D102
 
 
 @dataclass
@@ -69,6 +74,8 @@ class Iteration:
 
 
 Report = Callable[[Iteration], None]
+MakeEnvironment = Callable[[tuple[int, int] | None], TrainingEnvironment]
+"""Makes the environment anew with room for so many contacts and constraint rows a world, by default as at first."""
 
 
 class Trainer:
@@ -80,6 +87,7 @@ class Trainer:
         cfg: TrainCfg,
         folder: Path | None = None,
         process: DistributedProcess | None = None,
+        make_environment: MakeEnvironment | None = None,
     ) -> None:
         """Create policy and value function.
 
@@ -88,8 +96,10 @@ class Trainer:
             cfg: Settings; their `environment` is not read.
             folder: Run folder for checkpoints and metrics; None writes none.
             process: This process of a data-parallel training, within its group; a single process by default.
+            make_environment: Makes the environment with larger buffers when they overflow; by default they stay.
         """
         self.environment, self.cfg, self.folder = environment, cfg, folder
+        self._make_environment, self._warned_of_overflow = make_environment, False
         self.process = process or DistributedProcess()
         self.device = str(environment.device)
         torch.set_float32_matmul_precision("high" if cfg.ppo.tf32 else "highest")
@@ -145,16 +155,17 @@ class Trainer:
 
     def _iterate(self, observations: TensorDict) -> tuple[Iteration, TensorDict]:
         """Run one iteration: collect steps and update the policy; return it with the next observations."""
-        ppo, environment = self.algorithm, self.environment
+        ppo = self.algorithm
         start = time.monotonic()
         with torch.inference_mode():
             for _ in range(self.cfg.ppo.steps):
                 actions = ppo.act(observations)
-                observations, rewards, dones, extras = environment.step(actions)
+                observations, rewards, dones, extras = self.environment.step(actions)
                 ppo.process_env_step(observations, rewards, dones, extras)
             ppo.compute_returns(observations)
-        log = environment.read_log(self.process.sum_over_ranks)
+        log = self.environment.read_log(self.process.sum_over_ranks)
         self._save_diverged_state(log)
+        self._make_room(log.get("overflow", 0.0))
         collected = time.monotonic()
         losses = self._update()
         end = time.monotonic()
@@ -219,6 +230,51 @@ class Trainer:
             return
         np.savez(self.folder / DIVERGED_STATE_FILE, **states[0])  # pyright: ignore[reportArgumentType]
 
+    def _make_room(self, share: float) -> None:
+        """Warn of contacts that were dropped in a share of the steps, and go on with buffers twice as large.
+
+        All ranks call it with the same share.
+        """
+        if not share:
+            return
+        buffers, text = self.environment.buffers, f"contacts were dropped in {share:.2%} of the steps"
+        if buffers is None or self._make_environment is None:
+            fix = "give the scene more memory (<size memory>)" if buffers is None else "enlarge the buffers"
+            if not self._warned_of_overflow:
+                self._warn(f"{text}: {fix}, or the training is wrong")
+            self._warned_of_overflow = True
+            return
+        larger = 2 * buffers[0], 2 * buffers[1]
+        try:
+            with self.process.raise_together():
+                self._rebuild(larger)
+        except TrainError as error:
+            raise TrainError(
+                f"{text}, and larger buffers do not fit the memory", found=error, fix="lower --worlds"
+            ) from None
+        self._warn(
+            f"{text}: the training goes on with room for {larger[0]} contacts and {larger[1]} constraints a world"
+        )
+
+    def _warn(self, text: str) -> None:
+        """Warn once for all ranks."""
+        if self.process.is_rank_zero:
+            warnings.warn(text, stacklevel=2)
+
+    def _rebuild(self, buffers: tuple[int, int]) -> None:
+        """Make the environment anew with other buffers, in the same state; the old one is freed before.
+
+        Raises:
+            TrainError: It does not fit the memory.
+        """
+        assert self._make_environment is not None
+        random_state, state = _random_state(self.device), self.environment.state()
+        del self.environment
+        gc.collect()
+        self.environment = self._make_environment(buffers)
+        self.environment.restore(state)
+        _restore_random_state(random_state, self.device)
+
     @contextlib.contextmanager
     def _writer(self) -> Iterator[Report]:
         """Yield a function that writes an iteration's metrics to the run folder."""
@@ -249,6 +305,7 @@ class Trainer:
         if not self.process.is_rank_zero:
             return
         document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
+        document["buffers"] = self.environment.buffers
         write_checkpoint(self.folder / CHECKPOINT, document)
 
     def begin_with(self, weights: Mapping[str, Any], where: object = None) -> None:
@@ -306,6 +363,11 @@ class Trainer:
                         raise ValueError(f"{name} of shape {tuple(moment.shape)} for weights {tuple(weight.shape)}")
         ppo.learning_rate = float(document["learning_rate"])
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
+        buffers = document.get("buffers")
+        if self._make_environment is not None and buffers is not None and buffers != self.environment.buffers:
+            contacts, constraints = buffers
+            check_at_least(1, TrainError, contacts=contacts, constraints=constraints)
+            self._rebuild((int(contacts), int(constraints)))
         self.environment.restore(state["environment"])
         _restore_random_state(state["random"], self.device)
 
