@@ -477,6 +477,8 @@ def test_a_plan_of_splats_has_room_for_its_images():
     assert plan.gradients["pixels"].shape == (40,)
     assert SplatPlan(arrays(), 16, 8, capacity=1)._frame.tile == 8
     assert SplatPlan(arrays(), 16, 8, capacity=1)._frame.columns == 2
+    one = arrays(object_poses=numbers(1, 3, 7), camera_poses=numbers(1, 1, 7), pinholes=numbers(1, 1, 4))
+    assert SplatPlan(one, 56, 8, capacity=1, tile=8)._bits == 24 + 4  # 7 tiles, and one after the last
     SplatPlan(arrays(hidden=numbers(8, 9, 17)), 17, 9, capacity=50)
     with pytest.raises(ValueError, match=r"hidden must be of shape \(8, 9, 17\)"):
         SplatPlan(arrays(hidden=numbers(8, 17, 9)), 17, 9, capacity=50)
