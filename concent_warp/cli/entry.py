@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from importlib import import_module
 from threading import Timer
 
-from concent_warp.cli.terminal import SPOKEN
-from concent_warp.errors import ConcentError
+from concent_warp.cli.terminal import SPOKEN, one_line_warnings
+from concent_warp.errors import ConcentError, printable
 from concent_warp.run_folder import processes
 from concent_warp.version import __version__
 
@@ -143,7 +143,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         from concent_warp.run_folder import INVOCATION
 
         INVOCATION.set((command, *arguments))
-        with _loading(command, help_only=bool({"-h", "--help"} & set(arguments))):
+        help_only = bool({"-h", "--help"} & set(arguments))
+        with one_line_warnings(command), _loading(command, help_only=help_only):
             module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
             settings = tyro.cli(
                 module.Arguments,
@@ -162,7 +163,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         return _leave_pipe()
     except OSError as error:
         place = "" if error.filename is None else f"{error.filename}: "
-        _complain(f"concent {command}: {place}{error.strerror or error}; check the path and the disk.")
+        _complain(printable(f"concent {command}: {place}{error.strerror or error}; check the path and the disk."))
         return ERROR
     except KeyboardInterrupt as interrupt:
         if processes()[0] == 0:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
+from concent_warp.errors import printable
 from concent_warp.run_folder import processes
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ def say(message: RenderableType) -> None:
     """Write a remark or a table to standard output; text may carry rich's markup."""
     SPOKEN.set()
     out = _console()
+    if isinstance(message, str):
+        message = "\n".join(printable(line) for line in message.split("\n"))
     out.print(message, soft_wrap=isinstance(message, str) and not out.is_terminal)
 
 
@@ -49,7 +53,23 @@ def say_written(*paths: Path) -> None:
 
     SPOKEN.set()
     out = _console()
-    out.print(Text("wrote ") + Text(", ".join(map(str, paths)), style="bold"), soft_wrap=not out.is_terminal)
+    out.print(Text("wrote ") + Text(printable(", ".join(map(str, paths))), style="bold"), soft_wrap=not out.is_terminal)
+
+
+@contextmanager
+def one_line_warnings(command: str) -> Iterator[None]:
+    """Show each warning of Python as one line, without the place in the code."""
+    before = warnings.formatwarning
+
+    def line(message: Warning | str, *_: object, **__: object) -> str:
+        SPOKEN.set()
+        return f"concent {command}: warning: {printable(str(message))}\n"
+
+    warnings.formatwarning = line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 def quiet_warp() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -128,6 +128,16 @@ def no_log_file() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+def _remark(text: str) -> None:
+    """Make what MuJoCo warns of a warning of Python: MuJoCo itself would write MUJOCO_LOG.TXT to the working folder."""
+    with suppress(Exception):  # nothing can be raised through MuJoCo
+        warnings.warn(f"MuJoCo: {printable(text.partition(' Time =')[0])}", stacklevel=1)
+
+
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(_remark)
 
 
 @lru_cache(maxsize=4)

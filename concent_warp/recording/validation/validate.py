@@ -15,7 +15,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from concent_warp.errors import SceneError
+from concent_warp.errors import SceneError, printable
 from concent_warp.limits import limits, raising
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.naming import PREFIX
@@ -59,6 +59,9 @@ def validate(recording: Recording, cfg: ValidateCfg | None = None) -> None:
             raise place.error(
                 "a demonstration has an unusable name", expected=f"{PREFIX}0, {PREFIX}1, ...", found=repr(name)
             )
+        for what, text in (("name", name), ("task", "".join(demonstration.task.split()))):
+            if text != printable(text):
+                raise place.error(f"the {what} of a demonstration has characters that are not printable", found=text)
         if name in seen:
             raise place.error("two demonstrations have the same name", found=repr(name))
         seen.add(name)
