@@ -224,7 +224,7 @@ def _held(folder: Path, path: Path, *, unfinished: bool) -> ConcentError:
     if not unfinished:
         fix = "choose another folder, or pass --overwrite or --resume"
         return ConcentError("the folder holds a run", where=folder, fix=fix)
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, RecursionError):
         command = str(tomllib.loads((path / SETTINGS).read_text()).get("command", ""))
         fix = f"continue it with `{_resuming(shlex.split(command))}`, or start anew with --overwrite or elsewhere"
         return ConcentError("the folder holds a run that was interrupted", where=folder, fix=fix)
@@ -333,7 +333,7 @@ def check_unchanged(path: Path, settings: Mapping[str, Any], free: Collection[st
     """Raise an error where settings other than those in `free` differ from a settings file."""
     try:
         stored = tomllib.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return
     before, now = _flat(stored.get("settings", {})), _flat(settings)
     differing = [n for n in sorted(before | now) if n.split(".")[0] not in free and before.get(n) != now.get(n)]

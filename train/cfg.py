@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
 from concent_warp.files import write_text
@@ -452,8 +452,8 @@ class TrainCfg:
         if not path.is_file():
             raise TrainError("the configuration of a training is missing", where=path)
         try:
-            return decode(TrainCfg, tomllib.loads(path.read_text()), str(path))
-        except tomllib.TOMLDecodeError as error:
-            raise TrainError("not a TOML file", where=path, found=error) from None
+            return decode(TrainCfg, read_toml(path, TrainError), str(path))
+        except TrainError:
+            raise
         except ConcentError as error:
             raise TrainError(str(error)) from None

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from concent_warp.documents import is_number
 from concent_warp.errors import EventsError
 
 T = TypeVar("T")
@@ -37,7 +37,7 @@ def _decode_value(kind: Any, value: Any, where: str) -> Any:
         if value not in options:
             raise EventsError("unknown value", where=where, expected=f"one of {list(options)}", found=repr(value))
         return value
-    if kind is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+    if kind is float and is_number(value):
         return float(value)
     if kind is not float and type(value) is kind:
         return value

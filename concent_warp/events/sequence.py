@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from concent_warp.documents import read_json
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.decode import decode
@@ -185,10 +186,7 @@ class ContactEventSequence:
         path = Path(path)
         if not path.is_file():
             raise EventsError("no such contact event sequence", where=path, expected="a .json file")
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise EventsError("not a JSON file", where=path, found=error) from None
+        document = read_json(path, EventsError)
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise EventsError("not a contact event sequence", where=path, expected=f'"format": "{FORMAT}"')
         if (version := document.pop("version", None)) != VERSION:

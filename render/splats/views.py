@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from concent_warp.documents import read_json
 from concent_warp.errors import RenderError
 from concent_warp.files import write_text
 
@@ -106,12 +107,10 @@ def read_views(path: Path) -> SplatViews:
     """
     path = Path(path)
     file = path / FILE if path.is_dir() else path
-    try:
-        document = json.loads(file.read_text())
-    except OSError as error:
-        raise RenderError("no posed images", where=file, expected=FILE, found=error.strerror) from None
-    except ValueError as error:
-        raise RenderError("not a JSON file", where=file, found=error) from None
+    if not file.is_file():
+        found = "something else than a file" if file.exists() else "No such file or directory"
+        raise RenderError("no posed images", where=file, expected=FILE, found=found)
+    document = read_json(file, RenderError)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise RenderError("no list of frames", where=file, expected="frames, each with file_path and transform_matrix")

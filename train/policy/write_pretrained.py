@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import shlex
 import shutil
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from concent_warp.checkpoint_file import write_checkpoint
+from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
 from concent_warp.train.learning.ppo import CHECKPOINT
@@ -61,7 +61,7 @@ def _origin_of(settings: Path) -> dict[str, Any]:
     """Return command and versions of a training from its settings file; empty without one."""
     if not settings.is_file():
         return {}
-    stored = tomllib.loads(settings.read_text())
+    stored = read_toml(settings)
     found: dict[str, Any] = {"command": _without_folders(stored["command"])} if "command" in stored else {}
     return found | ({"versions": stored["versions"]} if "versions" in stored else {})
 

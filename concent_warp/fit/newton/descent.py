@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -111,7 +110,7 @@ class Descent:
                 kept, starts = list(data["kept"]), [int(k) for k in data["kept_start"]]
                 finished = bool(data["finished"])
                 (losses, lows), found = json.loads(str(data["losses"])), json.loads(str(data["identity"]))
-        except (ValueError, OSError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+        except Exception as error:  # NumPy, zipfile and json raise whatever their parsers do
             raise ModelError(
                 "not a state of a descent", where=path, found=error, fix="delete it to start anew"
             ) from None
