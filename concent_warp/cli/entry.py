@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import os
 import sys
-import time
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from threading import Timer
 
-from concent_warp.cli.terminal import SPOKEN, one_line_warnings
-from concent_warp.errors import ConcentError, printable
+from concent_warp.cli.boundary import DONE, ERROR, complain, exit_code
+from concent_warp.cli.terminal import HAS_PRINTED
 from concent_warp.run_folder import processes
 from concent_warp.version import __version__
 
@@ -70,9 +67,6 @@ EXAMPLES = {
 """One example of each command, shown by its help."""
 LOADING_AFTER = 1.5
 """Time after which a command that has not yet printed anything says that it is loading [s]."""
-ERROR, INTERRUPTED, CLOSED = 2, 130, 141
-PATIENCE = 10.0
-"""How long other processes wait for the first one to say what is wrong [s]."""
 
 
 def _usage() -> str:
@@ -95,84 +89,55 @@ def _usage() -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
-    0: done. 2: an input or a setting cannot be worked with, said in one sentence on standard error. 130: interrupted.
+    0: done. 1: an error that no check foresaw. 2: an input or a setting cannot be worked with. 130, 143: interrupted,
+    terminated. 141: the reader of the output has gone. What is wrong is said in one sentence on standard error.
 
     Args:
         argv: Arguments without the program's name; those of the process by default.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    name = f"concent {arguments[0]}" if arguments and arguments[0] in COMMANDS else "concent"
+    return exit_code(name, lambda: _answer(arguments))
+
+
+def _answer(arguments: Sequence[str]) -> int:
+    """Print the help or the version, or run a command, and return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
-        return 0
-    if arguments[0] == "--version":
+    elif arguments[0] == "--version":
         print(f"concent {__version__}")
-        return 0
-    if arguments[0] not in COMMANDS:
-        print(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.", file=sys.stderr)
+    elif arguments[0] not in COMMANDS:
+        complain(f"concent: no command {arguments[0]!r}; expected one of {', '.join(COMMANDS)}.")
         return ERROR
-    written, warnings.formatwarning = warnings.formatwarning, _one_line
-    try:
-        code = _run(arguments[0], arguments[1:])
-    finally:
-        warnings.formatwarning = written
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        return _leave_pipe()
-    return code
+    else:
+        _run(arguments[0], arguments[1:])
+    return DONE
 
 
-def _one_line(message: Warning | str, *place: object) -> str:
-    """Return a warning as one line, without the place in the code."""
-    del place
-    return f"concent: {' '.join(str(message).split())}\n"
+def _run(command: str, arguments: Sequence[str]) -> None:
+    """Run one command.
 
+    Raises:
+        ConcentError: An input or a setting cannot be worked with.
+    """
+    import tyro
 
-def _leave_pipe() -> int:
-    """Give up standard output, which its reader has closed as `head` does, and return the exit code for that."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return CLOSED
+    from concent_warp.checks import check_settings
+    from concent_warp.run_folder import INVOCATION
 
-
-def _run(command: str, arguments: Sequence[str]) -> int:
-    """Run one command."""
-    try:
-        import tyro
-
-        from concent_warp.checks import check_settings
-        from concent_warp.run_folder import INVOCATION
-
-        INVOCATION.set((command, *arguments))
-        help_only = bool({"-h", "--help"} & set(arguments))
-        with one_line_warnings(command), _loading(command, help_only=help_only):
-            module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
-            settings = tyro.cli(
-                module.Arguments,
-                args=arguments,
-                prog=f"concent {command}",
-                description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
-                config=(tyro.conf.HelptextFromCommentsOff,),
-                console_outputs=processes()[0] == 0,
-            )
-            check_settings(settings)
-            module.run(settings)
-    except ConcentError as error:
-        _complain(f"concent {command}: {error}")
-        return ERROR
-    except BrokenPipeError:
-        return _leave_pipe()
-    except OSError as error:
-        place = "" if error.filename is None else f"{error.filename}: "
-        _complain(printable(f"concent {command}: {place}{error.strerror or error}; check the path and the disk."))
-        return ERROR
-    except KeyboardInterrupt as interrupt:
-        if processes()[0] == 0:
-            print(f"\nconcent {command}: interrupted. {interrupt}".rstrip(), file=sys.stderr)
-        return INTERRUPTED
-    except SystemExit as end:  # tyro ends the process after a wrong option or --help
-        _wait_for_rank_zero()
-        return end.code if isinstance(end.code, int) else int(end.code is not None)
-    return 0
+    INVOCATION.set((command, *arguments))
+    with _loading(command, help_only=bool({"-h", "--help"} & set(arguments))):
+        module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
+        settings = tyro.cli(
+            module.Arguments,
+            args=arguments,
+            prog=f"concent {command}",
+            description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
+            config=(tyro.conf.HelptextFromCommentsOff,),
+            console_outputs=processes()[0] == 0,
+        )
+        check_settings(settings)
+        module.run(settings)
 
 
 def _summary(arguments: type) -> str:
@@ -184,24 +149,14 @@ def _summary(arguments: type) -> str:
 @contextmanager
 def _loading(command: str, *, help_only: bool) -> Iterator[None]:
     """Print on standard error that a command is loading, unless it has printed something or ended before."""
-    timer = Timer(LOADING_AFTER, lambda: SPOKEN.is_set() or print(f"concent {command}: loading ...", file=sys.stderr))
+    timer = Timer(
+        LOADING_AFTER, lambda: HAS_PRINTED.is_set() or print(f"concent {command}: loading ...", file=sys.stderr)
+    )
     timer.daemon = True
-    SPOKEN.clear()
+    HAS_PRINTED.clear()
     if processes()[0] == 0 and not help_only:
         timer.start()
     try:
         yield
     finally:
         timer.cancel()
-
-
-def _complain(sentence: str) -> None:
-    """Write to standard error; of several processes, which one error stops all, the first that comes to it."""
-    _wait_for_rank_zero()
-    print(sentence, file=sys.stderr)
-
-
-def _wait_for_rank_zero() -> None:
-    """Wait for the first of several processes, which says what is wrong with all and ends them by leaving."""
-    if processes()[0] > 0:
-        time.sleep(PATIENCE)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
 
-SPOKEN = Event()
+HAS_PRINTED = Event()
 """Set once a command has printed something."""
 WIDTH = 80
 """Columns of a table where there is no terminal and COLUMNS is not set."""
@@ -40,7 +40,7 @@ def table_width() -> int:
 
 def say(message: RenderableType) -> None:
     """Write a remark or a table to standard output; text may carry rich's markup."""
-    SPOKEN.set()
+    HAS_PRINTED.set()
     out = _console()
     if isinstance(message, str):
         message = "\n".join(printable(line) for line in message.split("\n"))
@@ -51,7 +51,7 @@ def say_written(*paths: Path) -> None:
     """Write which files are new."""
     from rich.text import Text
 
-    SPOKEN.set()
+    HAS_PRINTED.set()
     out = _console()
     out.print(Text("wrote ") + Text(printable(", ".join(map(str, paths))), style="bold"), soft_wrap=not out.is_terminal)
 
@@ -62,8 +62,8 @@ def one_line_warnings(command: str) -> Iterator[None]:
     before = warnings.formatwarning
 
     def line(message: Warning | str, *_: object, **__: object) -> str:
-        SPOKEN.set()
-        return f"concent {command}: warning: {printable(str(message))}\n"
+        HAS_PRINTED.set()
+        return f"{command}: warning: {printable(' '.join(str(message).split()))}\n"
 
     warnings.formatwarning = line
     try:
@@ -106,14 +106,14 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
             spent = time.monotonic() - begun
             if share > 0 and spent - last >= PLAIN_PERIOD:
                 last = spent
-                SPOKEN.set()
+                HAS_PRINTED.set()
                 out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{_time_left(share, spent, left)}")
 
         yield plain
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    SPOKEN.set()
+    HAS_PRINTED.set()
     columns = (TextColumn(title), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
     with Progress(*columns, console=out, transient=True) as bar:
         task = bar.add_task(title, total=1.0, text="")

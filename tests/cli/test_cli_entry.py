@@ -56,7 +56,7 @@ def test_a_warning_is_one_line_without_a_place_in_the_code(monkeypatch, capsys):
         warnings.simplefilter("always")
         warnings.showwarning = lambda *a: sys.stderr.write(warnings.formatwarning(*a[:4]))
         assert main(["fit"]) == 0
-    assert capsys.readouterr().err == "concent: fit: contacts were dropped\n"
+    assert capsys.readouterr().err == "concent fit: warning: fit: contacts were dropped\n"
     assert warnings.formatwarning is before
 
 

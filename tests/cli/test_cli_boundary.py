@@ -1,0 +1,127 @@
+"""Whatever stops a command becomes one sentence and an exit code, never a traceback."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from concent_warp.cli import boundary, entry, main
+from concent_warp.cli.entry import COMMANDS
+
+
+class OutOfMemoryError(RuntimeError):
+    """An error by the name that torch uses."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (KeyError("x"), 1, "no check foresaw (KeyError: 'x')"),
+        (RuntimeError("a\nb\x1b[31m"), 1, r"(RuntimeError: a b\x1b[31m)"),
+        (AssertionError(), 1, "(AssertionError)"),
+        (MemoryError(), 2, "the memory is not enough"),
+        (OutOfMemoryError("CUDA"), 2, "the memory is not enough"),
+        (RecursionError(), 2, "nested too deeply"),
+        (OSError(28, "No space left on device"), 2, "No space left on device; check the path and the disk."),
+        (UnicodeEncodeError("ascii", "é", 0, 1, "no"), 1, "UnicodeEncodeError"),
+        (KeyboardInterrupt("Go on."), 130, "interrupted. Go on."),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else None,
+)
+def test_what_stops_a_command_is_said_in_one_sentence(command, error, code, words, monkeypatch, tmp_path, capsys):
+    def stop(*_):
+        raise error
+
+    monkeypatch.setattr(boundary.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(entry, "_run", stop)
+    assert main([command, "input"]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.strip().startswith(f"concent {command}: ")
+    assert words in err
+    assert err.strip().count("\n") == 0
+    logs = list(tmp_path.glob("concent_*.log"))
+    if not isinstance(error, (OSError, KeyboardInterrupt)):
+        assert [str(log) for log in logs] == re.findall(r"\S+\.log", err)
+        assert "Traceback" in logs[0].read_text()
+    else:
+        assert logs == []
+
+
+def test_without_a_place_for_the_details_the_sentence_comes_all_the_same(monkeypatch, capsys):
+    def stop(*_):
+        raise KeyError("x")
+
+    def full(**_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(boundary.tempfile, "mkstemp", full)
+    monkeypatch.setattr(entry, "_run", stop)
+    assert main(["fit"]) == 1
+    assert capsys.readouterr().err.endswith("(KeyError: 'x'); check the input.\n")
+
+
+def shell(command, **environment):
+    return subprocess.run(
+        ["bash", "-c", command.replace("concent", f"{sys.executable} -m concent_warp")],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **environment},
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize("command", ["concent --help", "concent --version", "concent fit --help"])
+def test_a_full_disk_behind_standard_output_is_one_sentence(command):
+    done = shell(f"{command} > /dev/full")
+    assert done.returncode == 2
+    assert "No space left on device" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_closed_standard_output_or_error_is_no_failure(bench):
+    for closed in (">&-", "2>&-", ">&- 2>&-"):
+        done = shell(f"concent compare {bench / 'demo.h5'} --model {bench / 'inset.toml'} {closed}")
+        assert (done.returncode, done.stderr) == (0, ""), closed
+    assert shell("concent compare nowhere.h5 2>&-").returncode == 2
+
+
+def test_a_terminal_of_ascii_alone_gets_the_whole_table(bench):
+    command = f"concent compare {bench / 'demo.h5'} --model {bench / 'inset.toml'} --baseline {bench / 'surface.toml'}"
+    done = shell(command, PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "block" in done.stdout
+
+
+SLEEPING = """
+import sys, time
+import concent_warp.cli.entry as entry
+
+def run(*_):
+    try:
+        print("running", flush=True)
+        time.sleep(60)
+    finally:
+        print("cleaned up", flush=True)
+
+entry._run = run
+sys.exit(entry.main(["fit"]))
+"""
+
+
+def test_termination_cleans_up_as_an_interruption_does():
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLEEPING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "running\n"
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 143
+    assert out == "cleaned up\n"
+    assert err == "\nconcent fit: terminated.\n"
