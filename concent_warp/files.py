@@ -28,7 +28,7 @@ def new_file(path: Path) -> Iterator[Path]:
     try:
         lock = _locked(partial)
     except OSError as error:
-        raise _not_written(path, error) from None
+        raise not_written(path, error) from None
     try:
         try:
             yield partial
@@ -41,7 +41,7 @@ def new_file(path: Path) -> Iterator[Path]:
     except OSError as error:
         if error.filename not in (None, str(partial), str(path)):
             raise
-        raise _not_written(path, error) from None
+        raise not_written(path, error) from None
     finally:
         os.close(lock)
 
@@ -65,7 +65,7 @@ def _locked(path: Path) -> int:
         os.close(lock)
 
 
-def _not_written(path: Path, error: OSError) -> ConcentError:
+def not_written(path: Path, error: OSError) -> ConcentError:
     """Return the error that says why a file could not be written."""
     fix = "make room on the disk, or choose another place"
     return ConcentError("the file cannot be written", where=path, found=error.strerror or error, fix=fix)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from concent_warp.files import write_text
+from concent_warp.files import not_written, write_text
 
 CURVE = "curve.jsonl"
 """File of per-iteration metrics in a run folder."""
@@ -32,11 +33,16 @@ def curve(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
     """
     kept = [json.dumps(point) + "\n" for point in read_curve(folder) if point["steps"] <= steps]
     write_text(folder / CURVE, "".join(kept))
-    with (folder / CURVE).open("a") as file, _tensorboard(folder, steps) as board:
+    with (folder / CURVE).open("ab", buffering=0) as file, _tensorboard(folder, steps) as board:
 
         def write(point: Point) -> None:
-            file.write(json.dumps(point) + "\n")
-            file.flush()
+            line, end = json.dumps(point).encode() + b"\n", file.tell()
+            try:
+                while line:  # a full disk takes a part first
+                    line = line[file.write(line) :]
+            except OSError as error:
+                file.truncate(end)
+                raise not_written(folder / CURVE, error) from None
             board(point)
 
         yield write
@@ -50,10 +56,25 @@ def _tensorboard(folder: Path, steps: int) -> Iterator[Callable[[Point], None]]:
     except ImportError:
         yield lambda _: None
         return
-    with SummaryWriter(str(folder), purge_step=steps + 1, flush_secs=10) as writer:
+    reported = threading.excepthook
 
-        def write(point: Point) -> None:
-            for name in point.keys() - {"iteration", "steps", "seconds"}:
-                writer.add_scalar(name.replace(" ", "_"), point[name], point["steps"], point["seconds"])
+    def report(thread: threading.ExceptHookArgs) -> None:
+        """Leave what TensorBoard's thread cannot write to the main thread, which gets the error too."""
+        if not issubclass(thread.exc_type, OSError):
+            reported(thread)
 
-        yield write
+    threading.excepthook = report
+    try:
+        with SummaryWriter(str(folder), purge_step=steps + 1, flush_secs=10) as writer:
+
+            def write(point: Point) -> None:
+                for name in point.keys() - {"iteration", "steps", "seconds"}:
+                    writer.add_scalar(name.replace(" ", "_"), point[name], point["steps"], point["seconds"])
+
+            yield write
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise not_written(folder / "events.out.tfevents", error) from None
+    finally:
+        threading.excepthook = reported

@@ -86,6 +86,12 @@ def _onnx(module: nn.Module, described: dict[str, Any]) -> bytes:
                 module, (example,), input_names=[INPUT], output_names=[OUTPUT], opset_version=OPSET, dynamo=True,
                 dynamic_shapes=({0: torch.export.Dim("worlds")},), verbose=False,
             )  # fmt: skip
+    except torch.onnx.OnnxExporterError as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        found = " ".join(str(cause).split())[:200]
+        raise TrainError("the policy cannot be exported as ONNX", found=found) from None
     finally:
         logging.disable(level)
     assert program is not None

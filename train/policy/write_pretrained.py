@@ -8,15 +8,16 @@ of the training.
 from __future__ import annotations
 
 import shlex
-import shutil
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from concent_warp.checkpoint_file import write_checkpoint
 from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError
 from concent_warp.files import write_text
+from concent_warp.run_folder import exchange, make_folder
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.pretrained import ORIGIN
@@ -43,17 +44,24 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
         raise ConcentError("the folder exists", where=out, fix=fix)
     run, weights = policy.run, policy.weights
     one = replace(run.recording[0], points={}, image={})
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    replace(run, recording=replace(run.recording, demonstrations=(one,))).save(partial)
-    kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
-    write_checkpoint(partial / CHECKPOINT, kept)
-    length = {"iterations": weights["iteration"], "steps": weights["steps"], "seconds": round(weights["seconds"], 1)}
-    origin = length | _origin_of(policy.folder / COMMAND)
-    write_text(partial / ORIGIN, tomli_w.dumps(origin))
-    if out.exists():
-        shutil.rmtree(out)
-    partial.rename(out)
+    make_folder(out.parent)
+    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as made:
+        folder = Path(made) / out.name
+        replace(run, recording=replace(run.recording, demonstrations=(one,))).save(folder)
+        kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
+        write_checkpoint(folder / CHECKPOINT, kept)
+        length = {
+            "iterations": weights["iteration"],
+            "steps": weights["steps"],
+            "seconds": round(weights["seconds"], 1),
+        }
+        origin = length | _origin_of(policy.folder / COMMAND)
+        write_text(folder / ORIGIN, tomli_w.dumps(origin))
+        if not out.exists():
+            folder.rename(out)
+        elif not exchange(folder, out):
+            out.rename(Path(made) / "old")
+            folder.rename(out)
     return origin
 
 

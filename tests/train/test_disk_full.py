@@ -1,0 +1,82 @@
+"""A full disk is said in one sentence with the file; what was there stays whole, and nothing unfinished is left."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_checkpoint_files import copied, trained, training
+
+assert trained
+"""Fixture."""
+CHILD = """
+import json, resource, signal, sys
+from concent_warp.cli import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+before = resource.getrlimit(resource.RLIMIT_FSIZE)
+for limit, arguments in json.loads(sys.argv[1]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    code = main(arguments)
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    sys.stderr.flush()
+    print(f"\\nENDED {code}", file=sys.stderr, flush=True)
+"""
+
+
+def run_limited(commands: list[tuple[int, list[str]]]) -> list[tuple[int, str]]:
+    """Run commands that cannot write larger files than a limit [bytes]; return exit codes and last lines of errors."""
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, json.dumps(commands)], capture_output=True, text=True, timeout=250
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    parts = done.stderr.split("\nENDED ")
+    codes = [int(part.split("\n")[0]) for part in parts[1:]]
+    return [(code, part.strip().splitlines()[-1]) for code, part in zip(codes, parts[:-1], strict=True)]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_training_that_finds_the_disk_full_leaves_the_earlier_one(trained, tmp_path):
+    copied(trained, tmp_path)
+    before = content(tmp_path)
+    limits = [0, 1000, 3000, 12_000, 15_000, 30_000]
+    found = run_limited([(limit, training(tmp_path, "--overwrite")) for limit in limits])
+    for code, said in found:
+        assert code == 2
+        assert said.startswith(f"concent train: {tmp_path}/.run.new/")
+        assert "cannot be written" in said
+    assert len({said for _, said in found}) >= 4
+    assert content(tmp_path) == before
+
+
+def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_path):
+    run = copied(trained, tmp_path)
+    size = (run / "checkpoint.pt").stat().st_size
+    command = training(tmp_path, "--resume", "--iterations", "5000", "--checkpoint", "5000")
+    [(code, said)] = run_limited([(size + 20_000, command)])
+    assert code == 2
+    full = "the file cannot be written; found File too large; make room on the disk, or choose another place."
+    assert said in [f"concent train: {run}/{name}: {full}" for name in ("curve.jsonl", "events.out.tfevents")]
+    assert not list(tmp_path.rglob("*partial*"))
+    [(code, said)] = run_limited([(1 << 30, training(tmp_path, "--resume", "--iterations", "2"))])
+    assert code == 0
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "policy.pt", "pretrained"])
+def test_export_to_a_full_disk_leaves_the_earlier_file(trained, tmp_path, name):
+    run, out = copied(trained, tmp_path), tmp_path / name
+    command = ["export", "--checkpoint", str(run), "--out", str(out), "--overwrite"]
+    command += ["--as-pretrained"] * (name == "pretrained")
+    [(code, _)] = run_limited([(1 << 30, command)])
+    assert code == 0
+    before = content(tmp_path)
+    for code, said in run_limited([(limit, command) for limit in (0, 1000, 5000)]):
+        assert code == 2
+        assert said.startswith("concent export: ")
+        assert "cannot be" in said
+    assert content(tmp_path) == before
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} <= {"run", "pretrained"}
