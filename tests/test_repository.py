@@ -62,3 +62,8 @@ def test_issue_template_is_a_form_with_a_required_field(root, name):
 def test_bug_template_asks_for_recording_model_command_and_versions(root):
     form = load(root / ".github" / "ISSUE_TEMPLATE" / "bug.yml")
     assert {"recording", "model", "command", "versions"} <= {part["id"] for part in form["body"]}
+
+
+def test_test_files_have_names_of_their_own(root):
+    names = [path.name for path in (root / "tests").rglob("test_*.py")]
+    assert sorted({name for name in names if names.count(name) > 1}) == []  # pytest imports each by its name alone

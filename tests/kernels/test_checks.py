@@ -250,7 +250,7 @@ def test_a_table_is_refused_by_the_name_of_what_is_wrong():
     for name in ("point_a", "point_b", "normal"):
         with pytest.raises(ValueError, match=rf"{name} must be of shape \(1, 2, 3\)"):
             table(**{name: np.zeros((1, 2))})
-        with pytest.raises(ValueError, match=f"{name} holds values that are not finite"):
+        with pytest.raises(ValueError, match=f"{name} has values that are not finite"):
             table(**{name: np.full((1, 2, 3), np.inf)})
     for active in (np.ones(2), np.ones((0, 2)), np.ones((2, 0)), np.ones((1, 1, 2))):
         with pytest.raises(ValueError, match="active must be of shape"):
