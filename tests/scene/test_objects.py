@@ -111,6 +111,9 @@ def test_broken_files_get_one_clear_sentence(tmp_path):
         "few.xyz": (b"0 0 0\n.1 0 0\n0 .1 0\n0 0 .1\n", "too few points"),
         "cut.npy": (b"\x93NUMPY", "points cannot be read"),
         "pickle.npy": (pickled(tmp_path), "points cannot be read"),
+        "huge.npy": (npy("f8", "(2000000000000, 3)"), "points cannot be read"),
+        "unclosed.npy": (npy("f8", "((2, 3)"), "points cannot be read"),
+        "records.npy": (npy("f8', 'x", "(2, 3)"), "points cannot be read"),
         "normals.ply": (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float nx\nend_header\n1\n",
             "no coordinates",
@@ -124,6 +127,12 @@ def test_broken_files_get_one_clear_sentence(tmp_path):
             load_object(path, "thing")
         assert name in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def npy(kind: str, shape: str) -> bytes:
+    """Return an .npy file with 16 bytes of data, whatever its header says."""
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + bytes(16)
 
 
 def pickled(folder) -> bytes:

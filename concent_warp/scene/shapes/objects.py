@@ -189,8 +189,9 @@ def read_points(path: Path, opacity: float = 0.5) -> np.ndarray:
         try:
             table = np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else np.loadtxt(path, ndmin=2)
             points = np.asarray(table, dtype=float)
-        except (ValueError, EOFError, OSError, UnicodeDecodeError) as error:
-            raise SceneError("the points cannot be read", where=path, expected="rows of x y z", found=error) from None
+        except Exception as error:  # NumPy raises whatever its parsers do, and MemoryError where a header lies
+            found = " ".join(str(error).split())[:300] or type(error).__name__
+            raise SceneError("the points cannot be read", where=path, expected="rows of x y z", found=found) from None
     if points.ndim != 2 or points.shape[1] < 3:
         raise SceneError("the points have the wrong shape", where=path, expected="(n, 3)", found=points.shape)
     if not np.isfinite(points[:, :3]).all():
