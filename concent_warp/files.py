@@ -6,10 +6,110 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import ConcentError
+
+
+@dataclass
+class _Claims:
+    """Files that a command is going to write."""
+
+    locks: dict[Path, int] = field(default_factory=dict)
+    """Descriptors of the locked files that they are written to first, by their names."""
+    folders: list[Path] = field(default_factory=list)
+    """Folders that were made for them."""
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A written file that has not got its name yet."""
+
+    partial: Path
+    path: Path
+    lock: int
+
+    def discard(self) -> None:
+        """Remove it."""
+        self.partial.unlink(missing_ok=True)
+        os.close(self.lock)
+
+
+_claims: ContextVar[_Claims | None] = ContextVar("files that a command is going to write", default=None)
+_pending: ContextVar[dict[Path, _Pending] | None] = ContextVar("written files without a name yet", default=None)
+
+
+@contextmanager
+def claimed_files() -> Iterator[None]:
+    """Keep the files that `claim` names for this process until the end of the context, and clean up after them."""
+    claims = _Claims()
+    token = _claims.set(claims)
+    try:
+        yield
+    finally:
+        _claims.reset(token)
+        for partial, lock in claims.locks.items():
+            with suppress(OSError):
+                if os.path.samestat(os.fstat(lock), partial.stat()):
+                    partial.unlink()
+            os.close(lock)
+        for folder in reversed(claims.folders):
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def claim(path: Path) -> None:
+    """Keep a file for this process, within `claimed_files`; without effect outside of it.
+
+    The folder is made; it is removed at the end where nothing was written to it.
+
+    Raises:
+        ConcentError: Another process writes the file, or its folder cannot be made.
+    """
+    claims = _claims.get()
+    if claims is None:
+        return
+    partial = _partial(path)
+    key = _key(partial)
+    if key in claims.locks:
+        raise ConcentError("two results would be written to one file", where=path, fix="choose two names")
+    try:
+        for folder in reversed((path.parent, *path.parent.parents)):
+            if not folder.exists():
+                folder.mkdir(exist_ok=True)
+                claims.folders.append(folder)
+        claims.locks[key] = _locked(partial, wait=False)
+    except BlockingIOError:
+        fix = "wait until it has ended, or choose another name"
+        raise ConcentError("another command is writing to this place", where=path, fix=fix) from None
+    except OSError as error:
+        raise not_written(path, error) from None
+
+
+@contextmanager
+def all_or_none() -> Iterator[None]:
+    """Give the files of `new_file` within the context their names at its end, or remove all if something fails."""
+    if _pending.get() is not None:
+        yield
+        return
+    pending: dict[Path, _Pending] = {}
+    token = _pending.set(pending)
+    try:
+        yield
+        while pending:
+            key, file = next(iter(pending.items()))
+            try:
+                file.partial.replace(file.path)
+            except OSError as error:
+                raise not_written(file.path, error) from None
+            os.close(pending.pop(key).lock)
+    finally:
+        _pending.reset(token)
+        for file in pending.values():
+            file.discard()
 
 
 @contextmanager
@@ -24,9 +124,11 @@ def new_file(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not path.is_file():
         raise ConcentError("not a file", where=path, expected="the name of a file to write")
-    partial = path.with_name(f".{path.name}.partial")
+    partial, pending, key = _partial(path), _pending.get(), _key(path)
+    if pending is not None and key in pending:
+        pending.pop(key).discard()
     try:
-        lock = _locked(partial)
+        lock = _own_lock(partial)
     except OSError as error:
         raise not_written(path, error) from None
     try:
@@ -34,7 +136,10 @@ def new_file(path: Path) -> Iterator[Path]:
             yield partial
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())
-            partial.replace(path)
+            if pending is not None:
+                pending[key] = _Pending(partial, path, os.dup(lock))
+            else:
+                partial.replace(path)
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
@@ -46,16 +151,47 @@ def new_file(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
-def _locked(path: Path) -> int:
-    """Return the descriptor of an empty file at `path`, locked for this process until it is closed."""
+def _partial(path: Path) -> Path:
+    """Return the name of a file while it is being written."""
+    return path.with_name(f".{path.name}.partial")
+
+
+def _key(path: Path) -> Path:
+    """Return one name for all spellings of the path of a file."""
+    return path.parent.resolve() / path.name
+
+
+def _own_lock(partial: Path) -> int:
+    """Return the descriptor of an empty file, locked for this process, which may have claimed it before."""
+    claims = _claims.get()
+    claimed = None if claims is None else claims.locks.get(_key(partial))
+    if claimed is not None:
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(claimed), partial.stat()):
+                os.ftruncate(claimed, 0)
+                return os.dup(claimed)
+    return _locked(partial)
+
+
+def _locked(path: Path, *, wait: bool = True) -> int:
+    """Return the descriptor of an empty file at `path`, locked for this process until it is closed.
+
+    Raises:
+        BlockingIOError: Another process has locked it, and it is not to be waited for.
+    """
     try:
         import fcntl
     except ImportError:  # Windows
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
     while True:
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        with suppress(OSError):  # some network disks have no locks
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            raise
+        except OSError:  # some network disks have no locks
+            pass
         try:
             if os.path.samestat(os.fstat(lock), os.stat(path)):  # another process may have moved it meanwhile
                 os.ftruncate(lock, 0)

@@ -16,7 +16,7 @@ from concent_warp.effects.effect import AddedEffect, Effect, prepare, write
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.table import checked_values, effects_table, read_effects
 from concent_warp.errors import ModelError
-from concent_warp.files import write_text
+from concent_warp.files import all_or_none, write_text
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
@@ -186,21 +186,23 @@ class Model:
     def save(self, path: str | Path) -> None:
         """Write `path` (``.toml``), the scene as ``.xml`` and the geometry as ``.npz`` beside it.
 
-        Each file is written in one piece; the ``.toml`` last, so that it never names files that are not there.
+        All files are replaced, the ``.toml`` last, or none.
         """
         import tomli_w
 
         path = Path(path)
         document: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         document["scene"] = f"{path.stem}.scene.xml"
-        write_text(path.with_name(document["scene"]), self.scene.xml)
         if self.geometry is not None:
             document["geometry"] = f"{path.stem}.geometry.npz"
-            self.geometry.save(path.with_name(document["geometry"]))
         document["contact"] = {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self.contact).items()}
         if self.effects:
             document["effect"] = effects_table(self.effects)
-        write_text(path, tomli_w.dumps(document))
+        with all_or_none():
+            write_text(path.with_name(document["scene"]), self.scene.xml)
+            if self.geometry is not None:
+                self.geometry.save(path.with_name(document["geometry"]))
+            write_text(path, tomli_w.dumps(document))
 
     @staticmethod
     def load(path: str | Path) -> Model:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import ConcentError, TrainError
-from concent_warp.files import write_text
+from concent_warp.files import claim, write_text
 from concent_warp.version import __version__
 
 SETTINGS = "settings.toml"
@@ -37,11 +37,18 @@ PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
 
 
 def claim_file(path: Path, *, overwrite: bool) -> None:
-    """Check that a file may be written.
+    """Check that a file may be written, and keep it for the running command.
 
     Raises:
-        ConcentError: It exists and `overwrite` was not asked for.
+        ConcentError: It exists and `overwrite` was not asked for, or another command is writing it.
     """
+    _check_writable(path, overwrite=overwrite)
+    claim(path)
+    _check_writable(path, overwrite=overwrite)  # another command may just have written it
+
+
+def _check_writable(path: Path, *, overwrite: bool) -> None:
+    """Raise an error where a file must not be written, see `claim_file`."""
     if path.is_dir():
         raise ConcentError("this is a folder", where=path, expected="the name of a file to write")
     if path.exists() and not path.is_file():
@@ -230,6 +237,21 @@ def _held(folder: Path, path: Path, *, unfinished: bool) -> ConcentError:
         return ConcentError("the folder holds a run that was interrupted", where=folder, fix=fix)
     fix = "continue it with --resume, or start anew with --overwrite or elsewhere"
     return ConcentError("the folder holds a run that was interrupted", where=folder, fix=fix)
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and keep it for this process within the context.
+
+    Raises:
+        ConcentError: It cannot be made, or another process writes to it.
+    """
+    make_folder(folder)
+    lock = _locked(folder)
+    try:
+        yield
+    finally:
+        os.close(lock)
 
 
 def _locked(folder: Path) -> int:

@@ -123,6 +123,7 @@ def _run(command: str, arguments: Sequence[str]) -> None:
     import tyro
 
     from concent_warp.checks import check_settings
+    from concent_warp.files import claimed_files
     from concent_warp.run_folder import INVOCATION
 
     INVOCATION.set((command, *arguments))
@@ -137,7 +138,8 @@ def _run(command: str, arguments: Sequence[str]) -> None:
             console_outputs=processes()[0] == 0,
         )
         check_settings(settings)
-        module.run(settings)
+        with claimed_files():
+            module.run(settings)
 
 
 def _summary(arguments: type) -> str:

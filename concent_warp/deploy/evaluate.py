@@ -13,6 +13,7 @@ import torch
 from concent_warp.checks import check_device
 from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
 from concent_warp.deploy.reality_world import reality_environment, reality_world
+from concent_warp.files import all_or_none
 from concent_warp.reality.hidden.in_task import TaskWorld
 from concent_warp.reality.sensors.video import filmed, write_video
 from concent_warp.run_folder import claim_file, make_folder
@@ -124,15 +125,16 @@ def _write_videos(
 ) -> None:
     """Write videos of episodes from the initial states `starts`; `period` is the time between states [s]."""
     bodies = tuple(task.compiled.body(i).name for i in task.objects)
-    for k, (path, states) in enumerate(zip(files, episodes.states, strict=True)):
-        make_folder(path.parent)
-        spec = world.spec()
-        for body in task.objects:
-            mocap = int(task.compiled.body_mocapid[body])
-            if mocap >= 0:
-                placed = spec.body(task.compiled.body(body).name)
-                placed.pos, placed.quat = starts.mocap[k, mocap, :3], starts.mocap[k, mocap, 3:]
-        write_video(path, filmed(spec, bodies, np.array(states), period), 1 / period)
+    with all_or_none():
+        for k, (path, states) in enumerate(zip(files, episodes.states, strict=True)):
+            make_folder(path.parent)
+            spec = world.spec()
+            for body in task.objects:
+                mocap = int(task.compiled.body_mocapid[body])
+                if mocap >= 0:
+                    placed = spec.body(task.compiled.body(body).name)
+                    placed.pos, placed.quat = starts.mocap[k, mocap, :3], starts.mocap[k, mocap, 3:]
+            write_video(path, filmed(spec, bodies, np.array(states), period), 1 / period)
 
 
 def without_reality(cfg: EvaluateCfg) -> EvaluateCfg:

@@ -13,7 +13,7 @@ from concent_warp.diagnosis.tasks import Progress, TaskRunner, silent
 from concent_warp.files import write_json
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
-from concent_warp.run_folder import versions
+from concent_warp.run_folder import lock_folder, versions
 from concent_warp.simulate.select import EngineName
 
 EXPERIMENT_FILE = "next_experiment.json"
@@ -45,6 +45,7 @@ def diagnose(
         RecordingError: The recording has too few readings, or does not match the model.
         ModelError: The model diverges on all of the recording.
         EngineError: The model cannot be simulated.
+        ConcentError: Another process writes to `out`.
 
     Example:
         >>> import concent_warp as cw
@@ -57,10 +58,17 @@ def diagnose(
     model.check_recording(recording)
     cfg, progress = cfg or DiagnoseCfg(), progress or silent
     if out is None:
-        runner = TaskRunner(cfg.jobs, progress)
-    else:
+        return _diagnosed(model, recording, cfg, TaskRunner(cfg.jobs, progress), engine)
+    with lock_folder(Path(out)):
         runner = checkpointed_runner(model, recording, cfg, progress, engine, Path(out))
-    found = replace(Procedure(model, recording, cfg, runner, engine).run(), versions=versions())
-    if out is not None and found.next_experiment is not None:
-        write_json(Path(out) / EXPERIMENT_FILE, found.next_experiment.to_json())
+        found = _diagnosed(model, recording, cfg, runner, engine)
+        if found.next_experiment is not None:
+            write_json(Path(out) / EXPERIMENT_FILE, found.next_experiment.to_json())
     return found
+
+
+def _diagnosed(
+    model: Model, recording: Recording, cfg: DiagnoseCfg, runner: TaskRunner, engine: EngineName
+) -> Diagnosis:
+    """Return the diagnosis by the tasks of a runner."""
+    return replace(Procedure(model, recording, cfg, runner, engine).run(), versions=versions())

@@ -9,6 +9,7 @@ from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.extract import extract
 from concent_warp.events.schedule import plot_schedule
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName, make_engine
@@ -71,9 +72,10 @@ def event_paths(names: Sequence[str], folder: Path, *, plain_name: bool = True) 
 
 
 def save_events(events: Mapping[str, ContactEventSequence], folder: Path, *, plain_name: bool = True) -> list[Path]:
-    """Write the event file and the schedule plot of each demonstration, and return all paths."""
+    """Write the event file and the schedule plot of each demonstration, all or none, and return all paths."""
     paths = event_paths(list(events), folder, plain_name=plain_name)
-    for sequence, (file, plot) in zip(events.values(), paths, strict=True):
-        sequence.save(file)
-        plot_schedule(sequence, plot)
+    with all_or_none():
+        for sequence, (file, plot) in zip(events.values(), paths, strict=True):
+            sequence.save(file)
+            plot_schedule(sequence, plot)
     return [path for pair_of in paths for path in pair_of]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.engine import Rollout
@@ -49,12 +50,13 @@ def replay(
     model.check_recording(recording)
     simulator = make_engine(engine, model)
     found = {}
-    for k, d in enumerate(recording.demonstrations):
-        found[d.name] = replay_demonstration(model, d, simulator, contacts="all").numpy()
-        if out is not None:
-            save_rollout(found[d.name], simulator.compiled, rollout_path(Path(out), recording, d.name))
-        if progress is not None:
-            progress((k + 1) / len(recording.demonstrations))
+    with all_or_none():
+        for k, d in enumerate(recording.demonstrations):
+            found[d.name] = replay_demonstration(model, d, simulator, contacts="all").numpy()
+            if out is not None:
+                save_rollout(found[d.name], simulator.compiled, rollout_path(Path(out), recording, d.name))
+            if progress is not None:
+                progress((k + 1) / len(recording.demonstrations))
     return found
 
 

@@ -18,6 +18,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
+from concent_warp.array_file import write_arrays
 from concent_warp.checkpoint_file import check_state, read_checkpoint, write_checkpoint
 from concent_warp.checks import check_at_least
 from concent_warp.errors import TrainError
@@ -228,7 +229,7 @@ class Trainer:
             or (self.folder / DIVERGED_STATE_FILE).exists()
         ):
             return
-        np.savez(self.folder / DIVERGED_STATE_FILE, **states[0])  # pyright: ignore[reportArgumentType]
+        write_arrays(self.folder / DIVERGED_STATE_FILE, states[0])
 
     def _make_room(self, share: float) -> None:
         """Warn of contacts that were dropped in a share of the steps, and go on with buffers twice as large.

@@ -16,7 +16,7 @@ from typing import Any
 from concent_warp.checkpoint_file import write_checkpoint
 from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError
-from concent_warp.files import write_text
+from concent_warp.files import claim, write_text
 from concent_warp.run_folder import exchange, make_folder
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
@@ -39,9 +39,9 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
     """
     import tomli_w
 
-    if out.exists() and not (overwrite and (out / ORIGIN).is_file()):
-        fix = "pass --overwrite" if (out / ORIGIN).is_file() else "choose another folder"
-        raise ConcentError("the folder exists", where=out, fix=fix)
+    _check_replaceable(out, overwrite=overwrite)
+    claim(out)
+    _check_replaceable(out, overwrite=overwrite)  # another command may just have written it
     run, weights = policy.run, policy.weights
     one = replace(run.recording[0], points={}, image={})
     make_folder(out.parent)
@@ -63,6 +63,17 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
             out.rename(Path(made) / "old")
             folder.rename(out)
     return origin
+
+
+def _check_replaceable(out: Path, *, overwrite: bool) -> None:
+    """Check that a policy may be written to a folder.
+
+    Raises:
+        ConcentError: The folder exists and is not replaced.
+    """
+    if out.exists() and not (overwrite and (out / ORIGIN).is_file()):
+        fix = "pass --overwrite" if (out / ORIGIN).is_file() else "choose another folder"
+        raise ConcentError("the folder exists", where=out, fix=fix)
 
 
 def _origin_of(settings: Path) -> dict[str, Any]:

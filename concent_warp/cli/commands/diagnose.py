@@ -20,6 +20,7 @@ from concent_warp.diagnosis.diagnose import EXPERIMENT_FILE, diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
+from concent_warp.files import all_or_none
 from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
@@ -85,20 +86,13 @@ def run(arguments: Arguments) -> Diagnosis:
         _say_diagnosis(found)
     if arguments.out is not None and found.next_experiment is not None and not arguments.json:
         say_written(arguments.out / EXPERIMENT_FILE)
-    if arguments.apply is not None:
+    with all_or_none():
         _save_accepted(arguments, found, recording)
-    if arguments.html is not None:
-        from concent_warp.report.report import write_report
-
-        models = {"model": found.models[0]}
-        if found.accepted:
-            models = {"before": found.models[0], "after": found.model}
-        comparison = compare_replays(models, recording, arguments.engine, seed=arguments.seed)
-        settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
-        make_folder(arguments.html.parent)
-        write_report(arguments.html, recording, comparison, settings=settings, diagnosis=found.to_json())
-        if not arguments.json:
-            say_written(arguments.html)
+        _write_report(arguments, found, recording)
+    if not arguments.json:
+        for path in (arguments.apply if found.accepted else None, arguments.html):
+            if path is not None:
+                say_written(path)
     return found
 
 
@@ -207,4 +201,18 @@ def _save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording)
     fitted.model.save(path)
     if not arguments.json:
         say_fitted(fitted)
-        say_written(path)
+
+
+def _write_report(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
+    """Write the report that is asked for."""
+    if arguments.html is None:
+        return
+    from concent_warp.report.report import write_report
+
+    models = {"model": found.models[0]}
+    if found.accepted:
+        models = {"before": found.models[0], "after": found.model}
+    comparison = compare_replays(models, recording, arguments.engine, seed=arguments.seed)
+    settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+    make_folder(arguments.html.parent)
+    write_report(arguments.html, recording, comparison, settings=settings, diagnosis=found.to_json())

@@ -12,6 +12,7 @@ import tyro
 from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
+from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.scene.scene import Scene
@@ -49,14 +50,16 @@ def run(arguments: Arguments) -> Model:
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
     model = _build(arguments)
-    if arguments.out is not None:
-        make_folder(arguments.out.parent)
-        model.save(arguments.out)
-        say_written(arguments.out)
-    if arguments.export is not None:
-        make_folder(arguments.export.parent)
-        save_mjcf(model, arguments.export)
-        say_written(arguments.export)
+    with all_or_none():
+        if arguments.out is not None:
+            make_folder(arguments.out.parent)
+            model.save(arguments.out)
+        if arguments.export is not None:
+            make_folder(arguments.export.parent)
+            save_mjcf(model, arguments.export)
+    for path in (arguments.out, arguments.export):
+        if path is not None:
+            say_written(path)
     if (geometry := model.geometry) is None:
         return model
     for body in geometry.bodies:

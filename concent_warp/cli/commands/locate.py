@@ -16,6 +16,7 @@ from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.errors import RecordingError
+from concent_warp.files import all_or_none
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
@@ -60,22 +61,23 @@ def run(arguments: Arguments) -> UnexplainedForces:
         for sentence in found.sentences():
             say(escape(sentence))
     written = []
-    if arguments.png is not None:
-        from concent_warp.diagnosis.forces.plot import plot_location
+    with all_or_none():
+        if arguments.png is not None:
+            from concent_warp.diagnosis.forces.plot import plot_location
 
-        make_folder(arguments.png.parent)
-        plot_location(found, model, arguments.png)
-        written.append(arguments.png)
-    if arguments.html is not None:
-        from concent_warp.comparison.compare import compare_replays
-        from concent_warp.report.report import write_report
+            make_folder(arguments.png.parent)
+            plot_location(found, model, arguments.png)
+            written.append(arguments.png)
+        if arguments.html is not None:
+            from concent_warp.comparison.compare import compare_replays
+            from concent_warp.report.report import write_report
 
-        models = {"model": model}
-        settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
-        make_folder(arguments.html.parent)
-        compared = compare_replays(models, recording, arguments.engine)
-        write_report(arguments.html, recording, compared, settings=settings, location=found.to_json())
-        written.append(arguments.html)
+            models = {"model": model}
+            settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+            make_folder(arguments.html.parent)
+            compared = compare_replays(models, recording, arguments.engine)
+            write_report(arguments.html, recording, compared, settings=settings, location=found.to_json())
+            written.append(arguments.html)
     if written and not arguments.json:
         say_written(*written)
     return found

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ConcentError
+from concent_warp.files import new_file
 from concent_warp.reality.sensors.camera import film
 from concent_warp.reality.sensors.sensing import SensingCfg
 
@@ -61,14 +62,37 @@ def write_video(path: Path, frames: np.ndarray, rate: float) -> None:
     """
     import cv2
 
-    partial = path.with_name(f".{path.stem}.partial.mp4")
     height, width = frames.shape[1:3]
-    for codec in CODECS:
-        writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*codec), rate, (width, height))
-        if writer.isOpened():
-            for frame in frames:
-                writer.write(np.ascontiguousarray(frame[..., ::-1]))
-            writer.release()
-            partial.replace(path)
-            return
-    raise ConcentError("OpenCV cannot write this video", where=path, expected=f"a codec among {', '.join(CODECS)}")
+    with new_file(path) as partial:
+        video = partial.with_name(f"{partial.name}.mp4")  # OpenCV knows the format by the end of the name
+        try:
+            for codec in CODECS:
+                writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*codec), rate, (width, height))
+                if writer.isOpened():
+                    for frame in frames:
+                        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+                    writer.release()
+                    _check_video(video, len(frames), path)
+                    video.replace(partial)
+                    return
+        finally:
+            video.unlink(missing_ok=True)
+        raise ConcentError("OpenCV cannot write this video", where=path, expected=f"a codec among {', '.join(CODECS)}")
+
+
+def _check_video(video: Path, count: int, path: Path) -> None:
+    """Raise an error unless a video has all its frames; OpenCV does not say that a disk is full.
+
+    Raises:
+        ConcentError: It lacks some; `path` is where it was to go.
+    """
+    import cv2
+
+    reader = cv2.VideoCapture(str(video))
+    found = 0
+    while reader.grab():
+        found += 1
+    reader.release()
+    if found != count:
+        fix = "make room on the disk, or choose another place"
+        raise ConcentError("the video cannot be written", where=path, expected=f"{count} frames", found=found, fix=fix)
