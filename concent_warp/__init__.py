@@ -48,6 +48,7 @@ _HOMES = {
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
     "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
     "scene.scene": ("Scene",),
     "scene.spheres.build": ("ContactGeometryCfg",),
@@ -103,6 +104,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
     from concent_warp.scene.scene import Scene
     from concent_warp.scene.spheres.build import ContactGeometryCfg

@@ -53,7 +53,7 @@ class GroundCfg:
     """How the fit searches: evolution strategy, gradients through Newton, or the latter as a start for the former."""
     overlap_frame: float = 0.01
     """Length of the frames in which contact is compared with the truth [s]: shorter than contacts that count, see
-    `StagingCfg.blip`."""
+    `StagingCfg.min_contact_duration`."""
 
 
 @dataclass(frozen=True)

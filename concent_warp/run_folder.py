@@ -175,7 +175,7 @@ def _claim_folder(folder: Path, *, overwrite: bool, resume: bool, keep_folders: 
         if resume and waiting:
             return RunFolder(folder, after, keep_folders, "unfinished", False, [*locks, _locked(after)])
         if not overwrite and not resume and (waiting or holds != "nothing"):
-            raise _held(folder, after if waiting else folder, unfinished=waiting or holds == "unfinished")
+            raise _existing_run_error(folder, after if waiting else folder, unfinished=waiting or holds == "unfinished")
         shutil.rmtree(before, ignore_errors=True)
         if after.exists():
             locks.append(_locked(after))
@@ -226,8 +226,8 @@ def _content(folder: Path) -> str:
     return "finished" if (folder / SETTINGS).is_file() else "other"
 
 
-def _held(folder: Path, path: Path, *, unfinished: bool) -> ConcentError:
-    """Return the error about a run that is in the way, with the command that continues it."""
+def _existing_run_error(folder: Path, path: Path, *, unfinished: bool) -> ConcentError:
+    """Return the error that a folder holds a run, with the command that continues it."""
     if not unfinished:
         fix = "choose another folder, or pass --overwrite or --resume"
         return ConcentError("the folder holds a run", where=folder, fix=fix)

@@ -13,15 +13,14 @@ from concent_warp.files import new_file
 from concent_warp.render.composite import Layers
 
 COLUMNS = ("raw simulation", "hybrid composite", "robot and background", "objects", "object shadows")
-KEPT = 8
-"""Frames that are kept to choose from."""
 
 
 class FrameSelection:
     """Some frames of an episode, spread over it, however long it becomes."""
 
-    def __init__(self, shares: Sequence[float] = (0.3, 0.8)) -> None:
-        """Select frames by their positions in the episode, as shares of its length."""
+    def __init__(self, shares: Sequence[float] = (0.3, 0.8), max_frames: int = 8) -> None:
+        """Select frames by their positions in the episode, as shares of its length, from at most `max_frames`."""
+        self._max_frames = max_frames
         self._shares, self._every, self._count = tuple(shares), 1, 0
         self._kept: list[tuple[int, Layers]] = []
 
@@ -33,7 +32,7 @@ class FrameSelection:
         """Add the next frame."""
         if self._count % self._every == 0:
             self._kept.append((self._count, layers.clone(world)))
-            if len(self._kept) > KEPT:
+            if len(self._kept) > self._max_frames:
                 self._kept, self._every = self._kept[::2], 2 * self._every
         self._count += 1
 

@@ -204,7 +204,7 @@ class ResetCfg:
     1 than at its end."""
     before: float = 0.3
     """Time before the preceding stage from which states are sampled [s]."""
-    settle: float = 0.1
+    settling_time: float = 0.1
     """Time for which a state is simulated with constant commands before it is accepted [s]."""
     slip: float = 0.003
     """Largest accepted motion of a grasped object in the hand during that time [m]."""

@@ -35,7 +35,7 @@ from concent_warp.scene.spheres.build import ContactGeometryCfg
 HIDDEN = "actuator_delay=0.1"
 """What is hidden in Reality of some cases: commands that act a tenth of a second late. Demonstrations still
 succeed under it, policies that do not know of it fail more often."""
-FIT = FitCfg(evolution=EvolutionCfg(population=40), plateau_generations=20, least_gain=1e-3)
+FIT = FitCfg(evolution=EvolutionCfg(population=40), plateau_generations=20, min_gain=1e-3)
 """Settings of the fits that the page on Table 1 was made from: more candidates and generations than by default."""
 MODEL, DEMONSTRATION, WORLD = "model.toml", "demonstration.h5", "hidden.txt"
 

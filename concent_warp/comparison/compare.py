@@ -12,7 +12,7 @@ import numpy as np
 from concent_warp.comparison.bootstrap import BootstrapCfg
 from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, has_task, phases_by_body, stage_phases
-from concent_warp.comparison.residuals import instrument_noise, residuals
+from concent_warp.comparison.residuals import ResidualCfg, instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.worst_spans import WorstSpanCfg, find_worst_spans, rank_worst_spans
 from concent_warp.errors import EventsError, ModelError, RecordingError
@@ -48,6 +48,8 @@ class CompareCfg:
     """Settings of the intervals of mean errors."""
     motion_phases: MotionPhaseCfg = field(default_factory=MotionPhaseCfg)
     """Settings of the phases of motion."""
+    residuals: ResidualCfg = field(default_factory=ResidualCfg)
+    """Settings of the residuals."""
     worst_spans: WorstSpanCfg = field(default_factory=WorstSpanCfg)
     """Settings of the search for spans of large error."""
 
@@ -112,6 +114,7 @@ def compare(
         seed=cfg.seed,
         bootstrap=cfg.bootstrap,
         motion_cfg=cfg.motion_phases,
+        residual_cfg=cfg.residuals,
         span_cfg=cfg.worst_spans,
         progress=progress,
     )
@@ -131,6 +134,7 @@ def compare_replays(
     seed: int = 0,
     bootstrap: BootstrapCfg | None = None,
     motion_cfg: MotionPhaseCfg | None = None,
+    residual_cfg: ResidualCfg | None = None,
     span_cfg: WorstSpanCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
@@ -149,6 +153,7 @@ def compare_replays(
         seed: Seed of the bootstrap.
         bootstrap: Settings of the intervals of mean errors.
         motion_cfg: Settings of the phases of motion.
+        residual_cfg: Settings of the residuals.
         span_cfg: Settings of the search for spans of large error.
         progress: Called with the share done, 0..1.
 
@@ -170,7 +175,7 @@ def compare_replays(
         noise = instrument_noise(compiled, recording.demonstrations)
         for d in chosen:
             rollout = replay(model, d, simulator, contacts="all" if name == last else "none").numpy()
-            found[name, d.name] = residuals(compiled, rollout, d, noise, model.effects)
+            found[name, d.name] = residuals(compiled, rollout, d, noise, model.effects, residual_cfg)
             if rollout.diverged[0]:
                 bad = ~np.isfinite(rollout.qpos[0]).all(axis=1)
                 diverged[name, d.name] = float(rollout.time[np.argmax(bad)] if bad.any() else rollout.time[-1])

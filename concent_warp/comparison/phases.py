@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from concent_warp.events.filter import drop_blips, runs, steps_of, windowed
+from concent_warp.events.filter import drop_short_contacts, runs, steps_of, windowed
 from concent_warp.events.grasp import forces_cancel
 from concent_warp.events.roles import Roles
 from concent_warp.events.staging import ROBOT
@@ -210,7 +210,7 @@ def _body_state(
     state = np.full(steps, MOTIONS.index(FREE))
     state[touching] = MOTIONS.index(STICK)
     state[touching & (_slip(rows, motion, speeds, cfg.majority_window) > cfg.slide_speed)] = MOTIONS.index(SLIDE)
-    still = drop_blips(speeds.fastest(body) < cfg.rest_speed, steps_of(cfg.min_rest, dt))
+    still = drop_short_contacts(speeds.fastest(body) < cfg.rest_speed, steps_of(cfg.min_rest, dt))
     state[still] = MOTIONS.index(REST)
     hands = rows[np.asarray(np.isin(rows.body, roles.ids("robot")).any(axis=1))]
     if len(hands.step) and roles.body_role[body] != "robot":

@@ -22,8 +22,14 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Demonstration, PointTrack
     from concent_warp.simulate.engine import Rollout
 
-ANCHOR_FRAMES = 5
-"""Frames of a point track, from the first on, that tell where on the body a point sits."""
+
+@dataclass(frozen=True)
+class ResidualCfg:
+    """How residuals are computed."""
+
+    anchor_frames: int = 5
+    """First frames of a point track from which the points' positions on the body are estimated [-]: few, because the
+    model's own motion carries them; several, so that their scatter gives the noise."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ def residuals(
     demonstration: Demonstration,
     noise: Mapping[str, Noise] | None = None,
     effects: Sequence[AddedEffect] = (),
+    cfg: ResidualCfg | None = None,
 ) -> tuple[Residual, ...]:
     """Return the residuals of every measured channel and every point track.
 
@@ -77,6 +84,7 @@ def residuals(
         demonstration: What was measured.
         noise: Noise by channel (`instrument_noise`); estimated from this demonstration alone where there is none.
         effects: Those of the model; what they do to the instruments is in what is predicted.
+        cfg: Settings.
 
     Raises:
         RecordingError: A channel names a sensor or a body that the model lacks, or has another dimension.
@@ -96,7 +104,7 @@ def residuals(
                 where=demonstration.name,
                 expected=f"one of {list(rollout.bodies)}",
             )
-        found.append(_point_residual(rollout, body, track))
+        found.append(_point_residual(rollout, body, track, (cfg or ResidualCfg()).anchor_frames))
     return tuple(found)
 
 
@@ -182,10 +190,10 @@ def _extent(value: np.ndarray, kind: Kind) -> float:
     return float(np.linalg.norm(np.ptp(valid, axis=0)))
 
 
-def _point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
+def _point_residual(rollout: Rollout, body: str, track: PointTrack, anchor_frames: int) -> Residual:
     """Return the residual of a point track: each material point against where the model's body carries it.
 
-    Where a point sits on the body is the mean of its first `ANCHOR_FRAMES` observations, brought into the body frame by
+    Where a point sits on the body is the mean of its first `anchor_frames` observations, brought into the body frame by
     the model's own pose at these times; points not seen then take no part. What these observations scatter tells the
     noise.
     """
@@ -194,7 +202,8 @@ def _point_residual(rollout: Rollout, body: str, track: PointTrack) -> Residual:
     quaternion = interpolate(rollout.time, same_sign(rollout.body_quaternion[0][:, row]), track.time)
     rotation = rotations(quaternion)
     seen = np.where(track.visible[..., None], track.value, np.nan)
-    local = np.einsum("tji,tmj->tmi", rotation[:ANCHOR_FRAMES], seen[:ANCHOR_FRAMES] - position[:ANCHOR_FRAMES, None])
+    first = slice(anchor_frames)
+    local = np.einsum("tji,tmj->tmi", rotation[first], seen[first] - position[first, None])
     there = np.isfinite(local).all(axis=2)
     sightings = there.sum(axis=0)
     anchor = np.where(there[..., None], local, 0).sum(axis=0) / np.maximum(sightings, 1)[:, None]

@@ -20,10 +20,16 @@ from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.replay import commands, initial_state, step_count
 
-REST = 5e-4
-"""While the mean of a body's points has moved less than this [m], they count as at rest."""
-CARRIED_POINTS = 64
-"""Surface points that stand for a body whose pose is measured."""
+
+@dataclass(frozen=True)
+class ObjectTrackCfg:
+    """How observed poses and points become target points."""
+
+    rest_displacement: float = 5e-4
+    """Displacement of the mean of a body's points below which the body counts as at rest [m]: of the order of the noise
+    of a point tracker, averaged over its points."""
+    surface_points: int = 64
+    """Surface points that represent a body whose pose is measured [-]: enough to cover its faces and edges."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +70,15 @@ class Segment:
     """Whether the whole segment is kept from the fit; None keeps blocks of its frames."""
 
 
-def whole_demonstration(scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...]) -> Segment:
+def whole_demonstration(
+    scene: Scene, demonstration: Demonstration, bodies: tuple[str, ...], cfg: ObjectTrackCfg | None = None
+) -> Segment:
     """Return a demonstration as one segment, with the bodies of `bodies` that move and were observed as targets."""
     model = scene.model
     steps = step_count(demonstration, model.opt.timestep)
     qpos, qvel = initial_state(model, demonstration)
     movable = [body for body in bodies if model.body(body).weldid[0] != 0]
-    targets = [t for body in movable if (t := body_target(scene, demonstration, body, qpos)) is not None]
+    targets = [t for body in movable if (t := body_target(scene, demonstration, body, qpos, cfg)) is not None]
     if not targets:
         raise RecordingError(
             "nothing to fit to",
@@ -82,8 +90,11 @@ def whole_demonstration(scene: Scene, demonstration: Demonstration, bodies: tupl
     return Segment(demonstration.name, qpos, qvel, commands(model, demonstration, steps), tuple(targets), joints)
 
 
-def body_target(scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray) -> BodyTarget | None:
+def body_target(
+    scene: Scene, demonstration: Demonstration, body: str, qpos: np.ndarray, cfg: ObjectTrackCfg | None = None
+) -> BodyTarget | None:
     """Return the observed points of a body: tracked ones, else its surface carried by its measured pose, else None."""
+    cfg = cfg or ObjectTrackCfg()
     data = mujoco.MjData(scene.model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(scene.model, data)
@@ -91,21 +102,21 @@ def body_target(scene: Scene, demonstration: Demonstration, body: str, qpos: np.
     if body in demonstration.points:
         track = demonstration.points[body]
         points = np.where(track.visible[:, :, None], track.value, np.nan)
-        anchor = (_resting_mean(points) - origin) @ rotation
+        anchor = (_resting_mean(points, cfg.rest_displacement) - origin) @ rotation
         known = np.isfinite(anchor).all(axis=1)
         return BodyTarget(body, anchor[known], track.time, points[:, known])
     pose = measured_pose(scene.model, demonstration, body)
     if pose is None:
         return None
     time, position, turn = pose
-    anchor = _carried_points(scene, body)
+    anchor = _surface_points(scene, body, cfg.surface_points)
     return BodyTarget(body, anchor, time, position[:, None] + np.einsum("tij,mj->tmi", turn.as_matrix(), anchor))
 
 
-def _resting_mean(points: np.ndarray) -> np.ndarray:
+def _resting_mean(points: np.ndarray, rest_displacement: float) -> np.ndarray:
     """Return each point's mean over the frames before the body moves [m], shape (M, 3); NaN for points unseen then."""
     centre = np.nanmean(points - points[:1], axis=1)
-    moved = np.flatnonzero(np.linalg.norm(centre, axis=1) > REST)
+    moved = np.flatnonzero(np.linalg.norm(centre, axis=1) > rest_displacement)
     frames = max(int(moved[0]) if len(moved) else len(points), 1)
     seen = np.all(np.isfinite(points[:frames]), axis=2)
     total = np.where(seen[:, :, None], points[:frames], 0.0).sum(axis=0)
@@ -196,10 +207,10 @@ def _joint_channels(model: mujoco.MjModel, demonstration: Demonstration) -> dict
     return result
 
 
-def _carried_points(scene: Scene, body: str) -> np.ndarray:
-    """Return points spread over a body's surface, body frame [m], shape (CARRIED_POINTS, 3)."""
+def _surface_points(scene: Scene, body: str, count: int) -> np.ndarray:
+    """Return points spread evenly over a body's surface, body frame [m], shape (count, 3)."""
     from concent_warp.scene.shapes.surface import Surface
     from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
-    points, _ = Surface.of_body(scene, body).sample(20 * CARRIED_POINTS, np.random.default_rng(0))
-    return points[farthest_point_sampling(points, CARRIED_POINTS)]
+    points, _ = Surface.of_body(scene, body).sample(20 * count, np.random.default_rng(0))
+    return points[farthest_point_sampling(points, count)]

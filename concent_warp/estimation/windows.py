@@ -7,12 +7,12 @@ information on the geometry. Windows of 0.1-0.3 s keep the prediction near the m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.estimation.object_tracks import BodyTarget, Segment, whole_demonstration
+from concent_warp.estimation.object_tracks import BodyTarget, ObjectTrackCfg, Segment, whole_demonstration
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.model import Model
 from concent_warp.recording.recording import Demonstration
@@ -32,6 +32,8 @@ class WindowCfg:
     """Contact must begin within this share of a window, so that its outcome is observed [-]."""
     min_frames: int = 3
     """A window with fewer observed frames of every body is left out."""
+    tracks: ObjectTrackCfg = field(default_factory=ObjectTrackCfg)
+    """How observations become target points."""
 
 
 def cut_windows(
@@ -64,7 +66,7 @@ def cut_windows(
     stride = length if stride is None else stride
     if not (0 < length < np.inf and 0 < stride < np.inf):
         raise RecordingError("windows: length and stride must be times", expected="> 0 s", found=(length, stride))
-    full = whole_demonstration(scene, demonstration, bodies)
+    full = whole_demonstration(scene, demonstration, bodies, cfg.tracks)
     measured = StateEstimator.of(Model(scene), demonstration)
     clock = np.unique(np.concatenate([t.time for t in full.targets]))
     scatter = measured.scatter(clock)

@@ -54,31 +54,33 @@ class InsertionCfg:
 class StagingCfg:
     """How contacts are filtered and how stages and their target events are found.
 
+    Durations lie between the chatter of contacts of stiff spheres and the length of a stage.
+
     Example:
         >>> import concent_warp as cw
-        >>> cw.StagingCfg(blip=0.05).blip
+        >>> cw.StagingCfg(min_contact_duration=0.05).min_contact_duration
         0.05
     """
 
-    gap: float = 0.05
+    max_gap: float = 0.05
     """Breaks of a contact shorter than this are closed [s]."""
-    blip: float = 0.03
+    min_contact_duration: float = 0.03
     """Contacts shorter than this, after closing breaks, are dropped [s]."""
-    initial: float = 0.1
+    initial_duration: float = 0.1
     """Contacts that begin up to this time are the context the task starts in, and open no stage [s]."""
     window: float = 0.1
     """Length of the windows that forces are summed over and target events are read from [s]."""
-    persist: float = 0.05
+    min_state_duration: float = 0.05
     """A grasp or a contact inside another object counts once it has lasted this long [s]."""
-    squeeze: float = 0.5
+    max_net_force_ratio: float = 0.5
     """The robot grasps an object when its forces on it add up to less than this share of their magnitudes [-]."""
-    moved: float = 0.005
+    min_displacement: float = 0.005
     """An object that the robot touches without grasping it opens a stage if it is moved by more than this [m]."""
-    approach: float = 0.01
+    approach_length: float = 0.01
     """Length of path before the first contact of two objects from which the direction of approach is taken [m]."""
-    depth: float = 0.003
+    inside_depth: float = 0.003
     """An object is inside another once it is this far beyond the plane of their first contact [m]."""
-    share: float = 0.5
+    min_touch_share: float = 0.5
     """A pair belongs to a target event if it touched during this share of the window [-]."""
     target: Literal["settled", "transition"] = "settled"
     """Which configuration of a stage is its target event: the last steady one of the stage, before the object is
@@ -91,7 +93,11 @@ class StagingCfg:
             value = getattr(self, setting.name)
             if setting.name not in ("target", "insertion") and not 0 <= value < np.inf:
                 raise EventsError(f"staging: {setting.name} is not right", expected="a number >= 0", found=value)
-        if not 0 < self.share <= 1:
-            raise EventsError("staging: share is not right", expected="a number above 0, at most 1", found=self.share)
+        if not 0 < self.min_touch_share <= 1:
+            raise EventsError(
+                "staging: min_touch_share is not right",
+                expected="a number above 0, at most 1",
+                found=self.min_touch_share,
+            )
         if self.target not in ("settled", "transition"):
             raise EventsError("staging: unknown target", expected="'settled' or 'transition'", found=repr(self.target))

@@ -83,7 +83,7 @@ def _from_log(
         settings=cfg,
         entities=tuple(roles.entities[i] for i in used),
         body_contacts=_body_intervals(touches, in_contact, motion, roles),
-        contacts=_entity_intervals(touches, in_contact, motion, roles, steps_of(cfg.gap, motion.timestep)),
+        contacts=_entity_intervals(touches, in_contact, motion, roles, steps_of(cfg.max_gap, motion.timestep)),
         stages=find_stages(touches, in_contact, motion, roles, geometry, cfg),
     )
 

@@ -2,8 +2,8 @@
 
 A resting or sliding contact of stiff spheres flickers from step to step. Per pair of bodies:
 
-1. breaks shorter than `gap` between two touches are closed, then
-2. contacts shorter than `blip` are dropped.
+1. breaks shorter than `max_gap` between two touches are closed, then
+2. contacts shorter than `min_contact_duration` are dropped.
 
 In this order a flickering contact becomes one contact and an isolated tap is dropped. The robot's links count as pairs
 of their own; a contact between two spheres, or a link and a sphere, has its breaks closed by the same rule and counts
@@ -21,27 +21,27 @@ def runs(touching: np.ndarray) -> np.ndarray:
     return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
 
 
-def close_gaps(touching: np.ndarray, gap: int) -> np.ndarray:
-    """Return `touching` (K,) with breaks of fewer than `gap` steps between two touches closed."""
+def close_gaps(touching: np.ndarray, max_gap: int) -> np.ndarray:
+    """Return `touching` (K,) with breaks of fewer than `max_gap` steps between two touches closed."""
     result = touching.copy()
     for start, end in runs(~touching):
-        if start > 0 and end < len(touching) and end - start < gap:
+        if start > 0 and end < len(touching) and end - start < max_gap:
             result[start:end] = True
     return result
 
 
-def drop_blips(touching: np.ndarray, blip: int) -> np.ndarray:
-    """Return `touching` (K,) without runs of fewer than `blip` steps."""
+def drop_short_contacts(touching: np.ndarray, shortest: int) -> np.ndarray:
+    """Return `touching` (K,) without runs of fewer than `shortest` steps."""
     result = touching.copy()
     for start, end in runs(touching):
-        if end - start < blip:
+        if end - start < shortest:
             result[start:end] = False
     return result
 
 
-def debounce(touching: np.ndarray, gap: int, blip: int) -> np.ndarray:
-    """Return `touching` (K,) without contact chatter, with `gap` and `blip` in steps."""
-    return drop_blips(close_gaps(touching, gap), blip)
+def debounce(touching: np.ndarray, max_gap: int, shortest: int) -> np.ndarray:
+    """Return `touching` (K,) without contact chatter, with `max_gap` and `shortest` in steps."""
+    return drop_short_contacts(close_gaps(touching, max_gap), shortest)
 
 
 def steps_of(duration: float, timestep: float) -> int:

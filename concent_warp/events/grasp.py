@@ -17,32 +17,34 @@ def robot_onsets(
     """Return the onsets of grasps and pushes, and when each object is grasped, shape (K,) bool by body id.
 
     The links of the robot count as one. A contact with an object is a grasp if the robot's normal forces on it add up
-    to less than `squeeze` of the sum of their magnitudes, over windows, for `persist`: then they press from opposite
-    sides. It begins with the first touch of that contact. Any other contact counts if it moves the object by `moved`,
-    and as long as the robot has not grasped this object: brushing past it after letting go opens no stage.
+    to less than `max_net_force_ratio` of the sum of their magnitudes, over windows, for `min_state_duration`: then they
+    press from opposite sides. It begins with the first touch of that contact. Any other contact counts if it moves the
+    object by `min_displacement`, and as long as the robot has not grasped this object: touching it after its release
+    opens no stage.
     """
-    gap, blip = steps_of(cfg.gap, motion.timestep), steps_of(cfg.blip, motion.timestep)
-    persist, width = steps_of(cfg.persist, motion.timestep), steps_of(cfg.window, motion.timestep)
-    initial = cfg.initial / motion.timestep
+    max_gap, shortest = steps_of(cfg.max_gap, motion.timestep), steps_of(cfg.min_contact_duration, motion.timestep)
+    grasp, width = steps_of(cfg.min_state_duration, motion.timestep), steps_of(cfg.window, motion.timestep)
+    initial = cfg.initial_duration / motion.timestep
     by_robot = touches[np.isin(touches.body[:, 0], roles.ids("robot"))]
     onsets: list[Onset] = []
     grasped: dict[int, np.ndarray] = {}
     for body in roles.ids("object"):
         rows = by_robot[by_robot.body[:, 1] == body]
-        touching = debounce(rows.frames(motion.steps), gap, blip)
-        squeezing = debounce(touching & forces_cancel(rows, motion.steps, width, cfg.squeeze), gap, persist) & touching
+        touching = debounce(rows.frames(motion.steps), max_gap, shortest)
+        opposed = touching & forces_cancel(rows, motion.steps, width, cfg.max_net_force_ratio)
+        grasping = debounce(opposed, max_gap, grasp) & touching
         grasped[body] = np.zeros(motion.steps, dtype=bool)
         seen: set[str] = set()
         for start, end in runs(touching):
-            if squeezing[start:end].any():
+            if grasping[start:end].any():
                 kind = "pick"
                 grasped[body][start:end] = True
-            elif np.linalg.norm(motion.position[end - 1, body] - motion.position[start, body]) > cfg.moved:
+            elif np.linalg.norm(motion.position[end - 1, body] - motion.position[start, body]) > cfg.min_displacement:
                 kind = "push"
             else:
                 continue
             if start > initial and not seen & {kind, "pick"}:
-                onsets.append(Onset(kind, int(start), (None, body), squeezing if kind == "pick" else touching))
+                onsets.append(Onset(kind, int(start), (None, body), grasping if kind == "pick" else touching))
             seen.add(kind)
     return onsets, grasped
 

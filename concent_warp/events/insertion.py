@@ -5,10 +5,10 @@ kinds of contact are therefore distinguished by position, and by forces summed o
 
 - The *first contact* has a plane. Its normal is the reverse of the motion that the contact stopped (the approach, or
   the way that the object goes on while in contact), turned into the layer of spheres that the contact is on: both are
-  far less bumpy than contact normals, which are only used to decide whether the contact opposed the motion.
-- An object is *beyond* this plane once the foremost of its points that ever touch has passed it by `depth`. If it then
-  touches surfaces that stand across the plane, or any surface beyond it, it has entered; if the other object is all
-  around it there, that is insertion, and these surfaces are inner ones.
+  far smoother than contact normals, which are only used to decide whether the contact opposed the motion.
+- An object is *beyond* this plane once the foremost of its points that ever touch has passed it by
+  `inside_depth`. If it then touches surfaces across the plane, or any surface beyond it, it has entered; if the other
+  object surrounds it there, that is insertion, and these surfaces are inner ones.
 - A first contact that did not oppose the motion, or that is deep within the other object, did not block it: the
   object has entered directly.
 """
@@ -127,7 +127,7 @@ def object_onsets(
     """
     touching = in_contact.copy()
     for start, end in runs(in_contact):
-        if start <= cfg.initial / motion.timestep:
+        if start <= cfg.initial_duration / motion.timestep:
             touching[start:end] = False
     rows = touches[touching[touches.step]]
     if not len(rows.step):
@@ -138,11 +138,11 @@ def object_onsets(
     beyond, inside = _passage(contact, touching, plane, motion.timestep, cfg)
     entered = int(np.flatnonzero(inside)[0]) if inside.any() else motion.steps
     onsets = []
-    if entered - first >= steps_of(cfg.blip, motion.timestep):
+    if entered - first >= steps_of(cfg.min_contact_duration, motion.timestep):
         onsets.append(Onset("align" if grasped[first] else "touch", first, pair, touching & ~beyond))
     if inside.any():
         deepest = entered + int(np.argmin(contact.height(plane)[entered : contact.step[-1] + 1]))
-        kind = "insert" if _surrounded(contact, plane, deepest, cfg.depth) else "enter"
+        kind = "insert" if _surrounded(contact, plane, deepest, cfg.inside_depth) else "enter"
         onsets.append(Onset(kind, entered, pair, touching & beyond))
     return onsets
 
@@ -151,15 +151,15 @@ def _first_plane(contact: PairContact, touching: np.ndarray, width: int, cfg: St
     """Return the plane of the first contact, judged by the first `width` steps from it on."""
     first, last = int(contact.step[0]), int(np.flatnonzero(touching)[-1])
     point, normal = contact.mean(contact.step < first + width)
-    approach = _approach_direction(contact.origin, first, cfg.approach)
-    ways = [-approach, _unit(contact.origin[first] - contact.origin[last], cfg.depth)]
+    approach = _approach_direction(contact.origin, first, cfg.approach_length)
+    ways = [-approach, _unit(contact.origin[first] - contact.origin[last], cfg.inside_depth)]
     opposed = [way for way in ways if way @ normal > np.cos(np.radians(cfg.insertion.opposing_angle))]
     if not opposed:
         return Plane(point, -approach if approach.any() else normal, barred=not approach.any())
     if len(contact.spheres):
         normal = _fit_normal(contact.spheres, point, opposed[0], cfg.insertion)
     plane = Plane(point, normal, barred=True)
-    return replace(plane, barred=not _surrounded(contact, plane, first, cfg.depth))
+    return replace(plane, barred=not _surrounded(contact, plane, first, cfg.inside_depth))
 
 
 def _approach_direction(origin: np.ndarray, first: int, length: float) -> np.ndarray:
@@ -210,17 +210,20 @@ def _cone(axis: np.ndarray, tilts: np.ndarray) -> np.ndarray:
 def _passage(
     contact: PairContact, touching: np.ndarray, plane: Plane, timestep: float, cfg: StagingCfg
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return when a is in contact beyond the plane, and when on inner surfaces for `persist`, shape (K,) bool each."""
+    """Return when a is in contact beyond the plane, and when on inner surfaces, shape (K,) bool each.
+
+    Contact on inner surfaces counts once it has lasted `min_state_duration`.
+    """
     steps, width = len(touching), steps_of(cfg.window, timestep)
     across = np.abs(contact.normal @ plane.normal) < np.cos(np.radians(cfg.insertion.across_angle))
-    deep = (contact.point - plane.point) @ plane.normal < -cfg.depth
+    deep = (contact.point - plane.point) @ plane.normal < -cfg.inside_depth
     inner = across | deep if plane.barred else np.ones(len(contact.step), dtype=bool)
-    beyond = touching & (contact.height(plane) < -cfg.depth) if plane.barred else touching.copy()
+    beyond = touching & (contact.height(plane) < -cfg.inside_depth) if plane.barred else touching.copy()
     on_inner = windowed(np.bincount(contact.step, contact.force * inner, minlength=steps), width)
     total = windowed(np.bincount(contact.step, contact.force, minlength=steps), width)
     now = np.bincount(contact.step, inner, minlength=steps) > 0
     inside = beyond & now & (on_inner > cfg.insertion.inner_share * total)
-    return beyond, debounce(inside, steps_of(cfg.gap, timestep), steps_of(cfg.persist, timestep))
+    return beyond, debounce(inside, steps_of(cfg.max_gap, timestep), steps_of(cfg.min_state_duration, timestep))
 
 
 def _surrounded(contact: PairContact, plane: Plane, step: int, margin: float) -> bool:

@@ -103,8 +103,8 @@ def sequence_frames(sequence: ContactEventSequence, grid: np.ndarray) -> dict[Pa
 def debounce_frames(frames: Frames, period: float, cfg: StagingCfg | None = None) -> dict[Pair, np.ndarray]:
     """Return frames of length `period` [s] after the chatter rule, as sequences have them."""
     cfg = cfg or StagingCfg()
-    gap, blip = steps_of(cfg.gap, period), steps_of(cfg.blip, period)
-    return {key: debounce(np.asarray(touching, dtype=bool), gap, blip) for key, touching in frames.items()}
+    max_gap, shortest = steps_of(cfg.max_gap, period), steps_of(cfg.min_contact_duration, period)
+    return {key: debounce(np.asarray(touching, dtype=bool), max_gap, shortest) for key, touching in frames.items()}
 
 
 def iou(a: Frames, b: Frames, pairs: Iterable[Pair] | None = None) -> FrameOverlap:

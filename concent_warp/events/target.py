@@ -20,8 +20,8 @@ def target_event(
     """Return the target event of a stage.
 
     It holds the pairs of entities, robot or object on object, that touch in a window of `cfg.window`, see
-    `_event_window`: of each pair of bodies those that touch for at least `cfg.share` as long as the one that touches
-    longest. Points, normals and forces are means over the window.
+    `_event_window`: of each pair of bodies those that touch for at least `cfg.min_touch_share` as long as the one that
+    touches longest. Points, normals and forces are means over the window.
 
     Args:
         touches: Contacts after the chatter rule.
@@ -44,7 +44,7 @@ def target_event(
     pairs = [
         _contact_pair(group, motion, roles, high - low)
         for group, count in zip(groups, lasting, strict=True)
-        if count >= cfg.share * longest[tuple(group.body[0].tolist())]
+        if count >= cfg.min_touch_share * longest[tuple(group.body[0].tolist())]
     ]
     pairs.sort(key=lambda pair: (pair.a, pair.b))
     role = {entity.name: entity.role for entity in roles.entities}

@@ -116,9 +116,9 @@ class ReplayContacts:
 
     def debounced_pairs(self, steps: int, timestep: float, cfg: StagingCfg) -> dict[tuple[int, int], np.ndarray]:
         """Return for each pair of bodies when it is in contact after the chatter rule, shape (K,) bool."""
-        gap, blip = steps_of(cfg.gap, timestep), steps_of(cfg.blip, timestep)
+        max_gap, shortest = steps_of(cfg.max_gap, timestep), steps_of(cfg.min_contact_duration, timestep)
         pairs = {(int(a), int(b)) for a, b in np.unique(self.body, axis=0)}
-        in_contact = {pair: debounce(self.between(*pair).frames(steps), gap, blip) for pair in sorted(pairs)}
+        in_contact = {pair: debounce(self.between(*pair).frames(steps), max_gap, shortest) for pair in sorted(pairs)}
         return {pair: touching for pair, touching in in_contact.items() if touching.any()}
 
     def within(self, in_contact: dict[tuple[int, int], np.ndarray]) -> ReplayContacts:

@@ -12,7 +12,7 @@ from concent_warp.checks import check_seed
 from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
-from concent_warp.reality.run import WorldLog, settle, simulate
+from concent_warp.reality.run import WorldLog, simulate, simulate_to_rest
 from concent_warp.reality.sensors.camera import CAMERA, film
 from concent_warp.reality.sensors.footage import FootageCfg, footage
 from concent_warp.reality.sensors.sensing import SensingCfg, measure, sampled
@@ -36,6 +36,8 @@ class RealityCfg:
     """Half width of the square in which the block's position is sampled [m]."""
     yaw_spread: float = 0.15
     """Half width of the block's rotation about the vertical [rad]."""
+    settling_time: float = 0.3
+    """Time simulated before the recording starts, so that objects and arm come to rest [s]."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def _perform(
             action[:, column] = path.opening
         else:
             action[:, column] = angles[:, arm.index(int(model.actuator_trnid[column, 0]))]
-    settle(model, data, action[0], effects)
+    simulate_to_rest(model, data, action[0], effects, cfg.settling_time)
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     log = simulate(cfg.sensing, scene, model, data, path.time, action, effects, rng, progress)
 

@@ -26,12 +26,24 @@ class WorldLog:
     visible: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
 
-def settle(
-    model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray, effects: tuple[HiddenEffect, ...] = ()
+def simulate_to_rest(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    ctrl: np.ndarray,
+    effects: tuple[HiddenEffect, ...] = (),
+    duration: float = 0.3,
 ) -> None:
-    """Simulate until objects and arm are at rest before the recording starts, with the forces of the effects."""
+    """Simulate until objects and arm are at rest, before the recording starts, with the forces of the effects.
+
+    Args:
+        model: Reality.
+        data: Its state, changed in place; time is 0 afterwards.
+        ctrl: Commands, shape (nu,).
+        effects: Hidden effects.
+        duration: Simulated time [s].
+    """
     data.ctrl[:] = ctrl
-    for _ in range(round(0.3 / model.opt.timestep)):
+    for _ in range(round(duration / model.opt.timestep)):
         _act(model, data, effects)
         mujoco.mj_step(model, data)
     data.time = 0.0

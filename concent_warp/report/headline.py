@@ -11,15 +11,10 @@ import numpy as np
 from concent_warp.comparison.result import Comparison, Summary
 from concent_warp.comparison.units import percent, shown, times, unit_shown, words
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.report.cfg import ReportCfg
 
 NULL = "no contact"
 """Name of the model whose objects do not touch one another, where a comparison has one."""
-AT_NOISE = 1.2
-"""RMS error over the noise below which an error counts as noise [-]."""
-ENOUGH_OVERLAP = 0.8
-"""Overlap of contact frames with the truth above which the contact counts as reproduced [-]."""
-OVERLAP_STEP = 0.02
-"""Change of the overlap above which it counts as risen or fallen [-]."""
 
 
 def headline_channel(comparison: Comparison) -> str:
@@ -57,8 +52,10 @@ def cards(
     events: Mapping[str, ContactEventSequence],
     fitted: Sequence[str],
     overlap: Mapping[str, Mapping[str, float]],
+    cfg: ReportCfg | None = None,
 ) -> list[Card]:
     """Return the cards of a report."""
+    cfg = cfg or ReportCfg()
     channel, phases = headline_channel(comparison), comparison.contact_phases()
     where = f"Mean error of {words(channel)}" + (f", {' + '.join(phases)}" if phases else "")
     unseen = tuple(d for d in comparison.demonstrations if fitted and d not in fitted)
@@ -74,7 +71,7 @@ def cards(
         if ends:
             figure = _arrow([f"{value:.2f}" for value in (ends[0], ends[-1])], "")
             what = "Overlap (IoU) of the contact times with the truth; 1 is perfect"
-            found.append(Card(what, figure, _overlap_note(ends[0], ends[-1])))
+            found.append(Card(what, figure, _overlap_note(ends[0], ends[-1], cfg.overlap_change)))
     if comparison.staged and any(sequence.stages for sequence in events.values()):
         counts = sorted({len(sequence.stages) for sequence in events.values()})
         names = " · ".join(dict.fromkeys(stage.name for s in events.values() for stage in s.stages))
@@ -94,23 +91,23 @@ def cards(
     return found
 
 
-def _above_noise(summary: Summary) -> str:
+def _above_noise(summary: Summary, noise_ratio: float) -> str:
     """Return the RMS error over the noise, as the end of a sentence; empty where the noise is unknown."""
     if summary.ratio is None or not np.isfinite(summary.ratio):
         return ""
-    if summary.ratio < AT_NOISE:
+    if summary.ratio < noise_ratio:
         return f", at the level of the measurement noise ({times(summary.ratio)} noise)"
     return f" ({times(summary.ratio)} noise)"
 
 
-def _overlap_note(before: float, after: float) -> str:
+def _overlap_note(before: float, after: float, change: float) -> str:
     """Return what a change of the overlap of contact means, as HTML; empty where it stays."""
-    if after < before - OVERLAP_STEP:
+    if after < before - change:
         return (
             '<b class="bad">It falls:</b> the objects of the fitted model touch at other times than in truth, so that '
             "the motion is reproduced with less realistic contact."
         )
-    if after > before + OVERLAP_STEP:
+    if after > before + change:
         return '<b class="good">It rises:</b> the objects touch more nearly at the true times.'
     return ""
 
@@ -142,8 +139,14 @@ def _arrow(ends: Sequence[str], unit: str) -> str:
     return f'<span class="from">{ends[0]}</span><span class="arrow">→</span><span class="to">{ends[1]}</span>{tail}'
 
 
-def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
+def verdict(
+    comparison: Comparison,
+    fitted: Sequence[str],
+    overlap: Mapping[str, Mapping[str, float]],
+    cfg: ReportCfg | None = None,
+) -> str:
     """Return what the figures mean, in one or two sentences."""
+    cfg = cfg or ReportCfg()
     channel, phases = headline_channel(comparison), comparison.contact_phases()
     after = comparison.summarise(comparison.after, channel, phases)
     unit = unit_shown(after.unit)
@@ -152,7 +155,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
         return f"The simulation of “{comparison.after}” does not stay finite: see the table for when it diverges."
     if len(comparison.models) < 2:
         text = f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}"
-        return f"{text}{_above_noise(after)}."
+        return f"{text}{_above_noise(after, cfg.noise_ratio)}."
     before = comparison.summarise(comparison.before, channel, phases)
     found = comparison.difference(channel, phases)
     change = {
@@ -160,9 +163,10 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
         "risen": "has risen",
         "unclear": "has not changed by more than chance explains",
     }[found.verdict]
+    above = _above_noise(after, cfg.noise_ratio)
     text = (
         f"The error of {words(channel)}{during} {change}: {shown(before.mean, before.unit)} {unit} "
-        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{_above_noise(after)}."
+        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{above}."
     )
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)
@@ -172,7 +176,7 @@ def verdict(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str,
         else:
             text += ": this error alone does not show that the contact is right."
     ends = [float(np.mean(list(values.values()))) for values in overlap.values() if values]
-    if ends and ends[-1] < ENOUGH_OVERLAP:
+    if ends and ends[-1] < cfg.min_overlap:
         text += f" The contact times overlap with the truth by only {ends[-1]:.2f}."
     if unseen := tuple(d for d in comparison.demonstrations if fitted and d not in fitted):
         held = comparison.difference(channel, phases, unseen)

@@ -15,6 +15,7 @@ from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_text
+from concent_warp.report.cfg import ReportCfg
 from concent_warp.report.diagnosis_section import bullet_list, diagnosis_section
 from concent_warp.report.headline import cards, headline_channel, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
@@ -27,15 +28,12 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
 
-MOST_DEMONSTRATIONS = 6
-"""Demonstrations with charts and replay, those with the worst spans before others; further ones are in the tables
-alone, so that the page stays small."""
-
 
 def write_report(
     path: str | Path,
     recording: Recording,
     comparison: Comparison,
+    cfg: ReportCfg | None = None,
     *,
     events: Mapping[str, ContactEventSequence] | None = None,
     fit: FitResult | None = None,
@@ -51,6 +49,7 @@ def write_report(
         path: The ``.html`` file.
         recording: What was commanded and measured.
         comparison: Of one or more models with this recording.
+        cfg: Settings.
         events: Contact event sequences of the last model, by demonstration; by default those of the comparison.
         fit: The fit that led from the first model to the last.
         fitted: Demonstrations that the fit has seen; empty where there was none.
@@ -65,18 +64,19 @@ def write_report(
         >>> comparison = cw.compare(cw.Model.from_recording(recording), recording)
         >>> cw.write_report("report.html", recording, comparison)
     """
+    cfg = cfg or ReportCfg()
     path, events, overlap = Path(path), events or comparison.events, overlap or {}
     diagnosis = diagnosis.to_json() if isinstance(diagnosis, Diagnosis) else diagnosis
     location = location.to_json() if isinstance(location, UnexplainedForces) else location
     shown_models = {name: comparison.models[name] for name in dict.fromkeys((comparison.before, comparison.after))}
-    chosen = [recording[name] for name in shown_demonstrations(comparison, MOST_DEMONSTRATIONS)]
+    chosen = [recording[name] for name in shown_demonstrations(comparison, cfg.max_demonstrations)]
     data = page_data(shown_models, chosen, comparison, events, fit)
     data["forces"] = _forces(data, location)
     parts = {
         "title": escape(_title(recording, fit)),
         "subtitle": escape(_subtitle(recording, comparison, fitted)),
-        "verdict": escape(verdict(comparison, fitted, overlap)),
-        "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap)),
+        "verdict": escape(verdict(comparison, fitted, overlap, cfg)),
+        "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap, cfg)),
         "demonstration_options": _options([d.name for d in chosen]),
         "channel_options": _options(ordered_channels(comparison)),
         "model_keys": "".join(
@@ -109,7 +109,7 @@ def write_report(
         ),
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),
-        "footer": escape(f"Written by concent {__version__}. {_left_out(comparison)}"),
+        "footer": escape(f"Written by concent {__version__}. {_left_out(comparison, cfg.max_demonstrations)}"),
         "data": _script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
         "style": _page_file("style.css"),
         "script": "\n".join(_page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
@@ -218,14 +218,10 @@ def _subtitle(recording: Recording, comparison: Comparison, fitted: Sequence[str
     return text + (f"; the fit has seen {', '.join(fitted)}" if fitted else "")
 
 
-def _left_out(comparison: Comparison) -> str:
+def _left_out(comparison: Comparison, most: int) -> str:
     """Return which demonstrations have no charts."""
-    more = len(comparison.demonstrations) - MOST_DEMONSTRATIONS
-    return (
-        f"Charts and replay show {MOST_DEMONSTRATIONS} demonstrations; {more} more are in the tables."
-        if more > 0
-        else ""
-    )
+    more = len(comparison.demonstrations) - most
+    return f"Charts and replay show {most} demonstrations; {more} more are in the tables." if more > 0 else ""
 
 
 def _options(names: Sequence[str]) -> str:

@@ -33,7 +33,7 @@ from concent_warp.simulate.mujoco_steps import (
     simulate_steps,
     simulate_with_force_models,
 )
-from concent_warp.simulate.parallel import MIN_PROCESSES, MIN_STEPS, in_processes, simulations_at_a_time
+from concent_warp.simulate.parallel import ProcessPoolCfg, in_processes, simulations_at_a_time
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -50,6 +50,7 @@ class MujocoEngine:
         threads: int | None = None,
         memory: int | None = None,
         max_memory: int = 2**30,
+        processes: ProcessPoolCfg | None = None,
     ) -> None:
         """Compile the model.
 
@@ -61,6 +62,7 @@ class MujocoEngine:
             memory: Arena of one simulation [bytes], which holds contacts and constraints; by default what MuJoCo takes.
                 It grows when it overflows.
             max_memory: How far the arena may grow [bytes].
+            processes: When simulations whose steps call Python are distributed over processes.
 
         Raises:
             EngineError: An argument is out of bounds.
@@ -71,6 +73,7 @@ class MujocoEngine:
         self.max_memory = int(max_memory)
         self._collidable = None if collidable is None else np.array(collidable)
         self._memory = memory
+        self._processes = processes or ProcessPoolCfg()
         self._compiled, self._sphere_geom = compile_model(model, self._collidable)
         self._compilers: queue.SimpleQueue[VariantCompiler] = queue.SimpleQueue()
         if memory is not None:
@@ -150,7 +153,7 @@ class MujocoEngine:
     def _simulated(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants, `threads` at a time."""
         count = min(self.threads, len(rows))
-        if run.variants.force_models and count >= MIN_PROCESSES and len(rows) * run.steps >= MIN_STEPS:
+        if run.variants.force_models and self._processes.suits(count, len(rows) * run.steps):
             return in_processes(self._in_turn, run, rows, self.threads)
         # Force models are Python code, which runs in one thread at a time: more threads would only slow it down.
         with ThreadPoolExecutor(1 if run.variants.force_models else count) as pool:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
@@ -16,12 +16,21 @@ if TYPE_CHECKING:
     from concent_warp.simulate.inputs import SimulationRun
 
 T = TypeVar("T")
-MIN_PROCESSES = 3
-"""Fewest processes that are started: with two, sending data takes as long as is saved."""
-MIN_STEPS = 20_000
-"""Fewest steps of all simulations together for which processes are started: about one second in one thread."""
-
 _limit: ContextVar[int | None] = ContextVar("limit of simulations at a time", default=None)
+
+
+@dataclass(frozen=True)
+class ProcessPoolCfg:
+    """When simulations whose steps call Python are distributed over processes."""
+
+    min_processes: int = 3
+    """Fewest processes that are started [-]: with two, sending data takes as long as is saved."""
+    min_steps: int = 20_000
+    """Fewest steps of all simulations together for which processes are started [-]: about one second in one thread."""
+
+    def suits(self, processes: int, steps: int) -> bool:
+        """Return whether processes are worth starting for a number of steps of all simulations together."""
+        return processes >= self.min_processes and steps >= self.min_steps
 
 
 def simulations_at_a_time() -> int:

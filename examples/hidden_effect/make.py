@@ -31,7 +31,7 @@ def plan(rng: np.random.Generator, k: int) -> RigTrial:
     parts = [hold(0.0, 0.2), sweep(0.0, reach, 1.5), hold(reach, 0.2), sweep(reach, -0.6, 3.0), hold(-0.6, 0.2)]
     parts += [sweep(-0.6, -0.4, 0.4), sweep(-0.4, -0.6, 0.4), glide(-0.6, 0.0, 0.5)]
     parts += [hold(0.0, max(0.1, 4.0 - sum(map(len, parts)) / 100))]
-    return RigTrial(4.0, {"servo": joined(parts)}, settle=0.5)
+    return RigTrial(4.0, {"servo": joined(parts)}, settling_time=0.5)
 
 
 def main(folder: Path) -> None:

@@ -21,9 +21,6 @@ from concent_warp.render.raw import PosedWorlds, RawCamera
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
-BATCH = 16
-"""States rendered per batch."""
-
 
 @dataclass(frozen=True)
 class ImagePairs:
@@ -60,6 +57,7 @@ def pairs_of(
     cameras: Sequence[str] = (),
     *,
     device: str = "cpu",
+    batch: int = 16,
     progress: Callable[[float], None] | None = None,
 ) -> list[ImagePairs]:
     """Return the pairs of each camera of a recording, at the size of its images.
@@ -68,6 +66,7 @@ def pairs_of(
         recording: Demonstrations with images and the measured joints.
         cameras: Names of the cameras; all that every demonstration has by default.
         device: Warp's name of the device that renders.
+        batch: States rendered at a time.
         progress: Called with the share done.
 
     Raises:
@@ -99,7 +98,7 @@ def pairs_of(
         states = [m.states(np.clip(s.time, *m.span)).qpos for m, s in zip(motions, streams, strict=True)]
         qpos = np.concatenate(states)
         shown = None if progress is None else lambda share, c=c: progress((c + share) / len(names))
-        simulated, pose = _rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, shown)
+        simulated, pose = _rendered(scene, camera, streams[0].rgb.shape[1:3], qpos, device, batch, shown)
         real = torch.from_numpy(np.concatenate([s.rgb for s in streams])).permute(0, 3, 1, 2).contiguous()
         before = _frames_before([len(s.time) for s in streams])
         found.append(ImagePairs(camera, real, simulated, pose, before))
@@ -120,19 +119,20 @@ def _rendered(
     size: tuple[int, int],
     qpos: np.ndarray,
     device: str,
+    batch: int,
     progress: Callable[[float], None] | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return images (N, 3, H, W) uint8 of states (N, nq) without the objects, and poses (N, 9) of the camera's body."""
     model = camera_scene(scene, [camera])
-    stage = PosedWorlds(model, BATCH, device=device)
-    eye = RawCamera(stage, [camera.name], size, leave_out=scene.objects())
+    stage = PosedWorlds(model, batch, device=device)
+    sensor = RawCamera(stage, [camera.name], size, leave_out=scene.objects())
     images = torch.zeros((len(qpos), 3, *size), dtype=torch.uint8)
     poses = torch.zeros(len(qpos), 9)
-    for first in range(0, len(qpos), BATCH):
-        rows = np.minimum(np.arange(first, first + BATCH), len(qpos) - 1)
+    for first in range(0, len(qpos), batch):
+        rows = np.minimum(np.arange(first, first + batch), len(qpos) - 1)
         stage.place(qpos[rows])
-        count = min(BATCH, len(qpos) - first)
-        seen = to_bytes(eye.render().rgb[:count, 0])
+        count = min(batch, len(qpos) - first)
+        seen = to_bytes(sensor.render().rgb[:count, 0])
         images[first : first + count] = seen.permute(0, 3, 1, 2).cpu()
         poses[first : first + count] = carrier_pose(stage, camera)[:count].cpu()
         if progress is not None:

@@ -136,7 +136,7 @@ def test_spheres_that_touch_rarely_are_no_part_of_the_target():
     rare = [row for k in range(20, 100, 5) for row in touch(range(k, k + 1), LINK, 2, normal=(0, -1, 0), force=10.0)]
     event = events(touch(range(20, 100), LINK, 1), rare).stages[0].event
     assert event.primitives == ("block_sphere0",)
-    always = events(touch(range(20, 100), LINK, 1), rare, cfg=StagingCfg(share=0.1)).stages[0].event
+    always = events(touch(range(20, 100), LINK, 1), rare, cfg=StagingCfg(min_touch_share=0.1)).stages[0].event
     assert always.primitives == ("block_sphere0", "block_sphere1")
 
 
@@ -167,7 +167,10 @@ def test_a_replay_that_diverges_is_refused(task: Task):
         extract(task.model, demonstration, task.engine)
 
 
-@pytest.mark.parametrize(("setting", "value"), [("gap", -1), ("blip", float("nan")), ("share", 0), ("target", "best")])
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("max_gap", -1), ("min_contact_duration", float("nan")), ("min_touch_share", 0), ("target", "best")],
+)
 def test_settings_that_cannot_be_are_refused(setting: str, value: Any):
     with pytest.raises(EventsError, match=setting):
         StagingCfg(**{setting: value})

@@ -1,6 +1,6 @@
 import numpy as np
 
-from concent_warp.events.filter import close_gaps, debounce, drop_blips, runs, steps_of, windowed
+from concent_warp.events.filter import close_gaps, debounce, drop_short_contacts, runs, steps_of, windowed
 
 
 def frames(text: str) -> np.ndarray:
@@ -25,11 +25,11 @@ def test_time_before_the_first_and_after_the_last_touch_is_no_break():
 
 
 def test_contacts_shorter_than_the_blip_are_dropped():
-    assert text(drop_blips(frames("##.###.#"), 3)) == "...###.."
+    assert text(drop_short_contacts(frames("##.###.#"), 3)) == "...###.."
 
 
 def test_a_flickering_contact_survives_as_one_and_a_lone_tap_does_not():
-    assert text(debounce(frames("#.#.#.#......#...."), gap=3, blip=4)) == "#######..........."
+    assert text(debounce(frames("#.#.#.#......#...."), max_gap=3, shortest=4)) == "#######..........."
 
 
 def test_durations_become_whole_steps():

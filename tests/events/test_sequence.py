@@ -74,7 +74,7 @@ BROKEN = {
         lambda t: t.replace('"normal": [', '"normal": [[], ', 1),
         "normal: wrong length.*expected 3, found 4",
     ),
-    "settings": (lambda t: t.replace('"share": 0.5', '"share": 7'), "share is not right"),
+    "settings": (lambda t: t.replace('"min_touch_share": 0.5', '"min_touch_share": 7'), "share is not right"),
     "beyond the end": (lambda t: t.replace('"steps": 7', '"steps": 1', 1), "times that cannot be"),
 }
 

@@ -120,9 +120,7 @@ def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
 
 
 def test_small_gains_add_up_before_the_fit_ends(drop, swollen):
-    search = Search(
-        swollen, cut(swollen, [drop[0]], CFG), replace(CFG, plateau_generations=3, least_gain=0.05), "mujoco"
-    )
+    search = Search(swollen, cut(swollen, [drop[0]], CFG), replace(CFG, plateau_generations=3, min_gain=0.05), "mujoco")
 
     def seen(generation: int, loss: float, held_out: float) -> int:
         search.evolution.generation = generation

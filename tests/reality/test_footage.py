@@ -79,6 +79,6 @@ def test_camera_on_a_body_is_kept_in_the_file_and_no_points_are_tracked_from_it(
 
 
 def test_tone_curve_keeps_black_and_order():
-    levels = developed(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1))
+    levels = developed(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1), FootageCfg())
     assert np.allclose(levels[0], 0)
     assert (np.diff(levels, axis=0) >= 0).all()

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.run import WorldLog, settle, simulate
+from concent_warp.reality.run import WorldLog, simulate, simulate_to_rest
 from concent_warp.reality.sensors.sensing import SensingCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
@@ -22,7 +22,7 @@ def run(*effects: HiddenEffect, step: float = 0.0, duration: float = 0.4) -> tup
     hold = np.array([*data.qpos[:7], 0.0])
     action = np.repeat(hold[None], len(time), axis=0)
     action[1:, 0] += step
-    settle(model, data, hold)
+    simulate_to_rest(model, data, hold)
     log = simulate(SENSING, SCENE, model, data, time, action, effects, np.random.default_rng(0), None)
     return model, log
 

@@ -23,8 +23,8 @@ def swing(
     effects = [h.effect for h in found]
     model = PENDULUM.world(effects).compile()
     action = {"servo": (np.zeros(1), np.array([target]))}
-    settle, qpos = (0.8, {}) if start is None else (0.0, {"hinge": [start]})
-    trial = RigTrial(duration, action, qpos=qpos, settle=settle)
+    settling, qpos = (0.8, {}) if start is None else (0.0, {"hinge": [start]})
+    trial = RigTrial(duration, action, qpos=qpos, settling_time=settling)
     motion, _, _ = perform(model, trial, effects, PENDULUM.physics)
     angle = motion.sensordata[:, :1]
     for effect in effects:

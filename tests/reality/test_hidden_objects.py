@@ -20,7 +20,7 @@ def stopping_distance(velocity: tuple[float, float], name: str, magnitude: float
     made = hidden(name, magnitude, SLIDE)
     model = SLIDE.world([made.effect]).compile()
     trial = RigTrial(
-        0.8, qpos={"block_joint": [x, 0.0, *FLAT]}, qvel={"block_joint": [*velocity, 0, 0, 0, 0]}, settle=0.1
+        0.8, qpos={"block_joint": [x, 0.0, *FLAT]}, qvel={"block_joint": [*velocity, 0, 0, 0, 0]}, settling_time=0.1
     )
     motion, _, _ = perform(model, trial, [made.effect], SLIDE.physics)
     return float(np.linalg.norm(motion.sensordata[-1, :2] - motion.sensordata[0, :2]))
@@ -82,7 +82,7 @@ def test_torsional_friction_stops_a_spin_after_its_torque():
     made = hidden("torsional_friction", coefficient, SPIN)
     model = SPIN.world([made.effect]).compile()
     start = [0, 0, 0.03 - 1e-4, 1, 0, 0, 0]
-    trial = RigTrial(0.2, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settle=0.2)
+    trial = RigTrial(0.2, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settling_time=0.2)
     motion, _, _ = perform(model, trial, [made.effect], SPIN.physics)
     turned = 2 * np.arctan2(motion.sensordata[-1, 6], motion.sensordata[-1, 3])
     slowing = coefficient * 9.81 / (0.4 * 0.03**2)

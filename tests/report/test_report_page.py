@@ -289,6 +289,6 @@ def test_where_the_last_model_is_at_the_noise_the_page_opens_on_the_error_of_the
 
 @pytest.mark.parametrize(("after", "note"), [(0.3, "It falls:"), (0.6, "It rises:"), (0.41, "")])
 def test_the_overlap_card_says_what_a_change_means(after, note):
-    found = _overlap_note(0.41, after)
+    found = _overlap_note(0.41, after, 0.02)
     assert note in found
     assert bool(found) == bool(note)

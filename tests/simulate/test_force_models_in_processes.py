@@ -6,9 +6,9 @@ import pytest
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from concent_warp.simulate import mujoco_engine
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
+from concent_warp.simulate.parallel import ProcessPoolCfg
 
 PENDULUM = """<mujoco><option timestep=".002"/><worldbody>
 <body name="link" pos="0 0 .3"><joint name="hinge" axis="0 1 0"/>
@@ -18,10 +18,10 @@ PENDULUM = """<mujoco><option timestep=".002"/><worldbody>
 COUNT, STEPS = 6, 300
 
 
-def run(threads: int):
+def run(threads: int, processes: ProcessPoolCfg | None = None):
     model = Model(Scene(PENDULUM))
     effect = effect_class("load_friction")("hinge")
-    engine = MujocoEngine(model.add(effect), threads=threads)
+    engine = MujocoEngine(model.add(effect), threads=threads, processes=processes)
     force_model = effect.force_model(engine.compiled)
     assert force_model is not None
     values = np.linspace(0.0, 0.4, COUNT)[:, None] * np.ones(len(effect.parameters(engine.compiled)))
@@ -35,10 +35,9 @@ def run(threads: int):
 
 def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
     alone = run(1)
-    monkeypatch.setattr(mujoco_engine, "MIN_STEPS", 1)
     with monkeypatch.context() as here:
         here.setattr(MujocoEngine, "_simulate", None)  # in this process alone
-        shared = run(3)
+        shared = run(3, ProcessPoolCfg(min_steps=1))
     for name in ("qpos", "qvel", "sensordata", "diverged"):
         np.testing.assert_array_equal(getattr(shared, name), getattr(alone, name))
     assert np.ptp(alone.qpos[:, -1]) > 0.1
@@ -50,9 +49,8 @@ def test_few_steps_stay_where_they_are(monkeypatch):
 
 
 def test_an_error_in_another_process_is_reported_as_here(monkeypatch):
-    monkeypatch.setattr(mujoco_engine, "MIN_STEPS", 1)
     effect = effect_class("load_friction")("hinge")
-    engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3)
+    engine = MujocoEngine(Model(Scene(PENDULUM)), threads=3, processes=ProcessPoolCfg(min_steps=1))
     force_model = effect.force_model(engine.compiled)
     assert force_model is not None
     monkeypatch.setattr(MujocoEngine, "_simulate", None)  # in this process alone

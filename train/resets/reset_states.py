@@ -202,7 +202,7 @@ class ResetSampler:
         # Demonstrated commands differ from the joints by lag and contact forces; at rest they equal the joints.
         robot = self.task.robot
         candidate.ctrl[robot.actuator] = np.clip(candidate.qpos[robot.qpos], *self.command_limits(robot.actuator))
-        settled = self.settle(candidate)
+        settled = self.settled_state(candidate)
         if settled is None:
             self.discarded["chain broken"] += 1
         return settled
@@ -292,7 +292,7 @@ class ResetSampler:
                 deepest = max(deepest, -float(contact.dist))
         return deepest
 
-    def settle(self, candidate: ResetCandidate) -> np.ndarray | None:
+    def settled_state(self, candidate: ResetCandidate) -> np.ndarray | None:
         """Return positions after the settling time, None where the state fell apart."""
         m, d = self.m, self.d
         mujoco.mj_resetData(m, d)
@@ -300,7 +300,7 @@ class ResetSampler:
         d.mocap_pos[:], d.mocap_quat[:] = candidate.mocap[:, :3], candidate.mocap[:, 3:]
         mujoco.mj_kinematics(m, d)
         before = self.monitored_position(candidate)
-        for _ in range(round(self.cfg.settle / m.opt.timestep)):
+        for _ in range(round(self.cfg.settling_time / m.opt.timestep)):
             mujoco.mj_step(m, d)
         mujoco.mj_kinematics(m, d)
         if d.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(d.qpos).all():

@@ -29,12 +29,31 @@ class LeastSquaresCfg:
     """Relative fall of the cost below which the fit ends [-]."""
     damping: float = 1e-3
     """First Levenberg-Marquardt damping, relative to the curvature [-]."""
+    max_damping_trials: int = 5
+    """Most values of the damping tried for one step [-]."""
+    damping_decrease: float = 5.0
+    """Factor by which the damping falls after a step that lowers the cost [-]. Empirical, as the following."""
+    damping_increase: float = 8.0
+    """Factor by which the damping rises after a step that does not [-]."""
+    min_damping: float = 1e-6
+    """Damping below which it falls no further [-]."""
+    min_raised_damping: float = 1e-2
+    """Least damping after a step that does not lower the cost [-]."""
+    predicted_share: float = 0.25
+    """Share of the predicted fall of the cost that a step must reach to be taken without a refit of the initial states
+    [-] (Nocedal and Wright, "Numerical Optimization", section 4.1)."""
+    restart_ratio: float = 2.0
+    """Cost of a step over that before it above which a refit starts from the initial states before the step [-]."""
     refits: int = 3
     """Most refits of the initial states after steps that lower the cost by much less than predicted [-]."""
     refit_iterations: int = 2
     """Most iterations of such a refit [-]."""
     first_step: float = 0.1
     """First step of a parameter's finite difference, in units of its typical scale [-]."""
+    min_step: float = 0.01
+    """Least step of a finite difference, in units of the parameter's typical scale [-]."""
+    max_step: float = 0.3
+    """Largest step of a finite difference, in units of the parameter's typical scale [-]."""
     target_change: float = 3.0
     """Mean change of the residuals that a finite difference aims at, in units of noise [-]: with contacts, residuals
     jump a little from value to value, and smaller steps measure the jumps."""
@@ -46,6 +65,8 @@ class LeastSquaresCfg:
     """The same for a thorough polish, which is for the sake of the parameters' values [-]."""
     polish_steps: int = 6
     """Most steps of the parameters in a polish [-]."""
+    polish_step_decrease: float = 3.0
+    """Factor by which a step at fixed initial states is shortened where it raises the cost [-]."""
     polish_step_lengths: tuple[float, ...] = (1.0, 3.0)
     """Lengths that are tried for such a step, relative to the least-squares step [-]."""
     screened_gain: float = 0.5
@@ -275,7 +296,7 @@ class Solver:
             move, _ = self.solve(best.linear, fixed, best.offsets, best.values, self.cfg.damping)
             found = at(self.inside(best.values + size * move * self.scale))
             if found.cost > best.cost:
-                size /= 3
+                size /= self.cfg.polish_step_decrease
                 continue
             converged = found.cost > (1 - self.cfg.min_gain) * best.cost
             best, size = found, 1.0
@@ -336,7 +357,7 @@ class Solver:
         """Choose the next steps of finite differences, so that residuals change by about `target_change`."""
         change = np.sqrt(np.mean(np.concatenate(jacobian) ** 2, axis=0)) * self.scale
         steps = np.where(change > 0, self.cfg.target_change / np.maximum(change, 1e-12), 1.0)
-        self.step = np.clip(steps, 0.01, 0.3)
+        self.step = np.clip(steps, self.cfg.min_step, self.cfg.max_step)
 
     def fit(
         self,
@@ -385,10 +406,12 @@ class Solver:
     def _advance(self, state: _State, linear: Sequence[Linear], damping: float) -> tuple[_State, float]:
         """Return a better point, or the same one where there is none, and the next damping.
 
-        A step uses the derivatives by the initial states as computed last. Where the cost falls by less than a quarter
-        of the prediction, the initial states are fitted anew at the new parameters before the step is judged.
+        A step uses the derivatives by the initial states as computed last. Where the cost falls by less than
+        `predicted_share` of the prediction, the initial states are fitted anew at the new parameters before the step is
+        judged.
         """
-        for _ in range(5):
+        cfg = self.cfg
+        for _ in range(cfg.max_damping_trials):
             move, moves = self.solve(linear, state.starts, state.offsets, state.values, damping)
             values = self.inside(state.values + move * self.scale)
             offsets = [o + m for o, m in zip(state.offsets, moves, strict=True)]
@@ -398,17 +421,18 @@ class Solver:
             ]
             predicted = state.cost - self.cost(expected, offsets, values)
             cost = self.cost(self.p.residuals(self.trials(values, offsets)), offsets, values)
-            as_predicted = state.cost - cost > 0.25 * max(predicted, 0.0)
+            as_predicted = state.cost - cost > cfg.predicted_share * max(predicted, 0.0)
             if cost < state.cost and (as_predicted or not state.refits):
-                return _State(values, offsets, cost, state.starts, state.refits), max(damping / 5, 1e-6)
+                lowered = max(damping / cfg.damping_decrease, cfg.min_damping)
+                return _State(values, offsets, cost, state.starts, state.refits), lowered
             if state.refits:
-                begin = state.offsets if cost > 2 * state.cost else offsets
-                refitted, starts = self.fit_initial_states(values, begin, iterations=self.cfg.refit_iterations)
+                begin = state.offsets if cost > cfg.restart_ratio * state.cost else offsets
+                refitted, starts = self.fit_initial_states(values, begin, iterations=cfg.refit_iterations)
                 again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values)
                 state = replace(state, refits=state.refits - 1)
                 if again < state.cost:
                     return _State(values, refitted, again, starts, state.refits), damping
-            damping = max(damping * 8, 1e-2)
+            damping = max(damping * cfg.damping_increase, cfg.min_raised_damping)
         return state, damping
 
     def inside(self, values: np.ndarray) -> np.ndarray:

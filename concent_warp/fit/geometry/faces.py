@@ -71,7 +71,7 @@ class Faces:
             cfg: Settings.
         """
         self.cfg = cfg = cfg or FaceCfg()
-        found = [place for body in geometry.bodies for place in _places(geometry, scene, body, cfg)]
+        found = [place for body in geometry.bodies for place in _face_memberships(geometry, scene, body, cfg)]
         sphere, normal, foot, first = (np.array(column) for column in zip(*found, strict=True))
         self.count = len(geometry)
         self.sphere, self.normal, self.first = sphere, normal, first
@@ -129,7 +129,7 @@ def flattened(geometry: ContactGeometry, faces: Faces) -> ContactGeometry:
     return geometry.with_position(geometry.position + displacement)
 
 
-def _places(
+def _face_memberships(
     geometry: ContactGeometry, scene: Scene, body: str, cfg: FaceCfg
 ) -> list[tuple[int, np.ndarray, np.ndarray, bool]]:
     """Return sphere, outward normal (3,), foot on the nominal face [m] (3,) and whether it is the nearest face."""

@@ -31,9 +31,9 @@ class GeometrySearchCfg:
     """Generations at most."""
     plateau_generations: int = 20
     """Generations without progress after which the search ends: neither the lowest distance over the frames of the fit
-    nor the one over the held-out frames has fallen by `least_gain`. Chosen on seeds of the shape sorter that no page
+    nor the one over the held-out frames has fallen by `min_gain`. Chosen on seeds of the shape sorter that no page
     reports: shorter ones stop on the flat stretch after the first generations."""
-    least_gain: float = 0.02
+    min_gain: float = 0.02
     """Relative fall of the distance that counts as progress [-], measured from its value at the last progress."""
     held_out: float = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
@@ -215,7 +215,7 @@ class Search:
             self.stopped = f"all {cfg.generations} generations done"
         elif evolution.generation - self.last_gain > cfg.plateau_generations:
             self.stopped = (
-                f"error fell by less than {cfg.least_gain:.3g} of itself in {cfg.plateau_generations} generations"
+                f"error fell by less than {cfg.min_gain:.3g} of itself in {cfg.plateau_generations} generations"
             )
         if self.stopped is not None:
             self.note(self.survey([*segments, *self.held_out]))
@@ -227,7 +227,7 @@ class Search:
         if survey.held_out < self.best:
             self.best, self.best_mean = survey.held_out, self.evolution.mean.copy()
         lowest = self.best, self.lowest
-        share = 1 - self.cfg.least_gain
+        share = 1 - self.cfg.min_gain
         if any(now < share * then for now, then in zip(lowest, self.progress_from, strict=True)):
             self.last_gain, self.progress_from = self.evolution.generation, lowest
 

@@ -41,26 +41,34 @@ class GradientCfg:
     most `largest_step`."""
     largest_step: float = 1.5e-3
     """Longest first step that is chosen by itself [m]."""
+    step_increase: float = 1.2
+    """Factor by which a step grows after one that lowers the loss [-]. Empirical."""
+    step_decrease: float = 0.5
+    """Factor by which a step shrinks after one that does not [-]: bisection."""
     plateau_iterations: int = 4
-    """Steps in which no start got better by 3 %, after which the descent ends [-]. Empirical."""
+    """Steps in which the lowest loss must fall below `plateau_ratio`, or the descent ends [-]. Empirical."""
+    plateau_ratio: float = 0.97
+    """Lowest loss over that `plateau_iterations` before, above which the descent ends [-]. Empirical."""
     smallest_step: float = 2e-5
     """A start whose steps are shorter is finished [m]."""
     prior: float = 5.0
     """Weight of the mean squared displacement in the loss [1/m]."""
-    rescored: int = 4
-    """Iterates of each start that are scored again in MuJoCo."""
-    probe: int = 8
-    """Steps after which iterates are scored in MuJoCo for the first time: where none of them is better than the start,
-    the descent ends."""
-    disagreement: float = 5.0
-    """How many times farther from what was observed all starts may be in Newton than the model is in MuJoCo, on the
-    same stretches: beyond that Newton simulates another motion, such as a slipping grasp, and is not used."""
-    gain: float = 0.05
-    """Share by which the best of them must lie below the start, or gradients count as of no help."""
+    rescored_iterates: int = 4
+    """Iterates of each start that are evaluated again in MuJoCo [-]."""
+    first_rescoring: int = 8
+    """Steps after which iterates are evaluated in MuJoCo for the first time [-]: where none of them is better than the
+    start, the descent ends."""
+    max_engine_ratio: float = 5.0
+    """Loss in Newton of the best start over that of the model in MuJoCo, on the same segments, above which gradients
+    are not used [-]: Newton then simulates another motion, such as a slipping grasp. Empirical."""
+    min_gain: float = 0.05
+    """Relative fall of the loss in MuJoCo below which gradients count as without effect [-]."""
     device: str | None = None
     """Where Newton runs, "cpu" or "cuda:0"; None takes CUDA where there is a device."""
     horizon: HorizonCfg = field(default_factory=HorizonCfg)
+    """Settings of the lengths of the segments."""
     newton: NewtonCfg = field(default_factory=NewtonCfg)
+    """Settings of Newton's contacts and solver."""
 
 
 @dataclass
@@ -215,13 +223,14 @@ def descend(
         state.kept.append(state.now[p].copy())
         state.kept_start.append(int(p))
     first = len(state.losses) == 1
-    state.step = np.where(better, state.step * (1.0 if first else 1.2), state.step * 0.5)
+    state.step = np.where(better, state.step * (1.0 if first else cfg.step_increase), state.step * cfg.step_decrease)
     state.lowest = np.where(better, total, state.lowest)
     state.best[better], state.direction[better] = state.now[better], direction[better]
     state.now = bounded(state.best + state.step[:, None, None] * state.direction)
     goes_on = (state.step > cfg.smallest_step) & np.isfinite(state.lowest)
     state.lows.append(float(state.lowest.min()))
-    stale = len(state.lows) > cfg.plateau_iterations and state.lows[-1] > 0.97 * state.lows[-1 - cfg.plateau_iterations]
+    count = cfg.plateau_iterations
+    stale = len(state.lows) > count and state.lows[-1] > cfg.plateau_ratio * state.lows[-1 - count]
     state.finished = len(state.losses) >= cfg.iterations or stale or not goes_on.any()
 
 

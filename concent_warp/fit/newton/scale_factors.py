@@ -42,7 +42,7 @@ class FactorCfg:
     """Smallest and largest factor on stiffness [-]: contacts stay stable within them."""
     mass_range: tuple[float, float] = (0.7, 2.0)
     """Smallest and largest factor on masses [-]: contacts stay stable within them."""
-    disagreement: float = 5.0
+    max_engine_ratio: float = 5.0
     """How many times farther from what was observed the model may be in Newton than in MuJoCo: beyond that
     Newton simulates another motion, as of a grasp that slips [-]. Empirical."""
     device: str | None = None
@@ -167,11 +167,11 @@ class FactorDescent:
 
     def _agree(self, newton: float, mujoco: float) -> None:
         """Check that both simulators simulate the same motion, by the distances of the model from it [m]."""
-        if not newton <= self.cfg.disagreement * mujoco:
+        if not newton <= self.cfg.max_engine_ratio * mujoco:
             raise EngineError(
                 "Newton simulates another motion than MuJoCo, so that its gradients are of no use",
                 where=", ".join(s.name for s in self.scene.segments),
-                expected=f"objects at most {1e3 * self.cfg.disagreement * mujoco:.2g} mm from what was observed",
+                expected=f"objects at most {1e3 * self.cfg.max_engine_ratio * mujoco:.2g} mm from what was observed",
                 found=f"{1e3 * newton:.2g} mm",
                 fix="take demonstrations in which nothing is grasped",
             )

@@ -92,7 +92,7 @@ class GradientWarmStart:
         text = (
             f"best iterate {1e3 * self.metres(after):.2f} mm in MuJoCo, start {1e3 * self.metres(self.before):.2f} mm"
         )
-        if after > (1 - cfg.gain) * self.before:
+        if after > (1 - cfg.min_gain) * self.before:
             return self.without_help(f"gradients do not help here ({text})", state.losses)
         search.seconds += time.perf_counter() - self.begun
         return WarmStart(True, best, self.before, after, f"gradients helped: {text}", state.losses)
@@ -109,9 +109,9 @@ class GradientWarmStart:
         while not state.finished:
             descend(state, loss, self.base, metric, cfg, self.bounded)
             count = len(state.losses)
-            if count == 1 and min(state.losses[0]) > cfg.disagreement * mujoco_loss(loss.objective, loss.scene):
+            if count == 1 and min(state.losses[0]) > cfg.max_engine_ratio * mujoco_loss(loss.objective, loss.scene):
                 state.kept, state.kept_start, state.finished = [], [], True
-            if count == cfg.probe and not state.finished:
+            if count == cfg.first_rescoring and not state.finished:
                 state.finished = self.best_in_mujoco(state)[1] >= self.before
             keep((time.perf_counter() - begun) / (count - before) * (cfg.iterations - count))
         search.simulations += loss.simulations
@@ -158,7 +158,7 @@ class GradientWarmStart:
     def best_in_mujoco(self, state: Descent) -> tuple[np.ndarray | None, float]:
         """Return the best iterate in MuJoCo, in the strategy's channels, shape (S, C), and its distance [m]."""
         search = self.search
-        iterates = chosen_iterates(state, self.cfg.rescored)
+        iterates = chosen_iterates(state, self.cfg.rescored_iterates)
         if not len(iterates):
             return None, np.inf
         values = np.repeat(self.start[None], len(iterates), axis=0)

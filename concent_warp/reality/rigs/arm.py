@@ -46,7 +46,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     action["gripper"] = (time, np.full(len(time), FINGER_TRAVEL / 2))
     qpos = {f"joint{joint + 1}": [angle] for joint, angle in enumerate(HOME)}
     qpos |= {f"{side}_finger_joint": [FINGER_TRAVEL / 2] for side in ("left", "right")}
-    return RigTrial(DURATION, action, qpos=qpos, settle=0.5)
+    return RigTrial(DURATION, action, qpos=qpos, settling_time=0.5)
 
 
 SCENE = _nominal_scene()

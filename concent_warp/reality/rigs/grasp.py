@@ -104,7 +104,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
             "right_finger_joint": [OPEN],
             "slide_z": [LOW],
         },
-        settle=0.3,
+        settling_time=0.3,
     )
 
 

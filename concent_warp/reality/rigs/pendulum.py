@@ -50,7 +50,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     parts += [sweep(centre, centre - 0.15, slow), sweep(centre - 0.15, centre, slow)]
     parts += [sweep(centre, b, 0.8), hold(b, 0.4), glide(b, 0.0, 0.5)]
     parts += [hold(0.0, max(0.1, DURATION - sum(map(len, parts)) / 100))]
-    return RigTrial(DURATION, {"servo": joined(parts)}, settle=0.5)
+    return RigTrial(DURATION, {"servo": joined(parts)}, settling_time=0.5)
 
 
 SCENE = Scene(XML, "pendulum rig")

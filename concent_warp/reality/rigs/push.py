@@ -83,7 +83,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
         len(time) / RATE,
         {name: (time, value) for name, value in column.items()},
         qpos={"block_joint": [*place, HALF - 3e-5, 1, 0, 0, 0]},
-        settle=0.3,
+        settling_time=0.3,
     )
 
 

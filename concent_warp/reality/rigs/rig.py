@@ -35,7 +35,7 @@ class RigTrial:
     """Positions at time 0 by joint, if they differ from the nominal ones."""
     qvel: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """Velocities at time 0 by joint, set after settling."""
-    settle: float = 0.0
+    settling_time: float = 0.0
     """Time before time 0 for which the first command acts, so that bodies come to rest [s]."""
 
 
@@ -178,10 +178,10 @@ def perform(
     data = mujoco.MjData(model)
     _place(model, data.qpos, trial.qpos, model.jnt_qposadr)
     dt = model.opt.timestep
-    before = round(trial.settle / dt)
+    before = round(trial.settling_time / dt)
     steps = round(trial.duration / dt)
     forces = [f for f in (physics.force, *(effect.force for effect in effects)) if f is not None]
-    ctrl = _held_commands(model, trial, np.maximum(np.arange(-before, steps + 1) * dt + physics.lead, 0))
+    ctrl = _commands_at(model, trial, np.maximum(np.arange(-before, steps + 1) * dt + physics.lead, 0))
     readings = np.empty((steps + 1, model.nsensordata))
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     data.time = -before * dt
@@ -207,7 +207,7 @@ def perform(
     return TrueMotion(np.arange(steps + 1) * dt, readings), qpos, qvel
 
 
-def _held_commands(model: mujoco.MjModel, trial: RigTrial, time: np.ndarray) -> np.ndarray:
+def _commands_at(model: mujoco.MjModel, trial: RigTrial, time: np.ndarray) -> np.ndarray:
     """Return the commands in force at times (K,) [s], shape (K, nu)."""
     ctrl = np.zeros((len(time), model.nu))
     for i in range(model.nu):

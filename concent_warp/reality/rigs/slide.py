@@ -50,7 +50,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
         speed / (FRICTION * 9.81) + 0.35,
         qpos={"block_joint": [*start, *yaw_quaternion(yaw)]},
         qvel={"block_joint": [speed * np.cos(heading), speed * np.sin(heading), 0, 0, 0, turning]},
-        settle=0.2,
+        settling_time=0.2,
     )
 
 

@@ -36,11 +36,11 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     start = [0.0, 0.0, RADIUS - 1e-4, 1, 0, 0, 0]
     if k % 2 == 0:
         spin = rng.choice([-1, 1]) * rng.uniform(10, 20)
-        return RigTrial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settle=0.2)
+        return RigTrial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": [0, 0, 0, 0, 0, spin]}, settling_time=0.2)
     speed, heading = rng.uniform(0.25, 0.6), rng.uniform(-np.pi, np.pi)
     x, y = speed * np.cos(heading), speed * np.sin(heading)
     rolling = [x, y, 0, -y / RADIUS, x / RADIUS, 0]
-    return RigTrial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": rolling}, settle=0.2)
+    return RigTrial(1.4, qpos={"ball_joint": start}, qvel={"ball_joint": rolling}, settling_time=0.2)
 
 
 SPIN = Rig("spin", Scene(XML, "spin rig"), _plan, throws=4, start="resting", body="ball", surface="table")

@@ -13,8 +13,6 @@ from concent_warp.recording.recording import ImageStream
 
 CAMERA = "camera"
 """Name of the camera in a recording."""
-SAMPLES = 2
-"""Colour samples along each edge of a pixel."""
 
 
 def film(
@@ -49,7 +47,7 @@ def film(
         options = {"cam_res": (width, height), "cam_active": [CAMERA], "use_shadows": True}
         # Two contexts, because with several samples a pixel depth is that of the first sample, not of the middle.
         colour = mjw.create_render_context(
-            model, render_rgb=True, render_depth=False, samples_per_pixel=SAMPLES, **options
+            model, render_rgb=True, render_depth=False, samples_per_pixel=sensing.image_samples, **options
         )
         ranging = mjw.create_render_context(model, render_rgb=False, render_depth=True, **options)
         seen: Any = wp.zeros((1, height, width), dtype=wp.vec3)

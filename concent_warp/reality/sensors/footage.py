@@ -12,13 +12,6 @@ from concent_warp.reality.appearance.surroundings import furnish
 from concent_warp.recording.recording import ImageStream
 from concent_warp.scene.cameras import add_cameras
 
-GAIN = np.array([1.10, 1.0, 0.84])
-"""White balance of the cameras, by colour."""
-GAMMA = 0.85
-"""Exponent of their tone curve."""
-VIGNETTE = 0.22
-"""Loss of light in the corners."""
-
 
 @dataclass(frozen=True)
 class FootageCfg:
@@ -34,6 +27,12 @@ class FootageCfg:
     """Whether the objects are visible. Frames without them are for training the appearance of robot and background."""
     noise: float = 2.0
     """Noise of the colours, in steps of 1/255."""
+    white_balance: tuple[float, float, float] = (1.10, 1.0, 0.84)
+    """Gains of red, green and blue [-]: warmer than the simulated camera."""
+    gamma: float = 0.85
+    """Exponent of the tone curve [-]."""
+    vignette: float = 0.22
+    """Share of the light that the corners lose [-]."""
     samples: int = 2
     """Colour samples along each edge of a pixel."""
 
@@ -66,7 +65,7 @@ def footage(
     height, width = cfg.size
     rows = [model.camera(name).id for name in cfg.cameras]
     frames = np.zeros((len(rows), len(time), height, width, 3), dtype=np.uint8)
-    shade = _vignette(height, width)[..., None]
+    shade = _vignette(height, width, cfg.vignette)[..., None]
     with wp.ScopedDevice("cpu"):
         warp_model, warp_data = mjw.put_model(model), mjw.put_data(model, data)
         context = mjw.create_render_context(
@@ -82,7 +81,7 @@ def footage(
             mjw.render(warp_model, warp_data, context)
             for c in range(len(rows)):
                 mjw.get_rgb(context, c, seen)
-                light = developed(seen.numpy()[0] * shade)
+                light = developed(seen.numpy()[0] * shade, cfg)
                 frames[c, t] = np.clip(np.round(255 * light + rng.normal(0, cfg.noise, light.shape)), 0, 255)
     return {
         name: ImageStream(
@@ -97,9 +96,9 @@ def footage(
     }
 
 
-def developed(light: np.ndarray) -> np.ndarray:
+def developed(light: np.ndarray, cfg: FootageCfg) -> np.ndarray:
     """Return the colours 0..1 that the cameras report for light in 0..1, shape (..., 3)."""
-    return np.clip(light * GAIN, 0, 1) ** GAMMA
+    return np.clip(light * np.array(cfg.white_balance), 0, 1) ** cfg.gamma
 
 
 def _still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
@@ -112,11 +111,11 @@ def _still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     return spec
 
 
-def _vignette(height: int, width: int) -> np.ndarray:
+def _vignette(height: int, width: int, loss: float) -> np.ndarray:
     """Return the share of light that arrives at each pixel, shape (height, width)."""
     v, u = np.mgrid[0:height, 0:width]
     squared = ((2 * u / (width - 1) - 1) ** 2 + (2 * v / (height - 1) - 1) ** 2) / 2
-    return 1 - VIGNETTE * squared
+    return 1 - loss * squared
 
 
 def _pinhole_matrix(fovy: float, height: int, width: int) -> np.ndarray:

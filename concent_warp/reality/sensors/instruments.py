@@ -14,8 +14,6 @@ import numpy as np
 from concent_warp.recording.recording import Channel
 
 SENSOR = mujoco.mjtSensor
-JITTER = 0.02
-"""Spread of the instants of reading, as a share of their spacing; the clock tells each instant as it was."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,8 @@ class Instrument:
     """Standard deviation of the slow part [unit of the channel]."""
     memory: float = 0.3
     """Correlation time of the slow part [s]."""
+    jitter: float = 0.02
+    """Standard deviation of the instants of reading over their spacing [-]; recorded times are the true ones."""
 
     @property
     def std(self) -> float:
@@ -39,7 +39,7 @@ class Instrument:
     def times(self, duration: float, rng: np.random.Generator) -> np.ndarray:
         """Return the instants of reading [s] within 0..duration, evenly spaced but for the jitter, shape (T,)."""
         grid = np.arange(rng.uniform(0, 1 / self.rate), duration, 1 / self.rate)
-        return np.clip(grid + rng.normal(0, JITTER / self.rate, len(grid)), 0, duration)
+        return np.clip(grid + rng.normal(0, self.jitter / self.rate, len(grid)), 0, duration)
 
     def noise(self, time: np.ndarray, dim: int, rng: np.random.Generator) -> np.ndarray:
         """Return noise at the instants `time` (T,) [s], shape (T, dim)."""

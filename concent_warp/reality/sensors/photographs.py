@@ -11,9 +11,7 @@ import numpy as np
 from concent_warp.reality.sensors.camera import staged
 from concent_warp.reality.sensors.sensing import SensingCfg
 
-SAMPLES = 3
-"""Rays along each edge of a pixel."""
-SHOWN, APART = 0, 5
+VISIBLE_GROUP, HIDDEN_GROUP = 0, 5
 """Groups of geoms that the camera sees and does not see."""
 
 
@@ -25,6 +23,8 @@ class PhotographsCfg:
     """Photographs, spread over the sphere around the object."""
     size: int = 128
     """Width and height [px]."""
+    samples: int = 3
+    """Rays along each edge of a pixel [-]."""
     fovy: float = 20.0
     """Vertical field of view [degrees]."""
     fill: float = 0.8
@@ -59,10 +59,10 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
     import warp as wp
 
     cfg = cfg or PhotographsCfg()
-    fine = cfg.size * SAMPLES
+    fine = cfg.size * cfg.samples
     spec = staged(world, (body,), SensingCfg(image_size=(fine, fine), camera_fovy=cfg.fovy))
     for geom in spec.geoms:
-        geom.group = SHOWN if geom.parent.name == body else APART
+        geom.group = VISIBLE_GROUP if geom.parent.name == body else HIDDEN_GROUP
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -76,7 +76,7 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
         warp_model, warp_data = mjw.put_model(model), mjw.put_data(model, data)
         context = mjw.create_render_context(
             model, cam_res=(fine, fine), render_rgb=True, render_depth=True, use_shadows=False,
-            enabled_geom_groups=[SHOWN],
+            enabled_geom_groups=[VISIBLE_GROUP],
         )  # fmt: skip
         seen: Any = wp.zeros((1, fine, fine), dtype=wp.vec3)
         for camera in cameras:
@@ -135,7 +135,7 @@ def _looking_at(target: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 def _exposed(colour: np.ndarray, mask: np.ndarray, cfg: PhotographsCfg, rng: np.random.Generator) -> np.ndarray:
     """Return a photograph, uint8, shape (H, W, 4), of fine colours 0..1 and a mask, samples of a pixel averaged."""
-    shape = (cfg.size, SAMPLES, cfg.size, SAMPLES)
+    shape = (cfg.size, cfg.samples, cfg.size, cfg.samples)
     alpha = mask.reshape(shape).mean(axis=(1, 3))
     light = (colour * mask[..., None]).reshape(*shape, 3).mean(axis=(1, 3))
     straight = light / np.maximum(alpha, 1e-6)[..., None]

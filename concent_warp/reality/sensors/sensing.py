@@ -48,6 +48,8 @@ class SensingCfg:
     """Rate of the recorded frames [Hz]."""
     image_size: tuple[int, int] = (96, 128)
     """Height and width of the frames [px]."""
+    image_samples: int = 2
+    """Colour samples along each edge of a pixel [-]."""
     rgb_std: float = 2.0
     """Noise of the colours, in steps of 1/255."""
     depth_noise: float = 1.425e-3

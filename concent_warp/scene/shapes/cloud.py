@@ -9,7 +9,7 @@ box of 70 mm with a hole and a floor of 5 mm wants about 5,000 points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -21,20 +21,26 @@ from concent_warp.scene.shapes.solid import Distances, Solid, unit
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-NEIGHBOURS = 12
-"""Points that a local plane is fitted to."""
-VIEWS = 48
-"""Places around the object from which visibility is determined."""
-FLIP = 100.0
-"""Radius of the sphere that turns the cloud inside out, in distances of the farthest point: larger sees more."""
-SHARINGS = 2
-"""Times that neighbours share their votes on the side."""
-MOST = 20_000
-"""A larger cloud is thinned to about this many points."""
-BLEND = 6
-"""Points whose planes the distance is averaged over."""
-FEWEST = 50
-"""Fewer points than this do not describe a surface."""
+
+@dataclass(frozen=True)
+class PointCloudCfg:
+    """How a cloud of points becomes a solid. Values were set on scans of boxes with holes, at noise below a spacing."""
+
+    plane_neighbours: int = 12
+    """Nearest points that a local plane is fitted to, the point itself included [-]."""
+    views: int = 48
+    """Viewpoints around the object from which visibility is determined [-]."""
+    flip_radius: float = 100.0
+    """Radius of the sphere at which the cloud is inverted, over the distance of the farthest point [-]: larger values
+    count more points as visible (Katz, Tal and Basri 2007)."""
+    vote_averagings: int = 2
+    """How often votes on the outward side are averaged over neighbours [-]."""
+    max_points: int = 20_000
+    """Points to about which a larger cloud is thinned out [-]."""
+    distance_neighbours: int = 6
+    """Nearest points over whose planes the distance is averaged [-]."""
+    min_points: int = 50
+    """Fewest points that describe a surface [-]."""
 
 
 @dataclass(frozen=True)
@@ -45,31 +51,45 @@ class PointCloud(Solid):
     """Surface points [m], shape (n, 3)."""
     normals: np.ndarray
     """Outward unit normals, shape (n, 3)."""
+    cfg: PointCloudCfg = field(default_factory=PointCloudCfg)
+    """Settings."""
 
     @staticmethod
-    def of(points: np.ndarray, normals: np.ndarray | None = None, name: str = "<point cloud>") -> PointCloud:
+    def of(
+        points: np.ndarray,
+        normals: np.ndarray | None = None,
+        name: str = "<point cloud>",
+        cfg: PointCloudCfg | None = None,
+    ) -> PointCloud:
         """Return the solid of surface points [m], shape (n, 3); normals not given are estimated.
 
         Raises `SceneError` where the points are too few, not finite, or all in one place.
         """
+        cfg = cfg or PointCloudCfg()
         points = np.asarray(points, dtype=float)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < FEWEST:
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < cfg.min_points:
             raise SceneError(
-                "too few points for a surface", where=name, expected=f"(n, 3) with n >= {FEWEST}", found=points.shape
+                "too few points for a surface",
+                where=name,
+                expected=f"(n, 3) with n >= {cfg.min_points}",
+                found=points.shape,
             )
         if not np.isfinite(points).all():
             raise SceneError("the point cloud holds coordinates that are not finite", where=name)
         first = np.unique(points, axis=0, return_index=True)[1]
-        first = first[_thinned(points[first], MOST)]
+        first = first[_thinned(points[first], cfg.max_points)]
         points = points[first]
-        if len(points) < FEWEST:
+        if len(points) < cfg.min_points:
             raise SceneError(
-                "too few different points for a surface", where=name, expected=f"at least {FEWEST}", found=len(points)
+                "too few different points for a surface",
+                where=name,
+                expected=f"at least {cfg.min_points}",
+                found=len(points),
             )
         if normals is None:
-            return PointCloud(points, _outward_normals(points))
+            return PointCloud(points, _outward_normals(points, cfg), cfg)
         normals = np.asarray(normals, dtype=float)[first]
-        return PointCloud(points, unit(normals, np.linalg.norm(normals, axis=1)))
+        return PointCloud(points, unit(normals, np.linalg.norm(normals, axis=1)), cfg)
 
     @cached_property
     def tree(self) -> KDTree:
@@ -90,7 +110,7 @@ class PointCloud(Solid):
 
     def distance(self, points: np.ndarray) -> Distances:
         """See `Solid.distance`."""
-        reach, nearest = nearest_points(self.tree, points, BLEND)
+        reach, nearest = nearest_points(self.tree, points, self.cfg.distance_neighbours)
         width = np.sqrt(self.patch[nearest[:, :1]])
         weight = np.exp((reach[:, :1] ** 2 - reach**2) / width**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -109,7 +129,7 @@ def nearest_points(tree: Any, points: np.ndarray, count: int) -> tuple[np.ndarra
     return tree.query(points, k=[*range(1, count + 1)])
 
 
-def _outward_normals(points: np.ndarray) -> np.ndarray:
+def _outward_normals(points: np.ndarray, cfg: PointCloudCfg) -> np.ndarray:
     """Estimate outward normals of surface points, shape (n, 3).
 
     Directions are those of least spread among the nearest points. Signs are voted for: seen from each of many places
@@ -119,17 +139,17 @@ def _outward_normals(points: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial import ConvexHull, KDTree, QhullError
 
-    near = nearest_points(KDTree(points), points, NEIGHBOURS)[1]
+    near = nearest_points(KDTree(points), points, cfg.plane_neighbours)[1]
     spread = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     reach = float(np.linalg.norm(points - middle, axis=1).max())
     votes = np.zeros(len(points))
-    for direction in _fibonacci_sphere(VIEWS):
+    for direction in _fibonacci_sphere(cfg.views):
         ray = (points - middle) / reach - 4 * direction
         length = np.linalg.norm(ray, axis=1, keepdims=True)
         ray /= length
-        flipped = np.vstack([(2 * FLIP * length.max() - length) * ray, np.zeros(3)])
+        flipped = np.vstack([(2 * cfg.flip_radius * length.max() - length) * ray, np.zeros(3)])
         try:
             seen = ConvexHull(flipped).vertices
         except QhullError:
@@ -138,7 +158,7 @@ def _outward_normals(points: np.ndarray) -> np.ndarray:
         votes[seen] -= np.einsum("nd,nd->n", normals[seen], ray[seen])
     agreement = np.einsum("nkd,nd->nk", normals[near], normals)
     agreement *= np.abs(agreement)
-    for _ in range(SHARINGS):
+    for _ in range(cfg.vote_averagings):
         votes = np.mean(agreement * votes[near], axis=1)
     return normals * np.where(votes < 0, -1, 1)[:, None]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,10 +16,16 @@ if TYPE_CHECKING:
     import trimesh
     import warp as wp
 
-TOUCHING = 1e-6
-"""Distance below which a point lies on the surface, relative to the mesh's extent: the normal is then the face's."""
-FLAT = 1e-9
-"""Thickness below which points are in one plane, relative to their spread."""
+
+@dataclass(frozen=True)
+class MeshCfg:
+    """Tolerances of meshes."""
+
+    surface_tolerance: float = 1e-6
+    """Distance below which a point lies on the surface and takes the normal of the face, relative to the mesh's extent
+    [-]: above the rounding of the search, which is in float32."""
+    flat_tolerance: float = 1e-9
+    """Thickness below which points lie in one plane, relative to their spread [-]: above the rounding of float64."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +36,15 @@ class MeshSolid(Solid):
     """Vertices [m], shape (v, 3)."""
     faces: np.ndarray
     """Vertex indices, counter-clockwise seen from outside, shape (f, 3)."""
+    cfg: MeshCfg = field(default_factory=MeshCfg)
+    """Tolerances."""
 
     @staticmethod
-    def of(mesh: trimesh.Trimesh, name: str = "<mesh>") -> MeshSolid:
+    def of(mesh: trimesh.Trimesh, name: str = "<mesh>", cfg: MeshCfg | None = None) -> MeshSolid:
         """Return the solid of a mesh, or of its convex hull, with a warning, where the mesh is not watertight."""
-        closed = closed_mesh(mesh, name)
-        return MeshSolid(np.array(closed.vertices, dtype=float), np.array(closed.faces, dtype=int))
+        cfg = cfg or MeshCfg()
+        closed = closed_mesh(mesh, name, cfg)
+        return MeshSolid(np.array(closed.vertices, dtype=float), np.array(closed.faces, dtype=int), cfg)
 
     @property
     def area(self) -> float:
@@ -91,12 +100,12 @@ class MeshSolid(Solid):
         sign = side.astype(float)
         away = points - _nearest_on_triangles(points, corners)
         length = np.linalg.norm(away, axis=1)
-        touching = length < TOUCHING * self.extent
+        touching = length < self.cfg.surface_tolerance * self.extent
         gradient = unit(sign[:, None] * away, length)
         return sign * length, np.where(touching[:, None], _face_normals(corners), gradient)
 
 
-def closed_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
+def closed_mesh(mesh: trimesh.Trimesh, name: str, cfg: MeshCfg | None = None) -> trimesh.Trimesh:
     """Return a mesh with outward faces that bounds a volume: the mesh itself, or its convex hull with a warning."""
     import trimesh
 
@@ -107,7 +116,7 @@ def closed_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
         raise SceneError("the mesh has no faces, or vertices that are not finite", where=name)
     if not merged.is_watertight:
         warnings.warn(f"{name}: the mesh is not watertight; its convex hull is used in its place", stacklevel=3)
-        merged = hull(merged.vertices, name)
+        merged = convex_hull(merged.vertices, name, cfg)
     if not merged.is_winding_consistent:
         trimesh.repair.fix_normals(merged)
     if merged.volume < 0:
@@ -115,15 +124,19 @@ def closed_mesh(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
     return merged
 
 
-def hull(points: np.ndarray, name: str) -> trimesh.Trimesh:
-    """Return the convex hull of points [m], shape (n, 3)."""
+def convex_hull(points: np.ndarray, name: str, cfg: MeshCfg | None = None) -> trimesh.Trimesh:
+    """Return the convex hull of points [m], shape (n, 3).
+
+    Raises `SceneError` where all points lie in one plane.
+    """
     import trimesh
     from scipy.spatial import QhullError
 
     points = np.asarray(points, dtype=float)
+    flat = (cfg or MeshCfg()).flat_tolerance
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     try:
-        if len(spread) == 3 and spread[2] > FLAT * spread[0]:
+        if len(spread) == 3 and spread[2] > flat * spread[0]:
             return trimesh.convex.convex_hull(points)
     except (QhullError, ValueError):
         pass

@@ -12,7 +12,7 @@ import numpy as np
 
 from concent_warp.errors import SceneError
 from concent_warp.scene.shapes.cloud import PointCloud
-from concent_warp.scene.shapes.mesh import MeshSolid, closed_mesh, hull
+from concent_warp.scene.shapes.mesh import MeshSolid, closed_mesh, convex_hull
 from concent_warp.scene.shapes.ply import read_header, read_vertices
 from concent_warp.scene.shapes.splat import is_splats, read_splats
 from concent_warp.scene.shapes.surface import Surface
@@ -138,7 +138,7 @@ def load_object(
         if len(points) < 4:
             raise SceneError("too few points for an object", where=path, expected="at least 4", found=len(points))
         _check_size(np.array([points.min(axis=0), points.max(axis=0)]), path, scale)
-        mesh = hull(points, str(path))
+        mesh = convex_hull(points, str(path))
     else:
         raise SceneError(
             "an object cannot be read from this kind of file", where=path, expected=[*MESHES, ".ply", *CLOUDS],

@@ -10,7 +10,7 @@ leave no gap at the seam; geoms that merely touch keep spheres a radius away fro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import mujoco
@@ -20,10 +20,19 @@ from concent_warp.errors import SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, Placed, Solid
 
-PROBE = 1e-6
-"""How far outside a surface point is looked at to tell an outer face from an inner one, relative to the size."""
-ROUNDS = 200
-"""Draws after which a union without outer surface is given up."""
+
+@dataclass(frozen=True)
+class SurfaceCfg:
+    """How the outer surface of a union is sampled."""
+
+    probe_distance: float = 1e-6
+    """Distance from a surface point to the probe that distinguishes outer faces from inner ones, over the root of the
+    largest area [-]: above rounding, below the gaps between faces."""
+    max_batches: int = 200
+    """Batches of samples after which a union counts as without outer surface [-]: as many as a surface needs of which
+    one in 200 points is outer."""
+    area_samples: int = 20_000
+    """Samples from which the area of a union is estimated [-], to about 1 %."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,8 @@ class Surface:
     """Sliding friction coefficient of each solid [-], shape (len(solids),)."""
     name: str = "<surface>"
     """What it is the surface of, for messages."""
+    cfg: SurfaceCfg = field(default_factory=SurfaceCfg)
+    """Settings."""
 
     @staticmethod
     def of_body(scene: Scene, body: str) -> Surface:
@@ -84,14 +95,14 @@ class Surface:
         return np.argmin([solid.distance(points)[0] for solid in self.solids], axis=0)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw points [m] uniformly from the outer surface, with outward normals, each of shape (count, 3)."""
+        """Return points [m] sampled uniformly from the outer surface, with outward normals, each (count, 3)."""
         points: list[np.ndarray] = []
         normals: list[np.ndarray] = []
         found = 0
-        for _ in range(ROUNDS):
-            drawn, drawn_normals, outer = self.draw(max(2 * (count - found), 64), rng)
-            points.append(drawn[outer])
-            normals.append(drawn_normals[outer])
+        for _ in range(self.cfg.max_batches):
+            batch, batch_normals, outer = self.sample_all(max(2 * (count - found), 64), rng)
+            points.append(batch[outer])
+            normals.append(batch_normals[outer])
             found += int(outer.sum())
             if found >= count:
                 return np.concatenate(points)[:count], np.concatenate(normals)[:count]
@@ -99,14 +110,14 @@ class Surface:
 
     @cached_property
     def area(self) -> float:
-        """Area of the outer surface [m^2]; for a union an estimate from 20,000 points (about 1 %)."""
+        """Area of the outer surface [m^2]; for a union an estimate from `SurfaceCfg.area_samples` points."""
         whole = sum(solid.area for solid in self.solids)
         if len(self.solids) == 1:
             return whole
-        return whole * float(self.draw(20_000, np.random.default_rng(0))[2].mean())
+        return whole * float(self.sample_all(self.cfg.area_samples, np.random.default_rng(0))[2].mean())
 
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw from the surfaces of all solids and tell which points lie on the outer surface of the union.
+    def sample_all(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sample the surfaces of all solids and determine which points lie on the outer surface of the union.
 
         A point is outer if a probe just outside it is outside every solid, which drops points within another solid and
         faces where two solids touch. A face that two solids share is left to the first of them.
@@ -122,7 +133,7 @@ class Surface:
             points[mine], normals[mine] = solid.sample(int(mine.sum()), rng)
         outer = np.ones(count, dtype=bool)
         if len(self.solids) > 1:
-            step = PROBE * np.sqrt(areas.max())
+            step = self.cfg.probe_distance * np.sqrt(areas.max())
             for k, solid in enumerate(self.solids):
                 others = owner != k
                 probed = solid.distance(points[others] + step * normals[others])[0]

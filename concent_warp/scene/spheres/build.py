@@ -17,17 +17,14 @@ from concent_warp.errors import ModelError, SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
-from concent_warp.scene.spheres.inset import inset
-from concent_warp.scene.spheres.mass import split_mass
+from concent_warp.scene.spheres.inset import InsetCfg, inset
+from concent_warp.scene.spheres.mass import MassSplitCfg, split_mass
 from concent_warp.scene.spheres.sampling import farthest_point_sampling
-
-SMALLEST = 0.05
-"""Spheres that would have to shrink below this share of the radius, at sharp edges, are not candidates."""
 
 
 @dataclass(frozen=True)
 class ContactGeometryCfg:
-    """How the spheres are laid.
+    """How spheres are placed on objects.
 
     Example:
         >>> import concent_warp as cw
@@ -51,6 +48,13 @@ class ContactGeometryCfg:
     """Where an object is thinner than an inset sphere: make the sphere as large as fits, or raise an error."""
     friction: float | None = None
     """Sliding friction coefficient [-]; None takes it from the nearest geom of the body."""
+    min_radius_share: float = 0.05
+    """Share of the radius below which a shrunk sphere, at a sharp edge, is not a candidate [-]: smaller ones add
+    nothing to the shape. Empirical."""
+    inset: InsetCfg = field(default_factory=InsetCfg)
+    """How inset spheres are moved into the object."""
+    mass: MassSplitCfg = field(default_factory=MassSplitCfg)
+    """How the mass of a body is split over its spheres."""
     candidates: int = 20_000
     """Surface points of each object to choose from."""
     seed: int = 0
@@ -71,7 +75,7 @@ class ContactGeometryCfg:
         *,
         surfaces: Mapping[str, Surface] | None = None,
     ) -> ContactGeometry:
-        """Lay spheres on bodies of a scene.
+        """Return spheres on bodies of a scene.
 
         Args:
             scene: the scene.
@@ -84,7 +88,7 @@ class ContactGeometryCfg:
         names = tuple(scene.objects() if objects is None else objects)
         if not names:
             raise SceneError(
-                "the scene has no objects to lay spheres on",
+                "the scene has no objects to place spheres on",
                 where=scene.source,
                 expected="a body with a free joint, or names in <text name='concent_objects'>",
             )
@@ -122,12 +126,12 @@ class ContactGeometryCfg:
     def build_body(
         self, scene: Scene, name: str, surface: Surface, count: int, rng: np.random.Generator
     ) -> ContactGeometry:
-        """Lay `count` spheres on one body."""
+        """Return `count` spheres on one body."""
         wanted = self.radius if self.radius != "auto" else _spacing(surface.area, count) / 2
         points, _ = surface.sample(max(self.candidates, count), rng)
         radius = np.full(len(points), wanted)
         if self.placement == "inset":
-            points, radius = inset(surface, points, wanted)
+            points, radius = inset(surface, points, wanted, self.inset)
             if self.thin == "refuse" and radius.min() < wanted * (1 - 1e-6):
                 raise ModelError(
                     f"body {name!r} is too thin for spheres of this radius within it",
@@ -135,7 +139,7 @@ class ContactGeometryCfg:
                     found=f"{wanted:.3g} m",
                     fix='pass a smaller radius, thin="shrink" or placement="surface"',
                 )
-            roomy = radius > SMALLEST * wanted
+            roomy = radius > self.min_radius_share * wanted
             if roomy.sum() < count:
                 raise ModelError(
                     f"body {name!r} has no room for {count} spheres within it", found=f"{int(roomy.sum())} places"
@@ -149,7 +153,7 @@ class ContactGeometryCfg:
         mujoco.mju_quat2Mat(rotation, model.body_iquat[row])
         axes = rotation.reshape(3, 3)
         inertia = axes @ np.diag(model.body_inertia[row]) @ axes.T
-        split = split_mass(points, radius, float(model.body_mass[row]), model.body_ipos[row], inertia)
+        split = split_mass(points, radius, float(model.body_mass[row]), model.body_ipos[row], inertia, self.mass)
         friction = surface.friction[surface.owner(points)] if self.friction is None else np.full(count, self.friction)
         return ContactGeometry((name,), np.zeros(count, dtype=int), points, radius, split.mass, friction)
 

@@ -1,4 +1,4 @@
-"""Make a contact geometry wrong on purpose: noise on the centres, or faces moved. For benchmarks and tests."""
+"""Perturbed contact geometries for benchmarks and tests: noise on the centres, or faces moved."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 SelectFaces = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """From surface points [m] and outward normals, each (n, 3) in the body frame, to which of them are meant, (n,) bool."""
-PROBES = 40_000
-"""Surface points looked at to find the face that a sphere belongs to."""
 
 
 def disturb(
@@ -48,6 +46,7 @@ def offset_normal(
     body: str,
     slack: float = 1e-3,
     surface: Surface | None = None,
+    samples: int = 40_000,
 ) -> ContactGeometry:
     """Move the spheres that make up some faces of a body along the outward normals there.
 
@@ -62,6 +61,7 @@ def offset_normal(
         body: name of the body.
         slack: allowance [m] for spheres that do not quite reach the face.
         surface: surface to use in place of the geoms of the scene.
+        samples: surface points that represent the faces.
 
     Raises `ModelError` where no sphere is at the selected faces.
     """
@@ -69,7 +69,7 @@ def offset_normal(
 
     surface = surface or Surface.of_body(scene, body)
     mine = np.flatnonzero(geometry.body == _body_index(geometry, body))
-    points, normals = surface.sample(PROBES, np.random.default_rng(0))
+    points, normals = surface.sample(samples, np.random.default_rng(0))
     meant = select(points, normals)
     points, normals = points[meant], normals[meant]
     if not len(points):

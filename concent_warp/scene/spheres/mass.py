@@ -18,8 +18,22 @@ import numpy as np
 
 from concent_warp.errors import ModelError
 
-TOLERANCE = 1e-9
-"""Residual of the scaled equations below which they hold."""
+
+@dataclass(frozen=True)
+class MassSplitCfg:
+    """Settings of the quadratic programme."""
+
+    tolerance: float = 1e-9
+    """Residual of the scaled equations below which they hold [-]: above the rounding of float64."""
+    softness: float = 1e-6
+    """Inverse weight of equations that need only hold nearly [-]: small against 1, large against rounding."""
+    max_steps: int = 200
+    """Most Newton steps [-]; a few dozen are usual."""
+    min_step_length: float = 1e-8
+    """Length of a damped Newton step below which the equations count as without solution [-]."""
+    sufficient_decrease: float = 1e-4
+    """Share of the linearly predicted decrease that a step must reach [-] (Armijo; Nocedal and Wright, "Numerical
+    Optimization", section 3.1)."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +49,12 @@ class MassSplit:
 
 
 def split_mass(
-    positions: np.ndarray, radii: np.ndarray, mass: float, com: np.ndarray, inertia: np.ndarray
+    positions: np.ndarray,
+    radii: np.ndarray,
+    mass: float,
+    com: np.ndarray,
+    inertia: np.ndarray,
+    cfg: MassSplitCfg | None = None,
 ) -> MassSplit:
     """Split a body's mass over solid spheres.
 
@@ -45,6 +64,7 @@ def split_mass(
         mass: mass of the body [kg].
         com: its centre of mass, body frame [m], shape (3,).
         inertia: its inertia tensor about the centre of mass, axes of the body frame [kg m^2], shape (3, 3).
+        cfg: settings.
 
     Returns:
         Masses that keep mass, centre of mass and inertia where that is possible; else mass and centre of mass, with the
@@ -63,19 +83,19 @@ def split_mass(
     right = np.concatenate([[1.0, 0, 0, 0], target])
     share = np.full(count, 1 / count)
     for exact in (10, 4, 1):
-        weights = _nearest_weights(rows, right, share, exact)
+        weights = _nearest_weights(rows, right, share, exact, cfg or MassSplitCfg())
         if weights is not None:
             break
     else:
         weights = share
     weights = weights / weights.sum()
     com_error = float(np.linalg.norm(weights @ away))
-    scale = float(np.linalg.norm(FULL @ target))
-    inertia_error = float(np.linalg.norm(FULL @ (second @ weights - target))) / scale if scale > 0 else 0.0
+    scale = float(np.linalg.norm(FROBENIUS_WEIGHTS @ target))
+    inertia_error = float(np.linalg.norm(FROBENIUS_WEIGHTS @ (second @ weights - target))) / scale if scale > 0 else 0.0
     return MassSplit(mass * weights, com_error, inertia_error)
 
 
-FULL = np.diag(np.sqrt([1.0, 1, 1, 2, 2, 2]))
+FROBENIUS_WEIGHTS = np.diag(np.sqrt([1.0, 1, 1, 2, 2, 2]))
 """Weights under which the norm of the six entries of a symmetric tensor is its Frobenius norm."""
 
 
@@ -91,7 +111,9 @@ def _inertia_rows(away: np.ndarray, radii: np.ndarray) -> np.ndarray:
     return _tensor_entries(tensors).T
 
 
-def _nearest_weights(rows: np.ndarray, right: np.ndarray, share: np.ndarray, exact: int) -> np.ndarray | None:
+def _nearest_weights(
+    rows: np.ndarray, right: np.ndarray, share: np.ndarray, exact: int, cfg: MassSplitCfg
+) -> np.ndarray | None:
     """Minimise ``|w - share|^2 n / 2`` over ``w >= 0`` with the first `exact` equations kept and the rest near.
 
     The rest enter as a heavy quadratic penalty. Semi-smooth Newton on the dual: ``w = max(0, share + A^T y / n)``.
@@ -101,13 +123,14 @@ def _nearest_weights(rows: np.ndarray, right: np.ndarray, share: np.ndarray, exa
         right: right-hand side, shape (m,).
         share: wanted weights, shape (n,).
         exact: number of leading equations that must hold.
+        cfg: settings.
 
     Returns:
         Weights, shape (n,), or None where the exact equations cannot hold.
     """
     count = len(share)
     soft = np.zeros(len(right))
-    soft[exact:] = 1e-6
+    soft[exact:] = cfg.softness
     # Equations that depend on others (all centres in a plane, say) make the Newton matrix singular.
     tiny = 1e-13 * np.eye(len(right))
 
@@ -118,20 +141,20 @@ def _nearest_weights(rows: np.ndarray, right: np.ndarray, share: np.ndarray, exa
 
     y = np.zeros(len(right))
     value, weights, gradient = dual(y)
-    for _ in range(200):
-        if np.abs(gradient).max() < TOLERANCE:
+    for _ in range(cfg.max_steps):
+        if np.abs(gradient).max() < cfg.tolerance:
             return weights
         active = rows[:, weights > 0]
         curvature = active @ active.T / count + np.diag(soft)
         step = -np.linalg.solve(curvature + tiny * max(1.0, float(np.trace(curvature))), gradient)
         slope = float(gradient @ step)
         length = 1.0
-        while length > 1e-8:
+        while length > cfg.min_step_length:
             trial, trial_weights, trial_gradient = dual(y + length * step)
-            if trial <= value + 1e-4 * length * slope + 1e-15 * abs(value):
+            if trial <= value + cfg.sufficient_decrease * length * slope + 1e-15 * abs(value):
                 break
             length /= 2
         else:
             return None
         y, value, weights, gradient = y + length * step, trial, trial_weights, trial_gradient
-    return weights if np.abs(gradient).max() < TOLERANCE else None
+    return weights if np.abs(gradient).max() < cfg.tolerance else None

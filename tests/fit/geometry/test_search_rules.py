@@ -155,7 +155,7 @@ def test_the_search_ends_where_nothing_is_gained_for_some_generations(swollen, s
 
 
 def test_a_gain_is_a_fall_below_a_share_of_either_distance_at_the_last_one(swollen, segment):
-    search = written(swollen, segment, replace(CFG, least_gain=0.1))
+    search = written(swollen, segment, replace(CFG, min_gain=0.1))
     told = []
     for generation, (loss, held_out) in enumerate(
         [(1.0, 1.0), (0.91, 0.91), (0.89, 1.2), (0.81, 0.905), (0.9, 0.8), (0.9, 0.73), (0.7, 0.9)], start=1

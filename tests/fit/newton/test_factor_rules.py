@@ -396,11 +396,11 @@ def test_a_motion_that_newton_simulates_otherwise_ends_the_descent_at_its_first_
 def test_a_descent_ends_early_where_its_first_iterates_are_no_better(gradients, loss, steps):
     searched = Searched()
     searched.losses = lambda position: np.full(len(position), loss)
-    result = warm(searched, GradientCfg(iterations=6, probe=3)).run(None, False, None)
+    result = warm(searched, GradientCfg(iterations=6, first_rescoring=3)).run(None, False, None)
     assert len(result.losses) == steps
     assert len(searched.best_in_mujoco) == 2
     del gradients
-    last = warm(searched, GradientCfg(iterations=3, probe=3)).run(None, False, None)
+    last = warm(searched, GradientCfg(iterations=3, first_rescoring=3)).run(None, False, None)
     assert len(last.losses) == 3
 
 

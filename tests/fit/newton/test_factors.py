@@ -99,4 +99,4 @@ def test_without_geometry_or_observed_objects_or_a_common_motion_it_is_reported(
     with pytest.raises(RecordingError, match="nothing to fit to"):
         factors(model, blind)
     with pytest.raises(EngineError, match="another motion"):
-        factors(model, recording, FactorCfg(disagreement=0.5))
+        factors(model, recording, FactorCfg(max_engine_ratio=0.5))

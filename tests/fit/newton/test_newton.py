@@ -138,7 +138,7 @@ def test_without_help_from_gradients_the_strategy_goes_on_alone(pushed, thick):
 
 
 def test_another_motion_in_newton_ends_the_descent_at_once(pushed, thick):
-    cfg = FitCfg(gradient=replace(SMALL, disagreement=0.1), generations=1)
+    cfg = FitCfg(gradient=replace(SMALL, max_engine_ratio=0.1), generations=1)
     found = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco")
     assert "another motion" in found.gradients.remark
     assert len(found.gradients.losses) == 1
