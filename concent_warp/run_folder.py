@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 import tomllib
+import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -25,6 +26,10 @@ UNFINISHED = ".unfinished"
 """Empty file in the folder of a run that has not ended."""
 CHECKPOINT = "checkpoint.npz"
 """File of the state of a fit."""
+TRAIN_CHECKPOINT = "checkpoint.pt"
+"""File of the state of a training."""
+TRAIN_SETTINGS = "train.toml"
+"""File of the settings of a training; a folder that holds one is the run folder of a training."""
 EPISODES = ".staging"
 """Folder of the episodes of a data set that are not packed yet, each named by six digits."""
 STATES = ("checkpoint.*", f"{EPISODES}/{6 * '[0-9]'}", f"{EPISODES}/dropped-*", "meta/info.json", "dataset.hdf5")
@@ -57,6 +62,17 @@ def _check_writable(path: Path, *, overwrite: bool) -> None:
         raise ConcentError("the file exists", where=path, fix="choose another name or pass --overwrite")
 
 
+def check_folder(path: Path) -> None:
+    """Check that a folder is there or may be made.
+
+    Raises:
+        ConcentError: It, or one that it is to be in, is a file.
+    """
+    there = next((p for p in (path, *path.parents) if p.exists()), path)
+    if there.exists() and not there.is_dir():
+        raise ConcentError("this is a file", where=there, expected="a folder for the results")
+
+
 def check_training(path: Path) -> None:
     """Check that a training exists, without importing the training package.
 
@@ -65,6 +81,15 @@ def check_training(path: Path) -> None:
     """
     if not path.exists():
         raise TrainError("no such training", where=path, expected="its run folder, or a checkpoint file in one")
+    folder = path if path.is_dir() else path.parent
+    checkpoint = path / TRAIN_CHECKPOINT if path.is_dir() else path
+    if checkpoint.exists() and not (checkpoint.is_file() and zipfile.is_zipfile(checkpoint)):
+        raise TrainError("not a checkpoint", where=checkpoint, expected="an archive of torch.save")
+    if not (folder / TRAIN_SETTINGS).is_file():
+        raise TrainError("the folder holds no training", where=folder, expected=f"a {TRAIN_SETTINGS}")
+    if not checkpoint.exists():
+        expected = f"a {TRAIN_CHECKPOINT} that concent train wrote"
+        raise TrainError("no such checkpoint", where=checkpoint, expected=expected)
 
 
 @dataclass
@@ -166,16 +191,9 @@ def _claim_folder(folder: Path, *, overwrite: bool, resume: bool, keep_folders: 
     make_folder(folder)
     locks = [_locked(folder)]
     try:
-        holds = _content(folder)
-        waiting = _content(after) == "unfinished"
-        if holds == "other":
-            raise ConcentError(
-                "the folder holds other things than a run", where=folder, fix="choose another folder with --out"
-            )
+        holds, waiting = _check_content(folder, overwrite=overwrite, resume=resume)
         if resume and waiting:
             return RunFolder(folder, after, keep_folders, "unfinished", False, [*locks, _locked(after)])
-        if not overwrite and not resume and (waiting or holds != "nothing"):
-            raise _existing_run_error(folder, after if waiting else folder, unfinished=waiting or holds == "unfinished")
         shutil.rmtree(before, ignore_errors=True)
         if after.exists():
             locks.append(_locked(after))
@@ -192,6 +210,37 @@ def _claim_folder(folder: Path, *, overwrite: bool, resume: bool, keep_folders: 
         for lock in locks:
             os.close(lock)
         raise
+
+
+def check_run_folder(folder: Path, *, overwrite: bool, resume: bool = False) -> None:
+    """Check that a run may write to a folder, as `run_folder` does, but change nothing.
+
+    Raises:
+        ConcentError: It holds a run and neither `overwrite` nor `resume` was asked for, it holds other things, or
+            another process writes to it.
+    """
+    if folder.is_dir():
+        os.close(_locked(folder))
+        _check_content(folder, overwrite=overwrite, resume=resume)
+    elif folder.exists():
+        raise ConcentError("this is a file", where=folder, expected="a folder for the results")
+
+
+def _check_content(folder: Path, *, overwrite: bool, resume: bool) -> tuple[str, bool]:
+    """Return what a folder holds, see `_content`, and whether an unfinished run that is to replace it is beside it.
+
+    Raises:
+        ConcentError: It holds what may not be replaced.
+    """
+    after = _beside(folder, "new")
+    holds, waiting = _content(folder), _content(after) == "unfinished"
+    if holds == "other":
+        raise ConcentError(
+            "the folder holds other things than a run", where=folder, fix="choose another folder with --out"
+        )
+    if not overwrite and not resume and (waiting or holds != "nothing"):
+        raise _existing_run_error(folder, after if waiting else folder, unfinished=waiting or holds == "unfinished")
+    return holds, waiting
 
 
 def _beside(folder: Path, kind: str) -> Path:

@@ -10,7 +10,7 @@ from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
 from concent_warp.files import write_text
-from concent_warp.run_folder import plain
+from concent_warp.run_folder import TRAIN_SETTINGS, plain
 from concent_warp.train.check_cfg import check_cfg
 
 Range = tuple[float, float]
@@ -18,7 +18,7 @@ ALL = "all"
 """Name of the chain of all stages."""
 SINGLE_STAGE_DURATION, CHAIN_DURATION = 3.0, 12.0
 """Default durations of an episode of one stage and of a chain of stages [s]."""
-SETTINGS = "train.toml"
+SETTINGS = TRAIN_SETTINGS
 """File of the resolved configuration in a run folder."""
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.constructors import PrimitiveConstructorSpec
 
+from concent_warp.cli.terminal import quiet_warp
 from concent_warp.errors import TrainError
 from concent_warp.run_folder import check_training
 
@@ -37,12 +38,8 @@ Pretrained = Annotated[
 """The name of a policy that comes with the package; the option alone means the default one."""
 
 
-def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
-    """Return the policy that was asked for.
-
-    Args:
-        checkpoint: Run folder, or a checkpoint file in one.
-        pretrained: Name of a policy that comes with the package.
+def check_policy(checkpoint: Path | None, pretrained: str | None) -> None:
+    """Check that there is the policy that was asked for, before torch is imported.
 
     Raises:
         TrainError: Neither or both are given, or there is no such policy, folder or file.
@@ -54,7 +51,25 @@ def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
             found="neither" if checkpoint is None else "both",
         )
     if checkpoint is not None:
-        check_training(checkpoint)  # before torch is imported
+        check_training(checkpoint)
+    if pretrained is not None:
+        from concent_warp.train.policy.pretrained import pretrained_checkpoint
+
+        pretrained_checkpoint(pretrained)
+
+
+def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
+    """Return the policy that was asked for.
+
+    Args:
+        checkpoint: Run folder, or a checkpoint file in one.
+        pretrained: Name of a policy that comes with the package.
+
+    Raises:
+        TrainError: Neither or both are given, or there is no such policy, folder or file.
+    """
+    check_policy(checkpoint, pretrained)
+    quiet_warp()
     from concent_warp.train.policy.load import Policy
     from concent_warp.train.policy.pretrained import pretrained_checkpoint
 

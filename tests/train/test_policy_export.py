@@ -115,4 +115,4 @@ def test_other_formats_and_files_in_the_way_are_refused(trained, tmp_path, capsy
     assert "overwrite" in capsys.readouterr().err
     assert (tmp_path / "policy.pt").read_text() == "mine"
     assert main(["export", "--checkpoint", str(tmp_path), "--out", f"{tmp_path}/policy.onnx"]) == 2
-    assert "no such checkpoint" in capsys.readouterr().err
+    assert "holds no training" in capsys.readouterr().err

@@ -22,13 +22,14 @@ from concent_warp.array_file import write_arrays
 from concent_warp.checkpoint_file import check_state, read_checkpoint, write_checkpoint
 from concent_warp.checks import check_at_least
 from concent_warp.errors import TrainError
+from concent_warp.run_folder import TRAIN_CHECKPOINT
 from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.learning.metrics import curve
 from concent_warp.train.learning.normalisation import bound_observations
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = TRAIN_CHECKPOINT
 """File of the latest checkpoint in a run folder."""
 DIVERGED_STATE_FILE = "diverged.npz"
 """File of the state before the first divergence of a world, in a run folder."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from concent_warp.errors import TrainError
-from concent_warp.train.learning.ppo import CHECKPOINT
+from concent_warp.run_folder import TRAIN_CHECKPOINT
 
 FOLDER = Path(__file__).parents[1] / "pretrained"
 ORIGIN = "origin.toml"
@@ -25,4 +25,4 @@ def pretrained_checkpoint(name: str) -> Path:
     """
     if name not in names():
         raise TrainError("no such policy comes with the package", expected=f"one of {names()}", found=name)
-    return FOLDER / name / CHECKPOINT
+    return FOLDER / name / TRAIN_CHECKPOINT

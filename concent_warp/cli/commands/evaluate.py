@@ -11,9 +11,10 @@ import tyro
 
 from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
-from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
+from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
 from concent_warp.reality.hidden.in_task import wanted
+from concent_warp.run_folder import check_folder
 
 if TYPE_CHECKING:
     from concent_warp.train.policy.evaluate import Evaluation
@@ -48,10 +49,11 @@ class Arguments:
 
 def run(arguments: Arguments) -> dict[str, Evaluation]:
     """Evaluate and print."""
-    quiet_warp()
     cfg = arguments.cfg
     worlds: tuple[WorldName, ...] = ("simulation", "reality") if arguments.world == "both" else (arguments.world,)
     check(cfg, worlds[-1], arguments.episodes)
+    if arguments.out is not None:
+        check_folder(arguments.out)
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
     from concent_warp.deploy.evaluate import evaluate, without_reality
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy
 from concent_warp.cli.options import OptionalOutPath
-from concent_warp.cli.terminal import quiet_warp, say, say_written
-from concent_warp.run_folder import claim_file, make_folder
+from concent_warp.cli.terminal import say, say_written
+from concent_warp.run_folder import check_folder, claim_file, make_folder
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,13 @@ class Arguments:
 
 def run(arguments: Arguments) -> dict[str, Any]:
     """Export and return the metadata."""
-    quiet_warp()
-    policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    check_policy(arguments.checkpoint, arguments.pretrained)
     if arguments.as_pretrained:
+        folder = Path("pretrained") if arguments.out is None else arguments.out
+        check_folder(folder)
+        policy = given_policy(arguments.checkpoint, arguments.pretrained)
         from concent_warp.train.policy.write_pretrained import write_pretrained
 
-        folder = Path("pretrained") if arguments.out is None else arguments.out
         make_folder(folder.parent)
         origin = write_pretrained(policy, folder, overwrite=arguments.overwrite)
         size = sum(file.stat().st_size for file in folder.iterdir())
@@ -48,6 +49,8 @@ def run(arguments: Arguments) -> dict[str, Any]:
         return origin
     out = Path("policy.onnx") if arguments.out is None else arguments.out
     claim_file(out, overwrite=arguments.overwrite)
+    check_folder(out.parent)
+    policy = given_policy(arguments.checkpoint, arguments.pretrained)
     make_folder(out.parent)
     described = policy.export(out)
     observations, actions = described["observation"]["size"], described["action"]["size"]

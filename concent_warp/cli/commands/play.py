@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from concent_warp.cli.given_policy import Pretrained, given_policy
-from concent_warp.cli.terminal import quiet_warp, say
+from concent_warp.cli.terminal import say
 from concent_warp.deploy.cfg import PlayCfg, WorldName
 
 
@@ -38,7 +38,6 @@ class Arguments:
 
 def run(arguments: Arguments) -> list[str]:
     """Serve until the last episode or an interruption, and return the outcomes."""
-    quiet_warp()
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
     from concent_warp.deploy.play import counted, play
 

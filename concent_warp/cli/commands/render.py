@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy
 from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.cfg import Format, RenderCfg
 from concent_warp.errors import RenderError
 from concent_warp.recording.load import load_recording
+from concent_warp.run_folder import check_run_folder, claim_file
 
 if TYPE_CHECKING:
     from concent_warp.deploy.render_dataset import Dataset
@@ -48,11 +49,20 @@ class Arguments:
 
 def run(arguments: Arguments) -> Dataset:
     """Render and write the data set."""
-    quiet_warp()
     if (arguments.recording is not None) == (arguments.checkpoint is not None or arguments.pretrained is not None):
         raise RenderError("one thing is to be rendered", expected="either --recording, or --checkpoint or --pretrained")
+    if arguments.recording is None:
+        check_policy(arguments.checkpoint, arguments.pretrained)
+    check_run_folder(arguments.out, overwrite=arguments.overwrite, resume=arguments.resume)
+    if arguments.cfg.networks is not None and not arguments.cfg.networks.is_dir():
+        raise RenderError(
+            "there are no trained networks", where=arguments.cfg.networks, fix="train them with concent render-train"
+        )
+    if arguments.cfg.figure is not None:
+        claim_file(arguments.cfg.figure, overwrite=arguments.overwrite)
     if arguments.recording is not None:
         source = load_recording(arguments.recording)
+        quiet_warp()
     else:
         source = given_policy(arguments.checkpoint, arguments.pretrained)
     from concent_warp.deploy.render_dataset import render

@@ -12,7 +12,7 @@ from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
 from concent_warp.render.networks.cfg import RenderTrainCfg
-from concent_warp.run_folder import run_folder, write_settings
+from concent_warp.run_folder import check_run_folder, run_folder, write_settings
 
 if TYPE_CHECKING:
     from concent_warp.render.networks.train import RenderTraining
@@ -51,6 +51,8 @@ class Arguments:
 
 def run(arguments: Arguments) -> RenderTraining:
     """Train and write the run folder."""
+    check_run_folder(arguments.out, overwrite=arguments.overwrite, resume=arguments.resume)
+    recording = load_recording(arguments.recording)
     quiet_warp()
     import warp as wp
 
@@ -61,7 +63,6 @@ def run(arguments: Arguments) -> RenderTraining:
     device = arguments.device or preferred_device()
     cfg, folder = arguments.cfg(), arguments.out
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
-        recording = load_recording(arguments.recording)
         with progress_bar("simulation's images") as progress:
             pairs = pairs_of(recording, arguments.cameras, device=device, progress=progress)
         training = RenderTraining(pairs, cfg, claimed.path, device=str(wp.device_to_torch(wp.get_device(device))))

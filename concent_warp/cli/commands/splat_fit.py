@@ -15,7 +15,7 @@ from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
 from concent_warp.files import write_bytes, write_text
 from concent_warp.render.splats.cfg import SplatFitCfg
-from concent_warp.run_folder import CHECKPOINT, run_folder, write_settings
+from concent_warp.run_folder import CHECKPOINT, check_run_folder, run_folder, write_settings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,12 +56,15 @@ class Arguments:
 
 def run(arguments: Arguments) -> list[Score]:
     """Fit and write the run folder."""
-    quiet_warp()
     from concent_warp.render.splats.views import read_views
 
-    views = read_views(arguments.images).shrunk(arguments.longest)
     source = arguments.images if arguments.images.is_dir() else arguments.images.parent
     folder = arguments.out or Path("runs") / f"splats_{source.resolve().name}"
+    check_run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
+    views = read_views(arguments.images).shrunk(arguments.longest)
+    if arguments.points is not None and not arguments.points.is_file():
+        raise RenderError("no such mesh or point cloud", where=arguments.points)
+    quiet_warp()
     with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
         write_settings(claimed.path, arguments)
         fit = _fitted(arguments, views, claimed.path / CHECKPOINT)

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.given_policy import given_policy
+from concent_warp.cli.given_policy import check_policy, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
+from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import processes
+from concent_warp.run_folder import check_run_folder, processes
 from concent_warp.train.cfg import TrainCfg
 
 if TYPE_CHECKING:
@@ -71,20 +72,23 @@ class Arguments:
 
 def run(arguments: Arguments) -> Policy:
     """Train and write the run folder, one of several processes where torchrun started them."""
-    if arguments.begin_with is None and processes()[1] == 1 and not arguments.recording.exists():
-        load_recording(arguments.recording)  # raises, before torch is imported
+    folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
+    if processes()[1] > 1:
+        from concent_warp.train.learning.distributed import DistributedProcess
+
+        DistributedProcess.from_environment().device(arguments.device)  # more processes than GPUs are refused here
+    else:
+        check_run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume)
+    if arguments.begin_with is not None:
+        check_policy(arguments.begin_with, None)
+    recording = load_recording(arguments.recording)
+    model = given_model(arguments.model, recording)
+    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     quiet_warp()
-    from concent_warp.events.sequence import ContactEventSequence
-    from concent_warp.train.learning.distributed import DistributedProcess
     from concent_warp.train.learning.ppo import CHECKPOINT
     from concent_warp.train.train import train
 
-    DistributedProcess.from_environment().device(arguments.device)  # more processes than GPUs are refused here
     begin_with = None if arguments.begin_with is None else given_policy(arguments.begin_with, None)
-    recording = load_recording(arguments.recording)
-    model = given_model(arguments.model, recording)
-    folder = arguments.out or Path("runs") / f"train_{arguments.recording.stem}"
-    events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     cfg = arguments.cfg()
     last: Iteration | None = None
     with status_bar("training") as update:
