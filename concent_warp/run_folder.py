@@ -45,7 +45,8 @@ def claim_file(path: Path, *, overwrite: bool) -> None:
     """Check that a file may be written, and keep it for the running command.
 
     Raises:
-        ConcentError: It exists and `overwrite` was not asked for, or another command is writing it.
+        ConcentError: It exists and `overwrite` was not asked for, another command is writing it, or its folder is a
+            file.
     """
     _check_writable(path, overwrite=overwrite)
     claim(path)
@@ -54,6 +55,7 @@ def claim_file(path: Path, *, overwrite: bool) -> None:
 
 def _check_writable(path: Path, *, overwrite: bool) -> None:
     """Raise an error where a file must not be written, see `claim_file`."""
+    check_folder(path.parent)
     if path.is_dir():
         raise ConcentError("this is a folder", where=path, expected="the name of a file to write")
     if path.exists() and not path.is_file():

@@ -49,7 +49,6 @@ def run(arguments: Arguments) -> dict[str, Any]:
         return origin
     out = Path("policy.onnx") if arguments.out is None else arguments.out
     claim_file(out, overwrite=arguments.overwrite)
-    check_folder(out.parent)
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
     make_folder(out.parent)
     described = policy.export(out)
