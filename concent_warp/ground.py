@@ -17,7 +17,7 @@ from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.comparison.result import Comparison
 from concent_warp.events.extract_events import extract_events, save_events
-from concent_warp.events.overlap import Frames, debounce_frames, iou, pair, resample, sequence_frames, time_grid
+from concent_warp.events.overlap import Frames, debounce_frames, iou, resample, sequence_frames, sorted_pair, time_grid
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.files import write_json
 from concent_warp.fit.fit_geometry import FitCfg, Method, fit_geometry
@@ -177,7 +177,7 @@ def contact_overlap(
         objects: Names of the objects.
         frame: Length of the frames that are compared [s].
     """
-    pairs = [pair(a, b) for a, b in combinations(objects, 2)]
+    pairs = [sorted_pair(a, b) for a, b in combinations(objects, 2)]
     found = {}
     for name, sequence in events.items():
         if name in truth and pairs:

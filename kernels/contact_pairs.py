@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .rollout import UNSTABLE, rotate
+from .rollout import UNSTABLE, rotate_by_quaternion
 
 wp.set_module_options({"enable_backward": False})
 
@@ -209,7 +209,7 @@ def check_poses(name: str, xpos: wp.array, xquat: wp.array, stage: wp.array) -> 
 
 
 @wp.func
-def write(features: wp.array2d[float], world: int, column: int, value: wp.vec3):
+def write_vector(features: wp.array2d[float], world: int, column: int, value: wp.vec3):
     """Write three columns."""
     for k in range(3):
         features[world, column + k] = value[k]
@@ -245,9 +245,9 @@ def slot_kernel(
     if s == row and active[row, i]:
         a = body_a[row, i]
         b = body_b[row, i]
-        n = rotate(xquat[world, b], normal[row, i])
-        c = xpos[world, a] + rotate(xquat[world, a], point_a[row, i]) - radius_a[row, i] * n
-        d = xpos[world, b] + rotate(xquat[world, b], point_b[row, i]) + radius_b[row, i] * n - c
+        n = rotate_by_quaternion(xquat[world, b], normal[row, i])
+        c = xpos[world, a] + rotate_by_quaternion(xquat[world, a], point_a[row, i]) - radius_a[row, i] * n
+        d = xpos[world, b] + rotate_by_quaternion(xquat[world, b], point_b[row, i]) + radius_b[row, i] * n - c
         apart = wp.length(d)
         # The second sum catches a pose that is huge or not a number where the first cancels.
         if apart + wp.length(c) < UNSTABLE:
@@ -260,10 +260,10 @@ def slot_kernel(
             apart = wp.nan
     first = i * SLOT
     features[world, first + MASK] = mask
-    write(features, world, first + POINT, contact)
-    write(features, world, first + DISPLACEMENT, delta)
-    write(features, world, first + DIRECTION, direction)
-    write(features, world, first + NORMAL, outward)
+    write_vector(features, world, first + POINT, contact)
+    write_vector(features, world, first + DISPLACEMENT, delta)
+    write_vector(features, world, first + DIRECTION, direction)
+    write_vector(features, world, first + NORMAL, outward)
     distance[world, i] = apart
 
 

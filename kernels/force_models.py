@@ -18,7 +18,7 @@ PLANE = wp.constant(int(mujoco.mjtGeom.mjGEOM_PLANE))
 PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
 
 
-def stribeck(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
+def add_stribeck_friction(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
     """Add friction loss that fades with speed: extra exp(-(qd / speed)^2), qd in the middle of the step.
 
     Args:
@@ -35,7 +35,7 @@ def stribeck(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any
     )
 
 
-def load(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
+def add_load_friction(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -> None:
     """Add friction loss in proportion to the load: c |tau_m - tau_e| / 2.
 
     Args:
@@ -52,7 +52,7 @@ def load(m: mjw.Model, d: mjw.Data, dof: wp.array[Any], values: wp.array[Any]) -
     )
 
 
-def loose_gear(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], first: int, values: wp.array[Any]) -> None:
+def apply_loose_gear(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], first: int, values: wp.array[Any]) -> None:
     """Let a servo's force through only where its rotor presses on an end of the play.
 
     Args:
@@ -89,7 +89,7 @@ def loose_gear(m: mjw.Model, d: mjw.Data, actuators: wp.array[Any], first: int, 
     )
 
 
-def anisotropic(
+def add_anisotropic_friction(
     m: mjw.Model, d: mjw.Data, moving: wp.array[Any], still: wp.array[Any], values: wp.array[Any], smooth: float
 ) -> None:
     """Add -(ratio - 1) mu N v_y / sqrt(|v|^2 + v0^2) along y where a body slides on what stands still.
@@ -131,7 +131,7 @@ def anisotropic(
     )
 
 
-def pull(
+def add_adhesion(
     m: mjw.Model,
     d: mjw.Data,
     geom: wp.array[Any],
@@ -154,7 +154,7 @@ def pull(
         gap: [m].
     """
     wp.launch(
-        pull_kernel,
+        adhesion_kernel,
         dim=(d.nworld, geom.size, still.size),
         inputs=[
             geom,
@@ -184,7 +184,7 @@ def stribeck_kernel(
     qacc: wp.array2d[float],
     frictionloss: wp.array2d[float],
 ):
-    """See `stribeck`; dim (N, n).
+    """See `add_stribeck_friction`; dim (N, n).
 
     Args:
         dof: Shape (n,).
@@ -247,7 +247,7 @@ def loose_gear_kernel(
     userdata: wp.array2d[float],
     applied: wp.array2d[float],
 ):
-    """See `loose_gear`; dim (N, n).
+    """See `apply_loose_gear`; dim (N, n).
 
     Args:
         actuators: Shape (n,).
@@ -329,7 +329,7 @@ def anisotropic_kernel(
     cvel: wp.array2d[wp.spatial_vector],
     applied: wp.array2d[wp.spatial_vector],
 ):
-    """See `anisotropic`; dim the contact capacity.
+    """See `add_anisotropic_friction`; dim the contact capacity.
 
     Args:
         cone: Kind of friction cone.
@@ -387,7 +387,7 @@ def anisotropic_kernel(
 
 
 @wp.kernel
-def pull_kernel(
+def adhesion_kernel(
     geom: wp.array[int],
     point: wp.array[wp.vec3],
     rounded: wp.array[bool],

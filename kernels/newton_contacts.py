@@ -35,7 +35,7 @@ _TINY = wp.constant(1.0e-9)
 
 
 @wp.func
-def direction(difference: wp.vec3):
+def unit_vector(difference: wp.vec3):
     """Return the unit vector along a difference, z where that is zero."""
     size = wp.length(difference)
     if size > _TINY:
@@ -53,7 +53,7 @@ def box_surface(centre: wp.vec3, half: wp.vec3):
     )
     apart = centre - point
     if wp.length(apart) > _TINY:
-        return point, direction(apart)
+        return point, unit_vector(apart)
     x = half[0] - wp.abs(centre[0])
     y = half[1] - wp.abs(centre[1])
     z = half[2] - wp.abs(centre[2])
@@ -78,7 +78,7 @@ def cylinder_surface(centre: wp.vec3, radius: float, half: float):
     point = outward * wp.min(size, radius) + wp.vec3(0.0, 0.0, wp.clamp(centre[2], -half, half))
     apart = centre - point
     if wp.length(apart) > _TINY:
-        return point, direction(apart)
+        return point, unit_vector(apart)
     if radius - size <= half - wp.abs(centre[2]):
         return outward * radius + wp.vec3(0.0, 0.0, centre[2]), outward
     side = wp.sign(centre[2])
@@ -206,13 +206,13 @@ def write_contacts(
     point = wp.vec3(0.0, 0.0, 0.0)
     if other[c] >= 0:
         point = position[w // segments, other[c]]
-    outward = direction(local - point)
+    outward = unit_vector(local - point)
     if kind[c] == _PLANE:
         point = wp.vec3(local[0], local[1], 0.0)
         outward = wp.vec3(0.0, 0.0, 1.0)
     if kind[c] == _CAPSULE:
         point = wp.vec3(0.0, 0.0, wp.clamp(local[2], -half[1], half[1]))
-        outward = direction(local - point)
+        outward = unit_vector(local - point)
     if kind[c] == _BOX:
         point, outward = box_surface(local, half)
     if kind[c] == _CYLINDER:

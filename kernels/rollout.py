@@ -48,7 +48,7 @@ def command_kernel(
 
 
 @wp.func
-def watch(value: float, world: int, step: int, unstable_step: wp.array[int]):
+def record_unstable_step(value: float, world: int, step: int, unstable_step: wp.array[int]):
     """Note the step if the value is huge or not a number."""
     if not (wp.abs(value) < UNSTABLE):
         wp.atomic_min(unstable_step, world, step)
@@ -111,10 +111,10 @@ def record_kernel(
             wp.atomic_max(peak, PEAK_PAIRS, pairs[0])
 
     if i < qpos.shape[1]:
-        watch(qpos[world, i], world, step, unstable_step)
+        record_unstable_step(qpos[world, i], world, step, unstable_step)
     if i < qvel.shape[1]:
-        watch(qvel[world, i], world, step, unstable_step)
-        watch(qacc[world, i], world, step, unstable_step)
+        record_unstable_step(qvel[world, i], world, step, unstable_step)
+        record_unstable_step(qacc[world, i], world, step, unstable_step)
 
     row = row_of[step]
     if row < 0:
@@ -215,7 +215,7 @@ def log_kernel(
 
 
 @wp.func
-def rotate(q: wp.quat, v: wp.vec3) -> wp.vec3:
+def rotate_by_quaternion(q: wp.quat, v: wp.vec3) -> wp.vec3:
     """Rotate a vector by a wxyz quaternion."""
     u = wp.vec3(q[1], q[2], q[3])
     t = 2.0 * wp.cross(u, v)
@@ -252,8 +252,8 @@ def place_geoms_kernel(
     body = body_of[geom]
     q = xquat[world, body]
     local = geom_quat[world % geom_quat.shape[0], geom]
-    geom_xpos[world, geom] = xpos[world, body] + rotate(q, geom_pos[world % geom_pos.shape[0], geom])
-    x = rotate(q, rotate(local, wp.vec3(1.0, 0.0, 0.0)))
-    y = rotate(q, rotate(local, wp.vec3(0.0, 1.0, 0.0)))
-    z = rotate(q, rotate(local, wp.vec3(0.0, 0.0, 1.0)))
+    geom_xpos[world, geom] = xpos[world, body] + rotate_by_quaternion(q, geom_pos[world % geom_pos.shape[0], geom])
+    x = rotate_by_quaternion(q, rotate_by_quaternion(local, wp.vec3(1.0, 0.0, 0.0)))
+    y = rotate_by_quaternion(q, rotate_by_quaternion(local, wp.vec3(0.0, 1.0, 0.0)))
+    z = rotate_by_quaternion(q, rotate_by_quaternion(local, wp.vec3(0.0, 0.0, 1.0)))
     geom_xmat[world, geom] = wp.matrix_from_cols(x, y, z)

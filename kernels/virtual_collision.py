@@ -30,7 +30,7 @@ import numpy as np
 import warp as wp
 
 from .contact_pairs import check_poses
-from .virtual_collision_kernel import Tables, collision_kernel
+from .virtual_collision_kernel import CollisionTables, collision_kernel
 
 THREADS = 128
 """Threads of a world's block on CUDA."""
@@ -235,7 +235,7 @@ def build_tables(
     meshes: Sequence[wp.Mesh | None],
     stages: int,
     device: wp.Device,
-) -> Tables:
+) -> CollisionTables:
     """Return the tables on the device."""
     boxes = np.array([bounding_box(target) for target in targets]).reshape(-1, 2, 3)
     centres = [np.mean([s.centre.min(axis=0), s.centre.max(axis=0)], axis=0) for s in spheres]
@@ -246,7 +246,7 @@ def build_tables(
     ]
     rows = np.cumsum([0, *(counts[pair.spheres] for pair in pairs)])
     gates = [np.ones(stages) if pair.gate is None else pair.gate for pair in pairs]
-    tables = Tables()
+    tables = CollisionTables()
 
     def on_device(values: object, dtype: type, shape: tuple[int, ...] = (-1,)) -> wp.array:
         return wp.array(np.asarray(values).reshape(shape), dtype=dtype, device=device)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from .rollout import UNSTABLE, rotate
+from .rollout import UNSTABLE, rotate_by_quaternion
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Tables:
+class CollisionTables:
     """What does not change from step to step: P pairs, M sets, T targets."""
 
     pair_set: wp.array[int]  # shape (P,)
@@ -37,7 +37,7 @@ class Tables:
 @wp.func
 def rotate_back(q: wp.quat, v: wp.vec3) -> wp.vec3:
     """Rotate a vector by the inverse of a wxyz quaternion."""
-    return rotate(wp.quat(q[0], -q[1], -q[2], -q[3]), v)
+    return rotate_by_quaternion(wp.quat(q[0], -q[1], -q[2], -q[3]), v)
 
 
 @wp.func
@@ -78,7 +78,7 @@ def collision_kernel(
     depth_weight: float,
     band_weight: float,
     severe_penalty: float,
-    t: Tables,
+    t: CollisionTables,
     reward: wp.array[float],
     penetration: wp.array[float],
     band: wp.array[float],
@@ -108,9 +108,9 @@ def collision_kernel(
         q_target = xquat[world, b]
         origin = rotate_back(q_target, xpos[world, a] - xpos[world, b])
         turn = wp.matrix_from_cols(
-            rotate_back(q_target, rotate(q, wp.vec3(1.0, 0.0, 0.0))),
-            rotate_back(q_target, rotate(q, wp.vec3(0.0, 1.0, 0.0))),
-            rotate_back(q_target, rotate(q, wp.vec3(0.0, 0.0, 1.0))),
+            rotate_back(q_target, rotate_by_quaternion(q, wp.vec3(1.0, 0.0, 0.0))),
+            rotate_back(q_target, rotate_by_quaternion(q, wp.vec3(0.0, 1.0, 0.0))),
+            rotate_back(q_target, rotate_by_quaternion(q, wp.vec3(0.0, 0.0, 1.0))),
         )
         middle = turn @ t.set_centre[m] + origin
         margin = t.margin[p]

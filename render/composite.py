@@ -18,7 +18,7 @@ import warp as wp
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import carrier_pose
 from concent_warp.render.raw import PosedWorlds, RawCamera, body_id
-from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
+from concent_warp.render.shadows import ShadowCfg, Shadows, with_shadow
 from concent_warp.render.splats.rasterise import Rasteriser
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _composed(
     background: torch.Tensor, objects: torch.Tensor, alpha: torch.Tensor, shadow: torch.Tensor
 ) -> torch.Tensor:
     """Return the image of the layers: the background in the shadow, the objects over it; shapes as in `Layers`."""
-    return (objects + (1 - alpha[..., None]) * shaded(background, shadow)).clamp(0, 1)
+    return (objects + (1 - alpha[..., None]) * with_shadow(background, shadow)).clamp(0, 1)
 
 
 class HybridCamera:

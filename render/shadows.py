@@ -117,7 +117,7 @@ class Shadows:
         return gaussian_blur2d(alpha, (size, size), (sigma, sigma), border_type="replicate")
 
 
-def shaded(image: torch.Tensor, shadow: torch.Tensor) -> torch.Tensor:
+def with_shadow(image: torch.Tensor, shadow: torch.Tensor) -> torch.Tensor:
     """Return an image, shape (..., H, W, 3), in the shadow, shape (..., H, W)."""
     return image * (1 - shadow[..., None])
 

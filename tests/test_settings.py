@@ -29,6 +29,7 @@ CHANGED_IN_PLACE = {
     "ResetCandidate",
     "RunFolder",
     "Iteration",
+    "_Claims",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""
 

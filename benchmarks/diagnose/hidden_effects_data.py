@@ -21,7 +21,7 @@ import tyro
 from benchmarks.diagnose.hidden_effects_residual import ratios
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
-from concent_warp.reality.hidden.drives import strain
+from concent_warp.reality.hidden.drives import peak_drive_force
 from concent_warp.reality.hidden.registry import INSIDE, hidden
 from concent_warp.reality.hidden.sizes import MAGNITUDES, SIZES, Size
 from concent_warp.reality.rigs.registry import RIGS
@@ -126,7 +126,7 @@ class DataSet:
     kind: Kind
     rig: str
     magnitudes: Mapping[str, float]
-    """Value of the main parameter of each hidden effect, by name; of saturation, the limit over `strain`."""
+    """Value of the main parameter of each hidden effect, by name; of saturation, the limit over `peak_drive_force`."""
     size: Size | None
     seed: int
     demonstrations: int = 1
@@ -192,7 +192,7 @@ def make(case: DataSet) -> Data:
     rig = RIGS[case.rig]
     magnitudes = dict(case.magnitudes)
     if "actuator_saturation" in magnitudes:
-        magnitudes["actuator_saturation"] *= strain(rig, case.demonstrations, case.seed)
+        magnitudes["actuator_saturation"] *= peak_drive_force(rig, case.demonstrations, case.seed)
     inside = [hidden(name, magnitude, rig) for name, magnitude in magnitudes.items()]
     recording = record_rig(rig, [h.effect for h in inside], case.demonstrations, case.seed)
     truth = tuple(Truth(h.name, dict(h.truth), h.target, h.name in INSIDE) for h in inside)

@@ -25,7 +25,7 @@ from benchmarks.fit.gradient_scenes import SCENES, SceneName, record, starting_m
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, read_data, table, write_data, write_page
 from concent_warp.estimation.object_tracks import whole_demonstration
-from concent_warp.fit.fit_geometry import FitCfg, cut, warm_start
+from concent_warp.fit.fit_geometry import FitCfg, cut_segments, warm_start
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.geometry.objective import Objective
 from concent_warp.fit.geometry.search import Search
@@ -115,7 +115,7 @@ def run(args: Args, scene: SceneName, seed: int, method: MethodName) -> dict[str
 
     start = judge(model, recording)
     begun = time.perf_counter()
-    search = Search(model, cut(model, shown, cfg), cfg, args.engine)
+    search = Search(model, cut_segments(model, shown, cfg), cfg, args.engine)
     row: dict[str, Any] = {"scene": scene, "seed": seed, "method": method, "start": start}
     if method == "gradient+es":
         warm_start(search, "gradient+es", shown, cfg.gradient, None, False, None)

@@ -29,7 +29,7 @@ import warp as wp
 from benchmarks.fit.shape_sorter import Start, judge, starting_geometry
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
 from concent_warp.cli.terminal import quiet_warp
-from concent_warp.fit.fit_geometry import FitCfg, cut
+from concent_warp.fit.fit_geometry import FitCfg, cut_segments
 from concent_warp.fit.geometry.search import Search
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, Truth, record
@@ -140,7 +140,7 @@ def search_of(args: Args, recording: Recording, population: int) -> Search:
     scene = Scene(recording.scene)
     model = Model(scene, starting_geometry(scene, args.start, 0))
     cfg = replace(args.fit, evolution=replace(args.fit.evolution, population=population))
-    search = Search(model, cut(model, recording.demonstrations, cfg), cfg, "warp")
+    search = Search(model, cut_segments(model, recording.demonstrations, cfg), cfg, "warp")
     if args.duration is not None:
         steps = round(args.duration / model.scene.model.opt.timestep)
         search.used = [replace(segment, ctrl=segment.ctrl[:steps]) for segment in search.used]

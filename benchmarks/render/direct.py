@@ -232,9 +232,9 @@ def main() -> None:
 
 def reduced_bytes(images: torch.Tensor, size: int) -> torch.Tensor:
     """Return uint8 images (N, 3, H, W) at the size that is painted, as the networks are trained with."""
-    from concent_warp.render.networks.super_resolution import reduced
+    from concent_warp.render.networks.super_resolution import downsampled
 
-    return reduced(images.float(), size).round().clamp(0, 255).to(torch.uint8)
+    return downsampled(images.float(), size).round().clamp(0, 255).to(torch.uint8)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import numpy as np
 
 from concent_warp.reality.appearance.surroundings import light
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.reality.sensors.footage import FootageCfg, developed
+from concent_warp.reality.sensors.footage import FootageCfg, apply_tone_curve
 from concent_warp.reality.sensors.photographs import PhotographsCfg, photographs
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Recording
@@ -54,7 +54,7 @@ def photographed(folder: Path, body: str, cfg: PhotographsCfg) -> Path:
         light(world)
         taken = photographs(world, body, cfg)
         rgba = taken.rgba.copy()
-        rgba[..., :3] = np.round(255 * developed(rgba[..., :3] / 255))
+        rgba[..., :3] = np.round(255 * apply_tone_curve(rgba[..., :3] / 255, FootageCfg()))
         SplatViews(rgba, taken.poses, taken.intrinsics, True).write(path)
     return path
 

@@ -24,7 +24,7 @@ from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.model import Model
-from concent_warp.reality.hidden.in_task import TaskWorld, wanted
+from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
@@ -89,7 +89,7 @@ def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
     cfg = RealityCfg()
     effects = ()
     if hidden:
-        world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, wanted(hidden))
+        world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, parse_effects(hidden))
         effects = tuple(one.effect for one in world.hidden())
     return record(cfg, [1000 * seed], effects=effects)[0]
 

@@ -12,7 +12,8 @@ from rich.markup import escape
 
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.comparison.result import Comparison
-from concent_warp.comparison.table import mean_and_interval, percent, unit_shown
+from concent_warp.comparison.table import mean_and_interval
+from concent_warp.comparison.units import percent_text, unit_text
 from concent_warp.events.sequence import ContactEventSequence
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def say_grounded(found: Grounded, folder: Path) -> None:
     comparison = found.comparison
     channel, phases = comparison.main_channel(), comparison.contact_phases()
     unseen = tuple(d for d in comparison.demonstrations if d not in found.fitted)
-    unit = unit_shown(comparison.summarise(comparison.after, channel, phases).unit)
+    unit = unit_text(comparison.summarise(comparison.after, channel, phases).unit)
     title = Text(f"mean error of {channel} [{unit}], {' + '.join(phases) or 'all times'}")
     table = Table(title=title, title_justify="left")
     for name in ("demonstrations", *comparison.models, "change"):
@@ -53,7 +54,7 @@ def say_grounded(found: Grounded, folder: Path) -> None:
             continue
         cells = [mean_and_interval(comparison.summarise(m, channel, phases, chosen)) for m in comparison.models]
         difference = comparison.difference(channel, phases, chosen)
-        cells.append(percent(difference.share) if np.isfinite(difference.share) else "-")
+        cells.append(percent_text(difference.share) if np.isfinite(difference.share) else "-")
         if found.overlap:
             means = [np.mean([values[d] for d in chosen if d in values]) for values in found.overlap.values()]
             cells.append(" → ".join(f"{mean:.2f}" for mean in means))

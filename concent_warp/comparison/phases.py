@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from concent_warp.events.filter import drop_short_contacts, runs, steps_of, windowed
+from concent_warp.events.filter import drop_short_contacts, steps_of, true_runs, window_sums
 from concent_warp.events.grasp import forces_cancel
 from concent_warp.events.roles import Roles
 from concent_warp.events.staging import ROBOT
@@ -206,7 +206,7 @@ def _body_state(
     """Return what a body does at each step, shape (K,) int: index into `MOTIONS`."""
     dt, steps = motion.timestep, motion.steps
     rows = touches[np.asarray((touches.body == body).any(axis=1))]
-    touching = windowed(rows.frames(steps).astype(float), steps_of(cfg.majority_window / 2, dt)) > 0
+    touching = window_sums(rows.frames(steps).astype(float), steps_of(cfg.majority_window / 2, dt)) > 0
     state = np.full(steps, MOTIONS.index(FREE))
     state[touching] = MOTIONS.index(STICK)
     state[touching & (_slip(rows, motion, speeds, cfg.majority_window) > cfg.slide_speed)] = MOTIONS.index(SLIDE)
@@ -220,7 +220,7 @@ def _body_state(
     width = steps_of(cfg.impact_window, dt)
     jolted = touching & (speeds.jolt(body, width) > cfg.impact_acceleration * width * dt)
     lasting = steps_of(cfg.impact_extension, dt)
-    for start, end in runs(jolted):
+    for start, end in true_runs(jolted):
         state[max(start - width, 0) : end + lasting] = MOTIONS.index(IMPACT)
     return state
 
@@ -235,13 +235,13 @@ def _slip(rows: ReplayContacts, motion: BodyPoses, speeds: Speeds, window: float
         tangential = relative - np.einsum("ci,ci->c", relative, rows.normal)[:, None] * rows.normal
         weight = rows.force + 1e-9
         np.add.at(total, rows.step, np.stack([weight * np.linalg.norm(tangential, axis=1), weight], axis=1))
-    total = windowed(total, steps_of(window, motion.timestep))
+    total = window_sums(total, steps_of(window, motion.timestep))
     return total[:, 0] / np.maximum(total[:, 1], 1e-12)
 
 
 def _prevailing(state: np.ndarray, width: int) -> np.ndarray:
     """Return for each step the state (K,) that most of the `width` steps about it are in."""
-    return windowed(np.eye(len(MOTIONS))[state], width).argmax(axis=1)
+    return window_sums(np.eye(len(MOTIONS))[state], width).argmax(axis=1)
 
 
 def _spans(state: np.ndarray, timestep: float) -> tuple[Phase, ...]:

@@ -12,7 +12,12 @@ import numpy as np
 from concent_warp.comparison.noise_ratio import rms_noise
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import Noise, Source, channel_noise, pooled_noise
-from concent_warp.estimation.rotations import rotation_between, rotations, same_sign, turns
+from concent_warp.estimation.rotations import (
+    continuous_quaternions,
+    rotation_between,
+    rotation_matrices,
+    rotation_vectors,
+)
 from concent_warp.estimation.sensors import LOCAL, Kind, body_of, kind_and_unit
 from concent_warp.recording.recording import Channel
 from concent_warp.simulate.replay import interpolate, predict
@@ -186,7 +191,7 @@ def _extent(value: np.ndarray, kind: Kind) -> float:
     if not len(valid):
         return 0.0
     if kind == "orientation":
-        return float(np.linalg.norm(turns(np.broadcast_to(valid[0], valid.shape), valid), axis=1).max())
+        return float(np.linalg.norm(rotation_vectors(np.broadcast_to(valid[0], valid.shape), valid), axis=1).max())
     return float(np.linalg.norm(np.ptp(valid, axis=0)))
 
 
@@ -199,8 +204,8 @@ def _point_residual(rollout: Rollout, body: str, track: PointTrack, anchor_frame
     """
     row = rollout.bodies.index(body)
     position = interpolate(rollout.time, rollout.body_position[0][:, row], track.time)
-    quaternion = interpolate(rollout.time, same_sign(rollout.body_quaternion[0][:, row]), track.time)
-    rotation = rotations(quaternion)
+    quaternion = interpolate(rollout.time, continuous_quaternions(rollout.body_quaternion[0][:, row]), track.time)
+    rotation = rotation_matrices(quaternion)
     seen = np.where(track.visible[..., None], track.value, np.nan)
     first = slice(anchor_frames)
     local = np.einsum("tji,tmj->tmi", rotation[first], seen[first] - position[first, None])

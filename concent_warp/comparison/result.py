@@ -14,7 +14,7 @@ from concent_warp.comparison.html import comparison_html
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.units import shown, times, unit_shown
+from concent_warp.comparison.units import ratio_text, unit_text, value_text
 from concent_warp.comparison.worst_spans import WorstSpan, WorstSpanCfg
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.estimation.noise import Source
@@ -282,9 +282,9 @@ class Comparison:
         rows = []
         for channel in self.channels:
             found = [self.summarise(model, channel) for model in models]
-            row = [channel, unit_shown(found[0].unit)]
-            row += [shown(summary.mean, summary.unit) for summary in found]
-            row += ["-" if summary.ratio is None else times(summary.ratio) for summary in found]
+            row = [channel, unit_text(found[0].unit)]
+            row += [value_text(summary.mean, summary.unit) for summary in found]
+            row += ["-" if summary.ratio is None else ratio_text(summary.ratio) for summary in found]
             rows.append(row + ([self.difference(channel).verdict] if len(models) > 1 else []))
         spans = self.worst_spans[: self.span_cfg.max_shown]
         return comparison_html(header, rows, [span.sentence(demonstration=True) for span in spans])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.comparison.result import Comparison, Summary
-from concent_warp.comparison.units import percent, shown, times, unit_shown
+from concent_warp.comparison.units import percent_text, ratio_text, unit_text, value_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,10 +19,10 @@ DISPENSABLE = ("samples", "p95", "max", "RMS", "noise")
 
 def mean_and_interval(summary: Summary) -> str:
     """Return a mean with its interval, such as ``1.20 [1.05, 1.38]``."""
-    mean = shown(summary.mean, summary.unit)
+    mean = value_text(summary.mean, summary.unit)
     if not np.isfinite(summary.low):
         return mean
-    return f"{mean} [{shown(summary.low, summary.unit)}, {shown(summary.high, summary.unit)}]"
+    return f"{mean} [{value_text(summary.low, summary.unit)}, {value_text(summary.high, summary.unit)}]"
 
 
 def _cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[str], list[list[str]]]:
@@ -46,12 +46,12 @@ def _cells(comparison: Comparison, *, every_phase: bool = False) -> tuple[list[s
         last = summaries[-1]
         if not last.count:
             continue
-        row = ["" if phase else channel, last.phase, unit_shown(last.unit), str(last.count)]
+        row = ["" if phase else channel, last.phase, unit_text(last.unit), str(last.count)]
         row += [mean_and_interval(summary) for summary in summaries]
         if several:
             row.append(_change(comparison, channel, phase))
-        row += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
-        row.append("-" if last.ratio is None else times(last.ratio))
+        row += [value_text(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
+        row.append("-" if last.ratio is None else ratio_text(last.ratio))
         rows.append(row)
     return header, rows
 
@@ -61,10 +61,10 @@ def _change(comparison: Comparison, channel: str, phase: tuple[str, ...]) -> str
     found = comparison.difference(channel, phase)
     if not np.isfinite(found.share):
         return "-"
-    text = percent(found.share)
+    text = percent_text(found.share)
     if not np.isfinite(found.low):
         return text
-    low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
+    low, high = (value_text(end, found.unit, sign=True) for end in (found.low, found.high))
     return f"{text} [{low}, {high}]"
 
 

@@ -4,38 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
-SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "m/s": (1e3, "mm/s"), "rad/s": (180 / np.pi, "°/s")}
+DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / np.pi, "°"), "m/s": (1e3, "mm/s"), "rad/s": (180 / np.pi, "°/s")}
 """Factor and unit in which a unit is shown to people."""
 
 
-def shown(value: float | None, unit: str, *, sign: bool = False) -> str:
+def value_text(value: float | None, unit: str, *, sign: bool = False) -> str:
     """Return a number in the unit in which it is shown, without the unit's name."""
     if value is None or np.isnan(value):
         return "-"
     if np.isinf(value):
         return "diverged"
-    value *= SHOWN.get(unit, (1, unit))[0]
+    value *= DISPLAY_UNITS.get(unit, (1, unit))[0]
     digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
     return f"{value:{'+' if sign else ''}.{digits}f}"
 
 
-def percent(share: float) -> str:
+def percent_text(share: float) -> str:
     """Return a relative change in whole percent with its sign."""
     whole = round(100 * share)
     return f"{whole:+d} %" if whole else "0 %"
 
 
-def unit_shown(unit: str) -> str:
+def unit_text(unit: str) -> str:
     """Return the name of the unit in which a unit is shown."""
-    return SHOWN.get(unit, (1, unit))[1]
+    return DISPLAY_UNITS.get(unit, (1, unit))[1]
 
 
-def times(ratio: float) -> str:
+def ratio_text(ratio: float) -> str:
     """Return a ratio with its cross, such as ``8 x``."""
     return f"{ratio:.1f} x" if ratio < 9.95 else f"{ratio:.0f} x" if ratio < 1000 else "over 1000 x"
 
 
-def words(channel: str) -> str:
+def channel_text(channel: str) -> str:
     """Return a channel's name as words: ``block_position`` is "block position"."""
     return channel.replace("_", " ")
 

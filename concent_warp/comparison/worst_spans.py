@@ -16,8 +16,8 @@ from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
-from concent_warp.comparison.units import shown, times, unit_shown, words
-from concent_warp.events.filter import runs
+from concent_warp.comparison.units import channel_text, ratio_text, unit_text, value_text
+from concent_warp.events.filter import true_runs
 
 AXES = "xyz"
 
@@ -95,14 +95,14 @@ class WorstSpan:
         """How far off, in words."""
         if not np.isfinite(self.error):
             return "diverged"
-        size = f"{shown(self.error, self.unit)} {unit_shown(self.unit)}".strip()
-        return size if self.ratio is None else f"{times(self.ratio)} noise ({size})"
+        size = f"{value_text(self.error, self.unit)} {unit_text(self.unit)}".strip()
+        return size if self.ratio is None else f"{ratio_text(self.ratio)} noise ({size})"
 
     def sentence(self, *, demonstration: bool = False) -> str:
         """Return the span in words, such as "block position, insert phase, 3.1-3.6 s, 8 x noise (3.4 mm), ..."."""
-        name = words(self.channels[0])
+        name = channel_text(self.channels[0])
         if len(self.channels) > 1:
-            also = (words(c).removeprefix(f"{words(self.body or '')} ") for c in self.channels[1:])
+            also = (channel_text(c).removeprefix(f"{channel_text(self.body or '')} ") for c in self.channels[1:])
             name += f" (and {', '.join(also)})"
         parts = [f"{self.demonstration}: {name}" if demonstration else name]
         parts += [f"{self.phase} phase"] if self.phase else []
@@ -215,7 +215,7 @@ def _smoothed(time: np.ndarray, ratio: np.ndarray, cfg: WorstSpanCfg) -> np.ndar
 
 def _run_at(mask: np.ndarray, row: int) -> tuple[int, int]:
     """Return first and one-past-last row of the run of True in `mask` (T,) that holds `row`."""
-    spans = runs(mask)
+    spans = true_runs(mask)
     start, end = spans[(spans[:, 0] <= row) & (row < spans[:, 1])][0]
     return int(start), int(end)
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from concent_warp.checks import check_seed
 from concent_warp.errors import TrainError
-from concent_warp.reality.hidden.in_task import wanted
+from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.reality.world import WorldCfg
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
@@ -131,7 +131,7 @@ class RenderCfg:
     """Settings of the lights."""
 
 
-def check(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: int = 0) -> None:
+def check_evaluation(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: int = 0) -> None:
     """Check the settings of an evaluation.
 
     Raises:
@@ -142,7 +142,7 @@ def check(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: int = 0) -> N
         raise TrainError("the number of episodes is out of bounds", expected="at least 1", found=episodes)
     if not 0 <= cfg.videos <= episodes:
         raise TrainError("the number of videos is out of bounds", expected=f"0 to {episodes}", found=cfg.videos)
-    if wanted(cfg.hide) and world == "simulation":
+    if parse_effects(cfg.hide) and world == "simulation":
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     if cfg.videos and world == "simulation":
         raise TrainError("videos are of Reality", fix="add --world reality")

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from concent_warp.checks import check_device
-from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
+from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check_evaluation
 from concent_warp.deploy.reality_world import reality_environment, reality_world
 from concent_warp.files import all_or_none
 from concent_warp.reality.hidden.in_task import TaskWorld
-from concent_warp.reality.sensors.video import filmed, write_video
+from concent_warp.reality.sensors.video import render_video, write_video
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.evaluate import Evaluation, run_episodes
@@ -63,7 +63,7 @@ def evaluate(
         1.0
     """
     cfg = cfg or EvaluateCfg()
-    check(cfg, world, episodes, seed)
+    check_evaluation(cfg, world, episodes, seed)
     check_device(device)
     default = Path("videos") if policy.pretrained else policy.folder / "videos"
     videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
@@ -134,7 +134,7 @@ def _write_videos(
                 if mocap >= 0:
                     placed = spec.body(task.compiled.body(body).name)
                     placed.pos, placed.quat = starts.mocap[k, mocap, :3], starts.mocap[k, mocap, 3:]
-            write_video(path, filmed(spec, bodies, np.array(states), period), 1 / period)
+            write_video(path, render_video(spec, bodies, np.array(states), period), 1 / period)
 
 
 def without_reality(cfg: EvaluateCfg) -> EvaluateCfg:

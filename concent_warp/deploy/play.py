@@ -14,7 +14,7 @@ from concent_warp.checks import check_device, check_seed
 from concent_warp.deploy.cfg import PlayCfg, WorldName
 from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import TrainError
-from concent_warp.reality.hidden.in_task import wanted
+from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.report.live import LiveView
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.policy.load import Policy
@@ -86,7 +86,7 @@ def _make_player(
     """
     if cfg.states < 1:
         raise TrainError("the number of states is out of bounds", expected="at least 1", found=cfg.states)
-    if wanted(cfg.hide) and world == "simulation":
+    if parse_effects(cfg.hide) and world == "simulation":
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
     run = policy.run
@@ -121,7 +121,7 @@ def _watch(player: Player, view: LiveView, episodes: int | None, cfg: PlayCfg) -
         controls.step = False
         outcome = player.step()
         if outcome is not None:
-            view.set_message(f"**{outcome}**  \n{counted(player.ended)}")
+            view.set_message(f"**{outcome}**  \n{outcome_counts_text(player.ended)}")
             due += cfg.pause / controls.speed
         due = max(due + period / controls.speed, time.monotonic())
         _wait_until(due, view)
@@ -143,11 +143,11 @@ def _show(player: Player, view: LiveView, state: PlayedState) -> None:
     view.set_message(
         f"**Stage {state.stage}**, {state.time:.2f} s  \n"
         f"{touching} of {len(state.touching)} spheres touch  \n"
-        f"{counted(player.ended)}"
+        f"{outcome_counts_text(player.ended)}"
     )
 
 
-def counted(outcomes: list[str]) -> str:
+def outcome_counts_text(outcomes: list[str]) -> str:
     """Return the number of ended episodes and of each outcome, in words."""
     each = ", ".join(f"{count} {name}" for name, count in Counter(outcomes).most_common())
     return f"{len(outcomes)} episode{'s' * (len(outcomes) != 1)}{': ' * bool(outcomes)}{each}"

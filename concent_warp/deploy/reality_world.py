@@ -8,7 +8,7 @@ import numpy as np
 
 from concent_warp.deploy.cfg import RealityWorldCfg
 from concent_warp.errors import TrainError
-from concent_warp.reality.hidden.in_task import TaskWorld, wanted
+from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.physics import Actor, MujocoPhysics
@@ -23,7 +23,7 @@ def reality_world(task: Task, cfg: EnvironmentCfg, world: RealityWorldCfg) -> Ta
         world.reality,
         task.compiled.body(task.objects[0]).name,
         cfg.action.gripper_actuators,
-        wanted(world.hide),
+        parse_effects(world.hide),
     )
 
 

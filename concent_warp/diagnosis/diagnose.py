@@ -9,7 +9,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import checkpointed_runner
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis
-from concent_warp.diagnosis.tasks import Progress, TaskRunner, silent
+from concent_warp.diagnosis.tasks import Progress, TaskRunner, ignore_progress
 from concent_warp.files import write_json
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -56,7 +56,7 @@ def diagnose(
         ('effect', (('joint_friction',),))
     """
     model.check_recording(recording)
-    cfg, progress = cfg or DiagnoseCfg(), progress or silent
+    cfg, progress = cfg or DiagnoseCfg(), progress or ignore_progress
     if out is None:
         return _diagnosed(model, recording, cfg, TaskRunner(cfg.jobs, progress), engine)
     with lock_folder(Path(out)):

@@ -13,7 +13,7 @@ Progress = Callable[[float, str], None]
 """Called with the share done, 0..1, and what is being done."""
 
 
-def silent(share: float, text: str) -> None:
+def ignore_progress(share: float, text: str) -> None:
     """Ignore the progress, see `Progress`."""
     del share, text
 
@@ -21,7 +21,7 @@ def silent(share: float, text: str) -> None:
 class TaskRunner:
     """Runs independent tasks in order of their results and reports progress."""
 
-    def __init__(self, jobs: int = 1, progress: Progress = silent) -> None:
+    def __init__(self, jobs: int = 1, progress: Progress = ignore_progress) -> None:
         """Prepare to run `jobs` processes at a time, -1 for one per CPU."""
         self.jobs, self.progress = jobs, progress
         self.share = 0.0

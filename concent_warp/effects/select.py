@@ -14,7 +14,7 @@ POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
 
 
-def name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
+def element_name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
     """Return the name of an element, empty where it has none."""
     return mujoco.mj_id2name(m, kind, int(i)) or ""
 
@@ -23,7 +23,7 @@ def joints_by_type(m: mujoco.MjModel, among: Iterable[int] | None = None) -> tup
     """Return the names of hinges, then of slides; a selection without members is left out."""
     ids = range(m.njnt) if among is None else sorted(among)
     groups = [
-        tuple(n for j in ids if int(m.jnt_type[j]) == kind and (n := name(m, mujoco.mjtObj.mjOBJ_JOINT, j)))
+        tuple(n for j in ids if int(m.jnt_type[j]) == kind and (n := element_name(m, mujoco.mjtObj.mjOBJ_JOINT, j)))
         for kind in SINGLE
     ]
     return tuple(group for group in groups if group)
@@ -48,7 +48,7 @@ def free_bodies(m: mujoco.MjModel) -> list[int]:
 
 def free_body_targets(m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
     """Return one selection for each free body that has a name."""
-    return tuple((n,) for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+    return tuple((n,) for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
 
 def fingers(m: mujoco.MjModel) -> list[int]:
@@ -74,7 +74,7 @@ def arm_actuators(m: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(
         n
         for a in range(m.nu)
-        if a not in gripper and driven_joints(m, a) and (n := name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a))
+        if a not in gripper and driven_joints(m, a) and (n := element_name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a))
     )
 
 
@@ -98,7 +98,7 @@ def robot_bodies(m: mujoco.MjModel) -> list[int]:
     return carried
 
 
-def last_links(m: mujoco.MjModel) -> list[int]:
+def outermost_links(m: mujoco.MjModel) -> list[int]:
     """Return the moving bodies that carry no other moving body, but for free bodies and fingers; with fingers, what
     carries them.
     """
@@ -132,7 +132,9 @@ def surfaces(m: mujoco.MjModel, body: int) -> np.ndarray:
 def sensors_by_type(m: mujoco.MjModel, kinds: tuple[int, ...]) -> tuple[str, ...]:
     """Return the names of the sensors of some kinds."""
     return tuple(
-        n for i in range(m.nsensor) if int(m.sensor_type[i]) in kinds and (n := name(m, mujoco.mjtObj.mjOBJ_SENSOR, i))
+        n
+        for i in range(m.nsensor)
+        if int(m.sensor_type[i]) in kinds and (n := element_name(m, mujoco.mjtObj.mjOBJ_SENSOR, i))
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
-from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sampled
+from concent_warp.estimation.signals import Estimate, MeasuredJoint, Signal, sample_values_and_rates
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class CoupledJoints:
             return found.value[None], found.rate[None]
         covariance = self.covariance(time)[:, :, :2, :2]
         columns = [
-            sampled(found.value[:, j : j + 1], found.rate[:, j : j + 1], covariance[:, j], count, rng)
+            sample_values_and_rates(found.value[:, j : j + 1], found.rate[:, j : j + 1], covariance[:, j], count, rng)
             for j in range(len(self.qpos))
         ]
         return np.concatenate([c[0] for c in columns], axis=2), np.concatenate([c[1] for c in columns], axis=2)

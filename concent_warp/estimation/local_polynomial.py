@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.estimation.rotations import same_sign
+from concent_warp.estimation.rotations import continuous_quaternions
 from concent_warp.estimation.sensors import Kind
-from concent_warp.estimation.signals import Estimate, OrientationEstimate, sampled
+from concent_warp.estimation.signals import Estimate, OrientationEstimate, sample_values_and_rates
 from concent_warp.recording.recording import Channel
 
 
@@ -157,7 +157,7 @@ class LocalPolynomial:
         found = self.estimate(time)
         if rng is None or not count:
             return found.value[None], found.rate[None]
-        return sampled(found.value, found.rate, self.covariance(time)[:, :2, :2], count, rng)
+        return sample_values_and_rates(found.value, found.rate, self.covariance(time)[:, :2, :2], count, rng)
 
     def _fit(self, now: float) -> LocalFit:
         """Return the polynomial about a time."""
@@ -186,7 +186,7 @@ class LocalPolynomialOrientation:
     @property
     def value(self) -> np.ndarray:
         """Readings as quaternions wxyz with aligned signs, shape (R, 4)."""
-        return same_sign(self.rotation.as_quat(scalar_first=True))
+        return continuous_quaternions(self.rotation.as_quat(scalar_first=True))
 
     @property
     def std(self) -> float:
@@ -225,7 +225,7 @@ class LocalPolynomialOrientation:
         if rng is None or not count:
             return found.quaternion[None], found.velocity[None]
         zero = np.zeros_like(found.velocity)
-        turn, rate = sampled(zero, found.velocity, self.covariance(time)[:, :2, :2], count, rng)
+        turn, rate = sample_values_and_rates(zero, found.velocity, self.covariance(time)[:, :2, :2], count, rng)
         middle = Rotation.from_quat(found.quaternion, scalar_first=True)
         return np.stack([(middle * Rotation.from_rotvec(t)).as_quat(scalar_first=True) for t in turn]), rate
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from concent_warp.estimation.rotations import turns
+from concent_warp.estimation.rotations import rotation_vectors
 from concent_warp.estimation.sensors import Kind
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def _difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
     third = []
     for piece in pieces:
         if len(piece) > 3:
-            first = turns(piece[:-1], piece[1:]) if kind == "orientation" else np.diff(piece, axis=0)
+            first = rotation_vectors(piece[:-1], piece[1:]) if kind == "orientation" else np.diff(piece, axis=0)
             third.append(np.diff(first, n=2, axis=0))
     if not third:
         return np.nan
@@ -181,7 +181,7 @@ def _is_still(window: np.ndarray, limit: float) -> bool:
 
 def _centred(window: np.ndarray, kind: Kind) -> np.ndarray:
     """Return readings (n, dim) less their mean; of orientations rotation vectors [rad], shape (n, 3)."""
-    value = turns(np.broadcast_to(window[0], window.shape), window) if kind == "orientation" else window
+    value = rotation_vectors(np.broadcast_to(window[0], window.shape), window) if kind == "orientation" else window
     return value - value.mean(axis=0)
 
 

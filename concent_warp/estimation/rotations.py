@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
-def turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the rotation vectors [rad], shape (n, 3), from `start` to `end`, quaternions wxyz (n, 4)."""
     lengths = np.linalg.norm(start, axis=1) * np.linalg.norm(end, axis=1)
     vectors = np.zeros((len(start), 3))
@@ -23,17 +23,17 @@ def rotation_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """
     vector = np.full((len(start), 3), np.nan)
     valid = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    vector[valid] = turns(start[valid], end[valid])
+    vector[valid] = rotation_vectors(start[valid], end[valid])
     return vector
 
 
-def same_sign(quaternion: np.ndarray) -> np.ndarray:
+def continuous_quaternions(quaternion: np.ndarray) -> np.ndarray:
     """Return quaternions (T, 4) with signs flipped so that each is on the side of the one before it."""
     flips = np.where((quaternion[1:] * quaternion[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
 
-def rotations(quaternion: np.ndarray) -> np.ndarray:
+def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
     """Return rotation matrices, shape (T, 3, 3), of quaternions wxyz (T, 4) of any length but zero; NaN for NaN."""
     matrix = np.full((len(quaternion), 3, 3), np.nan)
     valid = np.isfinite(quaternion).all(axis=1)

@@ -136,7 +136,7 @@ class MeasuredBody:
     """None if only the position was measured."""
 
 
-def sampled(
+def sample_values_and_rates(
     value: np.ndarray, rate: np.ndarray, covariance: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values and rates (T, n), followed by `count` samples of them under their joint error.

@@ -16,9 +16,9 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.spatial.transform import Rotation
 
 from concent_warp.estimation.noise import channel_noise
-from concent_warp.estimation.rotations import same_sign
+from concent_warp.estimation.rotations import continuous_quaternions
 from concent_warp.estimation.sensors import Kind
-from concent_warp.estimation.signals import Estimate, OrientationEstimate, sampled
+from concent_warp.estimation.signals import Estimate, OrientationEstimate, sample_values_and_rates
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -89,7 +89,7 @@ class SmoothingSplineCfg:
         if not valid.any():
             return None
         body = Rotation.from_quat(channel.value[valid], scalar_first=True) * turn.inv()
-        quaternion = same_sign(body.as_quat(scalar_first=True))
+        quaternion = continuous_quaternions(body.as_quat(scalar_first=True))
         time = np.asarray(channel.time[valid], float)
         # A rotation by a small vector v changes a unit quaternion by v / 2.
         spline = fit_spline(time, quaternion, std / 2, cfg=self)
@@ -252,7 +252,7 @@ def _sampled_spline(
     value, rate = spline.at(time), spline.at(time, 1)
     if rng is None or not count:
         return value[None], rate[None]
-    return sampled(value, rate, spline.covariance(time)[:, :2, :2], count, rng)
+    return sample_values_and_rates(value, rate, spline.covariance(time)[:, :2, :2], count, rng)
 
 
 def fit_spline(

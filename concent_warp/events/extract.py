@@ -8,11 +8,11 @@ import numpy as np
 
 from concent_warp.errors import EventsError
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import close_gaps, runs, steps_of
+from concent_warp.events.filter import close_gaps, steps_of, true_runs
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEventSequence, ContactInterval
 from concent_warp.events.staging import find_stages
-from concent_warp.events.target import direction, number, vector
+from concent_warp.events.target import rounded_direction, rounded_number, rounded_vector
 from concent_warp.events.touches import BodyPoses, ReplayContacts
 from concent_warp.simulate.replay import replay, step_count
 
@@ -121,7 +121,7 @@ def _intervals(
 ) -> list[ContactInterval]:
     """Return an interval for each run of `touching` (K,) with the means of the contacts `rows` within it."""
     found = []
-    for start, end in runs(touching):
+    for start, end in true_runs(touching):
         part = rows[(rows.step >= start) & (rows.step < end)]
         if not len(part.step):
             continue
@@ -132,11 +132,11 @@ def _intervals(
             ContactInterval(
                 a=names[0],
                 b=names[1],
-                start=number(start * motion.timestep),
-                end=number(end * motion.timestep),
-                force=number(np.bincount(part.step - start, part.force).max()),
-                point=vector(weight @ motion.into(b, part.step, part.point)),
-                normal=direction(weight @ motion.turn_into(b, part.step, part.normal)),
+                start=rounded_number(start * motion.timestep),
+                end=rounded_number(end * motion.timestep),
+                force=rounded_number(np.bincount(part.step - start, part.force).max()),
+                point=rounded_vector(weight @ motion.into(b, part.step, part.point)),
+                normal=rounded_direction(weight @ motion.turn_into(b, part.step, part.normal)),
             )
         )
     return found

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def runs(touching: np.ndarray) -> np.ndarray:
+def true_runs(touching: np.ndarray) -> np.ndarray:
     """Return the runs of True in `touching` (K,) as first and one-past-last step, shape (n, 2) int."""
     edges = np.diff(np.concatenate([[False], touching, [False]]).astype(np.int8))
     return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
@@ -24,7 +24,7 @@ def runs(touching: np.ndarray) -> np.ndarray:
 def close_gaps(touching: np.ndarray, max_gap: int) -> np.ndarray:
     """Return `touching` (K,) with breaks of fewer than `max_gap` steps between two touches closed."""
     result = touching.copy()
-    for start, end in runs(~touching):
+    for start, end in true_runs(~touching):
         if start > 0 and end < len(touching) and end - start < max_gap:
             result[start:end] = True
     return result
@@ -33,7 +33,7 @@ def close_gaps(touching: np.ndarray, max_gap: int) -> np.ndarray:
 def drop_short_contacts(touching: np.ndarray, shortest: int) -> np.ndarray:
     """Return `touching` (K,) without runs of fewer than `shortest` steps."""
     result = touching.copy()
-    for start, end in runs(touching):
+    for start, end in true_runs(touching):
         if end - start < shortest:
             result[start:end] = False
     return result
@@ -49,7 +49,7 @@ def steps_of(duration: float, timestep: float) -> int:
     return max(1, round(duration / timestep))
 
 
-def windowed(value: np.ndarray, width: int) -> np.ndarray:
+def window_sums(value: np.ndarray, width: int) -> np.ndarray:
     """Return the sum of `value` (K, ...) over centred windows of `width` steps, cut at the ends, same shape.
 
     Summed shift by shift and not by differences of a running total, so that windows without contact give exact zeros.

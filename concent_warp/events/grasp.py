@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import debounce, runs, steps_of, windowed
+from concent_warp.events.filter import debounce, steps_of, true_runs, window_sums
 from concent_warp.events.onset import Onset
 from concent_warp.events.roles import Roles
 from concent_warp.events.touches import BodyPoses, ReplayContacts
@@ -35,7 +35,7 @@ def robot_onsets(
         grasping = debounce(opposed, max_gap, grasp) & touching
         grasped[body] = np.zeros(motion.steps, dtype=bool)
         seen: set[str] = set()
-        for start, end in runs(touching):
+        for start, end in true_runs(touching):
             if grasping[start:end].any():
                 kind = "pick"
                 grasped[body][start:end] = True
@@ -53,5 +53,5 @@ def forces_cancel(rows: ReplayContacts, steps: int, width: int, share: float) ->
     """Return when normal forces cancel to less than `share` of their sum, over windows of `width` steps, shape (K,)."""
     total = np.zeros((steps, 4))
     np.add.at(total, rows.step, np.concatenate([rows.force[:, None] * rows.normal, rows.force[:, None]], axis=1))
-    total = windowed(total, width)
+    total = window_sums(total, width)
     return np.linalg.norm(total[:, :3], axis=1) < share * total[:, 3]

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from concent_warp.events.cfg import InsertionCfg, StagingCfg
-from concent_warp.events.filter import debounce, runs, steps_of, windowed
+from concent_warp.events.filter import debounce, steps_of, true_runs, window_sums
 from concent_warp.events.onset import Onset
 from concent_warp.events.touches import BodyPoses, ReplayContacts
 
@@ -126,7 +126,7 @@ def object_onsets(
         cfg: Settings.
     """
     touching = in_contact.copy()
-    for start, end in runs(in_contact):
+    for start, end in true_runs(in_contact):
         if start <= cfg.initial_duration / motion.timestep:
             touching[start:end] = False
     rows = touches[touching[touches.step]]
@@ -219,8 +219,8 @@ def _passage(
     deep = (contact.point - plane.point) @ plane.normal < -cfg.inside_depth
     inner = across | deep if plane.barred else np.ones(len(contact.step), dtype=bool)
     beyond = touching & (contact.height(plane) < -cfg.inside_depth) if plane.barred else touching.copy()
-    on_inner = windowed(np.bincount(contact.step, contact.force * inner, minlength=steps), width)
-    total = windowed(np.bincount(contact.step, contact.force, minlength=steps), width)
+    on_inner = window_sums(np.bincount(contact.step, contact.force * inner, minlength=steps), width)
+    total = window_sums(np.bincount(contact.step, contact.force, minlength=steps), width)
     now = np.bincount(contact.step, inner, minlength=steps) > 0
     inside = beyond & now & (on_inner > cfg.insertion.inner_share * total)
     return beyond, debounce(inside, steps_of(cfg.max_gap, timestep), steps_of(cfg.min_state_duration, timestep))

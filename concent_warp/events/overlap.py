@@ -43,7 +43,7 @@ class SequenceOverlap:
     """The same of the robot links."""
 
 
-def pair(a: str, b: str) -> Pair:
+def sorted_pair(a: str, b: str) -> Pair:
     """Return two body names in alphabetical order."""
     return (a, b) if a <= b else (b, a)
 
@@ -65,7 +65,7 @@ def contact_frames(contacts: Iterable[tuple[float, str, str]], grid: np.ndarray)
     for time, a, b in contacts:
         row = _frame_of(np.array([time]), grid)[0]
         if 0 <= row < len(grid):
-            frames.setdefault(pair(a, b), np.zeros(len(grid), dtype=bool))[row] = True
+            frames.setdefault(sorted_pair(a, b), np.zeros(len(grid), dtype=bool))[row] = True
     return frames
 
 
@@ -79,7 +79,7 @@ def resample(frames: Frames, time: np.ndarray, grid: np.ndarray) -> dict[Pair, n
             raise EventsError(
                 f"contact of {a!r} and {b!r} has the wrong shape", expected=np.shape(time), found=np.shape(touching)
             )
-        result[pair(a, b)] = np.bincount(row[inside & touching], minlength=len(grid)) > 0
+        result[sorted_pair(a, b)] = np.bincount(row[inside & touching], minlength=len(grid)) > 0
     return result
 
 
@@ -95,7 +95,7 @@ def sequence_frames(sequence: ContactEventSequence, grid: np.ndarray) -> dict[Pa
     """Return the frames of a sequence at the times of a grid (T,) [s]."""
     frames: dict[Pair, np.ndarray] = {}
     for contact in sequence.body_contacts:
-        touching = frames.setdefault(pair(contact.a, contact.b), np.zeros(len(grid), dtype=bool))
+        touching = frames.setdefault(sorted_pair(contact.a, contact.b), np.zeros(len(grid), dtype=bool))
         touching |= (grid >= contact.start) & (grid < contact.end)
     return frames
 
@@ -115,10 +115,10 @@ def iou(a: Frames, b: Frames, pairs: Iterable[Pair] | None = None) -> FrameOverl
         b: The other.
         pairs: Pairs to compare; all by default.
     """
-    a, b = ({pair(*key): np.asarray(value, dtype=bool) for key, value in frames.items()} for frames in (a, b))
+    a, b = ({sorted_pair(*key): np.asarray(value, dtype=bool) for key, value in frames.items()} for frames in (a, b))
     if len({len(value) for value in (*a.values(), *b.values())}) > 1:
         raise EventsError("the contact records are not on the same time grid")
-    chosen = sorted({pair(*key) for key in pairs} if pairs is not None else set(a) | set(b))
+    chosen = sorted({sorted_pair(*key) for key in pairs} if pairs is not None else set(a) | set(b))
     scores: dict[Pair, float] = {}
     common = total = 0
     for key in chosen:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.events.cfg import StagingCfg
-from concent_warp.events.filter import runs, steps_of
+from concent_warp.events.filter import steps_of, true_runs
 from concent_warp.events.roles import Roles
 from concent_warp.events.sequence import ContactEvent, ContactPair, Vector
 from concent_warp.events.touches import BodyPoses, ReplayContacts
 
-DIGITS = 6
+DECIMALS = 6
 """Decimals kept of every number of a sequence: micrometres, microseconds, micronewtons."""
 
 
@@ -50,7 +50,7 @@ def target_event(
     role = {entity.name: entity.role for entity in roles.entities}
     names = sorted({name for pair in pairs for name in (pair.a, pair.b)})
     return ContactEvent(
-        time=number((low + high) / 2 * motion.timestep),
+        time=rounded_number((low + high) / 2 * motion.timestep),
         links=tuple(name for name in names if role[name] == "robot"),
         primitives=tuple(name for name in names if role[name] == "object"),
         pairs=tuple(pairs),
@@ -63,7 +63,7 @@ def _event_window(start: int, end: int, steady: np.ndarray, width: int, target: 
     "transition" takes the first `width` steps of the stage; "settled" takes as many of the last steady run of the stage
     that is long enough, `width` before its end, so that letting go or moving on has not begun.
     """
-    spans = runs(steady[start:end]) + start
+    spans = true_runs(steady[start:end]) + start
     if target == "transition" or not len(spans):
         return start, min(start + width, end)
     long = spans[spans[:, 1] - spans[:, 0] >= width]
@@ -81,25 +81,25 @@ def _contact_pair(rows: ReplayContacts, motion: BodyPoses, roles: Roles, steps: 
     return ContactPair(
         a=first,
         b=second,
-        point_a=vector(weight @ motion.into(a, rows.step, rows.point)),
-        point_b=vector(weight @ motion.into(b, rows.step, rows.point)),
-        normal=direction(weight @ motion.turn_into(b, rows.step, rows.normal)),
-        force=number(rows.force.sum() / steps),
+        point_a=rounded_vector(weight @ motion.into(a, rows.step, rows.point)),
+        point_b=rounded_vector(weight @ motion.into(b, rows.step, rows.point)),
+        normal=rounded_direction(weight @ motion.turn_into(b, rows.step, rows.normal)),
+        force=rounded_number(rows.force.sum() / steps),
     )
 
 
-def number(value: float) -> float:
+def rounded_number(value: float) -> float:
     """Return a number at the precision of the file, without a negative zero."""
-    return round(float(value), DIGITS) + 0.0
+    return round(float(value), DECIMALS) + 0.0
 
 
-def vector(value: np.ndarray) -> Vector:
+def rounded_vector(value: np.ndarray) -> Vector:
     """Return a vector (3,) at the precision of the file."""
-    x, y, z = (number(v) for v in value)
+    x, y, z = (rounded_number(v) for v in value)
     return x, y, z
 
 
-def direction(value: np.ndarray) -> Vector:
+def rounded_direction(value: np.ndarray) -> Vector:
     """Return a vector (3,) at length 1 and at the precision of the file; zero where it cancels."""
     length = np.linalg.norm(value)
-    return vector(value / length if length > 1e-6 else np.zeros(3))
+    return rounded_vector(value / length if length > 1e-6 else np.zeros(3))

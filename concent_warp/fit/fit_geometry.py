@@ -96,7 +96,7 @@ def fit_geometry(
         names = [d.name for d in recording.demonstrations] if demonstrations is None else list(demonstrations)
         chosen = [recording[name] for name in names]
         shown = chosen if cfg.window is None else []
-        segments = cut(model, chosen, cfg)
+        segments = cut_segments(model, chosen, cfg)
     search = Search(model, list(segments), cfg, engine)
     if method != "es":
         warm_start(search, method, shown, cfg.gradient, checkpoint, resume, progress)
@@ -123,7 +123,7 @@ def _save_fit(fit: FitResult, folder: Path) -> None:
     write_json(folder / "history.json", document)
 
 
-def cut(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> list[Segment]:
+def cut_segments(model: Model, demonstrations: Sequence[Demonstration], cfg: FitCfg) -> list[Segment]:
     """Return whole demonstrations as segments, or windows of them where the settings ask for that.
 
     Raises:

@@ -13,9 +13,9 @@ from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
 from concent_warp.reality.run import WorldLog, simulate, simulate_to_rest
-from concent_warp.reality.sensors.camera import CAMERA, film
+from concent_warp.reality.sensors.camera import CAMERA, record_depth_images
 from concent_warp.reality.sensors.footage import FootageCfg, footage
-from concent_warp.reality.sensors.sensing import SensingCfg, measure, sampled
+from concent_warp.reality.sensors.sensing import SensingCfg, measure, reading_steps
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene
@@ -144,11 +144,13 @@ def _perform(
     }
     image = {}
     if cfg.sensing.images:
-        rows = sampled(truth.time, cfg.sensing.image_rate)
+        rows = reading_steps(truth.time, cfg.sensing.image_rate)
         # A generator of its own, so that all else is the same with and without images.
-        image[CAMERA] = film(cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
+        image[CAMERA] = record_depth_images(
+            cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0]
+        )
     if cfg.footage.cameras:
-        rows = sampled(truth.time, cfg.footage.rate)
+        rows = reading_steps(truth.time, cfg.footage.rate)
         image |= footage(cfg.footage, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
     for effect in effects:
         if effect.measure is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from concent_warp.reality.sensors.sensing import SensingCfg, seen, visible_points
+from concent_warp.reality.sensors.sensing import SensingCfg, are_visible, visible_points
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.scene.scene import Scene
 
@@ -99,7 +99,7 @@ def simulate(
             for body, local in track.items():
                 place = data.body(body)
                 points = place.xpos + local @ place.xmat.reshape(3, 3).T
-                log.visible[body].append(seen(sensing, model, data, points, sensing.visibility_slack))
+                log.visible[body].append(are_visible(sensing, model, data, points, sensing.visibility_slack))
                 noisy = points + rng.normal(0, sensing.point_std, points.shape)
                 log.points[body].append(np.where(log.visible[body][-1][:, None], noisy, np.nan))
         if progress is not None and k % 200 == 0:

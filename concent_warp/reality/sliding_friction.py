@@ -40,7 +40,9 @@ def normal_forces(model: mujoco.MjModel, data: mujoco.MjData, body: int, surface
     return contact.pos[rows], data.efc_force[address[rows]]
 
 
-def rub(coefficients: Coefficients, body: str, surface: str) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
+def apply_sliding_friction(
+    coefficients: Coefficients, body: str, surface: str
+) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
     """Return the force hook of a body that slides on a level, fixed geom."""
     velocity = np.zeros(6)
 

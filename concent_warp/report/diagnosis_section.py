@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from concent_warp.comparison.units import p_value_text, words
+from concent_warp.comparison.units import channel_text, p_value_text
 from concent_warp.report.tables import Row, table
 
 MOST_EFFECTS = 10
@@ -41,7 +41,9 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     if where := diagnosis.get("where"):
         found += ["<h3>Where it shows</h3>", bullet_list([entry["sentence"] for entry in where])]
     if limits := diagnosis.get("detectable"):
-        rows: list[Row] = [("", [escape(words(d["name"])), _number(d["size"], 3), escape(d["unit"])]) for d in limits]
+        rows: list[Row] = [
+            ("", [escape(channel_text(d["name"])), _number(d["size"], 3), escape(d["unit"])]) for d in limits
+        ]
         opened = " open" if verdict == "none_needed" else ""
         about = "<summary>Smallest detectable effects</summary>"
         found.append(f"<details{opened}>{about}{table(['effect', 'size', 'unit'], rows, 1)}</details>")
@@ -59,23 +61,23 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
         return "No discrepancy was detected: the model explains the measurements down to their noise."
     if diagnosis["verdict"] == "group":
         group = next(g for g in groups if len(g) > 1)
-        names = _listed([words(name) for name in group])
+        names = _listed([channel_text(name) for name in group])
         return f"The model lacks something, and the data cannot distinguish between {names}.{left}"
     if diagnosis["verdict"] == "effect":
-        names = _listed([f"{words(e['name'])} ({FAMILIES.get(e['family'], e['family'])})" for e in accepted])
+        names = _listed([f"{channel_text(e['name'])} ({FAMILIES.get(e['family'], e['family'])})" for e in accepted])
         return f"The model lacks {names}. {_gain_sentence(accepted)}{left}"
     lacks = "The model lacks something that none of the effects in the library explains"
     if not accepted:
         return f"{lacks}.{left}"
     alike = [next((g for g in groups if e["name"] in g), [e["name"]]) for e in accepted]
-    names = _listed([_listed([words(name) for name in group], "or") for group in alike])
+    names = _listed([_listed([channel_text(name) for name in group], "or") for group in alike])
     return f"{lacks}, beside what {names} can account for. {_gain_sentence(accepted)}{left}"
 
 
 def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence on the held-out gains of effects."""
     parts = [
-        f"{words(e['name']) if len(effects) > 1 else 'it'} removes {_gain_text(e)} of the error ({_p_text(e)})"
+        f"{channel_text(e['name']) if len(effects) > 1 else 'it'} removes {_gain_text(e)} of the error ({_p_text(e)})"
         for e in effects
     ]
     return f"On data that the fit has not seen, {', '.join(parts)}."
@@ -83,7 +85,7 @@ def _gain_sentence(effects: Sequence[Mapping[str, Any]]) -> str:
 
 def _group_sentence(group: Sequence[str]) -> str:
     """Return a sentence on effects that the data cannot distinguish."""
-    return f"These data cannot distinguish between {_listed([words(name) for name in group])}."
+    return f"These data cannot distinguish between {_listed([channel_text(name) for name in group])}."
 
 
 def _bars(effects: Sequence[Mapping[str, Any]]) -> str:
@@ -105,7 +107,7 @@ def _bars(effects: Sequence[Mapping[str, Any]]) -> str:
         marks += mark("gain", *sorted((0.0, value))) + mark("whisker", *interval)
         rows.append(
             f'<div class="effect {"accepted" if e["accepted"] else "rejected"}"><span class="name">'
-            f'{escape(words(e["name"]))}</span><span class="track">{marks}</span>'
+            f'{escape(channel_text(e["name"]))}</span><span class="track">{marks}</span>'
             f'<span class="figure">{_gain_text(e)} <span class="quiet">{escape(_p_text(e))}</span></span></div>'
         )
     shown = f'<div class="bars">{"".join(rows[:MOST_EFFECTS])}</div>'
@@ -119,7 +121,7 @@ def _parameter_rows(effects: Sequence[Mapping[str, Any]]) -> list[Row]:
     rows: list[Row] = []
     for e in [e for e in effects if e["accepted"]] or effects[:1]:
         for k, p in enumerate(e["parameters"]):
-            name = escape(words(e["name"])) if k == 0 else ""
+            name = escape(channel_text(e["name"])) if k == 0 else ""
             low, high = (_number(end, 4) for end in p["interval"])
             value = f"<b>{_number(p['value'], 4)}</b>"
             rows.append(("", [name, escape(p["name"]), value, f"{low} to {high}", escape(p["unit"])]))

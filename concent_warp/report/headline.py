@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from concent_warp.comparison.result import Comparison, Summary
-from concent_warp.comparison.units import percent, shown, times, unit_shown, words
+from concent_warp.comparison.units import channel_text, percent_text, ratio_text, unit_text, value_text
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.report.cfg import ReportCfg
 
@@ -57,7 +57,7 @@ def cards(
     """Return the cards of a report."""
     cfg = cfg or ReportCfg()
     channel, phases = headline_channel(comparison), comparison.contact_phases()
-    where = f"Mean error of {words(channel)}" + (f", {' + '.join(phases)}" if phases else "")
+    where = f"Mean error of {channel_text(channel)}" + (f", {' + '.join(phases)}" if phases else "")
     unseen = tuple(d for d in comparison.demonstrations if fitted and d not in fitted)
     seen = tuple(d for d in comparison.demonstrations if d not in unseen)
     found = []
@@ -78,10 +78,10 @@ def cards(
         figure = " or ".join(map(str, counts)) + " <small>stages</small>"
         found.append(Card("Contact stages found in the replay", figure, escape(names)))
     last = comparison.summarise(comparison.after, channel, phases)
-    noise = "" if last.noise is None else f"{shown(last.noise, last.unit)} {unit_shown(last.unit)}"
+    noise = "" if last.noise is None else f"{value_text(last.noise, last.unit)} {unit_text(last.unit)}"
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)
-        figure = f"{shown(null.mean, null.unit)} <small>{unit_shown(null.unit)}</small>"
+        figure = f"{value_text(null.mean, null.unit)} <small>{unit_text(null.unit)}</small>"
         note = f"Measurement noise alone would leave {noise} (RMS)." if noise else ""
         found.insert(
             bool(seen) + bool(unseen), Card("The same error if objects did not touch one another", figure, note)
@@ -96,8 +96,8 @@ def _above_noise(summary: Summary, noise_ratio: float) -> str:
     if summary.ratio is None or not np.isfinite(summary.ratio):
         return ""
     if summary.ratio < noise_ratio:
-        return f", at the level of the measurement noise ({times(summary.ratio)} noise)"
-    return f" ({times(summary.ratio)} noise)"
+        return f", at the level of the measurement noise ({ratio_text(summary.ratio)} noise)"
+    return f" ({ratio_text(summary.ratio)} noise)"
 
 
 def _overlap_note(before: float, after: float, change: float) -> str:
@@ -119,18 +119,18 @@ def _error_card(
     before, after = (
         comparison.summarise(model, channel, phases, demonstrations) for model in (comparison.before, comparison.after)
     )
-    unit = unit_shown(after.unit)
+    unit = unit_text(after.unit)
     if len(comparison.models) < 2:
-        return Card(what, f"{shown(after.mean, after.unit)} <small>{unit}</small>")
+        return Card(what, f"{value_text(after.mean, after.unit)} <small>{unit}</small>")
     found = comparison.difference(channel, phases, demonstrations)
     note = ""
     if np.isfinite(found.share):
         kind = {"fallen": "good", "risen": "bad"}.get(found.verdict, "")
-        note = f'<b class="{kind}">{percent(found.share)}</b>'
+        note = f'<b class="{kind}">{percent_text(found.share)}</b>'
         if np.isfinite(found.low):
-            low, high = (shown(end, found.unit, sign=True) for end in (found.low, found.high))
+            low, high = (value_text(end, found.unit, sign=True) for end in (found.low, found.high))
             note += f", difference {low} to {high} {unit} (95 %)"
-    return Card(what, _arrow([shown(before.mean, before.unit), shown(after.mean, after.unit)], unit), note)
+    return Card(what, _arrow([value_text(before.mean, before.unit), value_text(after.mean, after.unit)], unit), note)
 
 
 def _arrow(ends: Sequence[str], unit: str) -> str:
@@ -149,13 +149,13 @@ def verdict(
     cfg = cfg or ReportCfg()
     channel, phases = headline_channel(comparison), comparison.contact_phases()
     after = comparison.summarise(comparison.after, channel, phases)
-    unit = unit_shown(after.unit)
+    unit = unit_text(after.unit)
     during = f" during {' and '.join(phases)}" if phases else ""
     if not np.isfinite(after.mean):
         return f"The simulation of “{comparison.after}” does not stay finite: see the table for when it diverges."
     if len(comparison.models) < 2:
-        text = f"The model is off by {shown(after.mean, after.unit)} {unit} on average in {words(channel)}{during}"
-        return f"{text}{_above_noise(after, cfg.noise_ratio)}."
+        off = f"{value_text(after.mean, after.unit)} {unit} on average in {channel_text(channel)}"
+        return f"The model is off by {off}{during}{_above_noise(after, cfg.noise_ratio)}."
     before = comparison.summarise(comparison.before, channel, phases)
     found = comparison.difference(channel, phases)
     change = {
@@ -165,12 +165,12 @@ def verdict(
     }[found.verdict]
     above = _above_noise(after, cfg.noise_ratio)
     text = (
-        f"The error of {words(channel)}{during} {change}: {shown(before.mean, before.unit)} {unit} "
-        f"{comparison.before}, {shown(after.mean, after.unit)} {unit} {comparison.after}{above}."
+        f"The error of {channel_text(channel)}{during} {change}: {value_text(before.mean, before.unit)} {unit} "
+        f"{comparison.before}, {value_text(after.mean, after.unit)} {unit} {comparison.after}{above}."
     )
     if NULL in comparison.models:
         null = comparison.summarise(NULL, channel, phases)
-        text += f" Ignoring the contact would leave {shown(null.mean, null.unit)} {unit}"
+        text += f" Ignoring the contact would leave {value_text(null.mean, null.unit)} {unit}"
         if after.mean < 0.5 * null.mean:
             text += ", so it is the contact that explains the motion."
         else:

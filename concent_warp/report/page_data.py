@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.comparison.result import Comparison
-from concent_warp.comparison.units import SHOWN, unit_shown, words
+from concent_warp.comparison.units import DISPLAY_UNITS, channel_text, unit_text
 from concent_warp.comparison.worst_spans import WorstSpan, whole_rows
 from concent_warp.events.schedule import contact_count, schedule_rows
 from concent_warp.events.sequence import ContactEventSequence
@@ -118,10 +118,10 @@ def _channel_lines(comparison: Comparison, demonstration: str) -> list[dict[str,
         found.append(
             {
                 "name": channel,
-                "unit": unit_shown(first.unit),
-                "factor": SHOWN.get(first.unit, (1.0, first.unit))[0],
+                "unit": unit_text(first.unit),
+                "factor": DISPLAY_UNITS.get(first.unit, (1.0, first.unit))[0],
                 "noise": first.noise,
-                "words": words(channel),
+                "words": channel_text(channel),
                 "time": packed(np.array([first.time[rows[0]] for rows in pieces])),
                 "errors": {model: packed(np.array([e[rows].max() for rows in pieces])) for model, e in errors.items()},
             }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.result import Comparison, Summary
-from concent_warp.comparison.units import percent, shown, times, unit_shown
+from concent_warp.comparison.units import percent_text, ratio_text, unit_text, value_text
 from concent_warp.report.headline import headline_channel
 
 Row = tuple[str, Sequence[str]]
@@ -30,10 +30,10 @@ def table(header: Sequence[str], rows: Sequence[Row], numbers_from: int) -> str:
 
 def _mean_cell(summary: Summary) -> str:
     """Return a mean with its interval."""
-    mean = shown(summary.mean, summary.unit)
+    mean = value_text(summary.mean, summary.unit)
     if not np.isfinite(summary.low):
         return mean
-    low, high = shown(summary.low, summary.unit), shown(summary.high, summary.unit)
+    low, high = value_text(summary.low, summary.unit), value_text(summary.high, summary.unit)
     return f'{mean} <span class="interval">[{low}, {high}]</span>'
 
 
@@ -45,7 +45,7 @@ def _change_cell(
     if not np.isfinite(found.share):
         return "-"
     kind = {"fallen": "good", "risen": "bad"}.get(found.verdict, "")
-    return f'<span class="{kind}">{percent(found.share)}</span>'
+    return f'<span class="{kind}">{percent_text(found.share)}</span>'
 
 
 def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool) -> str:
@@ -63,10 +63,10 @@ def error_table(comparison: Comparison, channels: Sequence[str], *, phases: bool
         if not last.count:
             continue
         name = escape(phase[0]) if phase else f"<b>{escape(channel)}</b>"
-        cells = [name, unit_shown(last.unit), str(last.count), *map(_mean_cell, summaries)]
+        cells = [name, unit_text(last.unit), str(last.count), *map(_mean_cell, summaries)]
         cells += [_change_cell(comparison, channel, phase)] if several else []
-        cells += [shown(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
-        cells.append("-" if last.ratio is None else times(last.ratio))
+        cells += [value_text(value, last.unit) for value in (last.rms, last.p95, last.max, last.noise)]
+        cells.append("-" if last.ratio is None else ratio_text(last.ratio))
         rows.append(("phase-row" if phase else "", cells))
     return table(header, rows, 2)
 
@@ -77,7 +77,7 @@ def demonstration_table(
     """Return the table of the headline channel's error by demonstration."""
     channel, phases = headline_channel(comparison), comparison.contact_phases()
     several = len(comparison.models) > 1
-    unit = unit_shown(comparison.summarise(comparison.after, channel, phases).unit)
+    unit = unit_text(comparison.summarise(comparison.after, channel, phases).unit)
     header = ["demonstration", "", *(f"mean, {escape(name)} [{unit}]" for name in comparison.models)]
     header += ["change"] if several else []
     header += [f"contact overlap, {escape(name)}" for name in overlap]

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from html import escape
 
 from concent_warp.comparison.result import Comparison
-from concent_warp.comparison.units import words
+from concent_warp.comparison.units import channel_text
 from concent_warp.comparison.worst_spans import WorstSpan, span_kind
 from concent_warp.estimation.noise import WORDS
 
@@ -55,6 +55,6 @@ def noise_words(comparison: Comparison) -> str:
     found: dict[str, list[str]] = {}
     for channel in comparison.channels:
         source = comparison.summarise(comparison.after, channel).source
-        found.setdefault(WORDS[source], []).append(words(channel))
+        found.setdefault(WORDS[source], []).append(channel_text(channel))
     (most, _), *others = sorted(found.items(), key=lambda item: -len(item[1]))
     return "; ".join([f"Noise: {most}", *(f"of {', '.join(channels)}: {how}" for how, channels in others)]) + "."

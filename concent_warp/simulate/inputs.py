@@ -96,7 +96,7 @@ def check_run(
     if contacts not in get_args(Contacts):
         raise EngineError("unknown `contacts`", expected=f"one of {list(get_args(Contacts))}", found=repr(contacts))
     _check_variants(compiled, sphere_count, variants)
-    values = np.asarray(host(ctrl), dtype=float)
+    values = np.asarray(to_host(ctrl), dtype=float)
     found = values.shape
     values = values[None] if values.ndim == 2 else values
     if values.ndim != 3 or values.shape[2] != compiled.nu or not len(values) or variants.count % len(values):
@@ -196,7 +196,7 @@ def _check_bodies(compiled: mujoco.MjModel, bodies: Sequence[str] | None) -> tup
     return tuple(bodies), np.array([known.index(name) for name in bodies], dtype=int)
 
 
-def host(value: Any) -> Any:
+def to_host(value: Any) -> Any:
     """Return a tensor as a NumPy array, anything else as it is."""
     return value.detach().cpu().numpy() if hasattr(value, "detach") else value
 
@@ -204,14 +204,14 @@ def host(value: Any) -> Any:
 def host_variants(variants: Variants) -> Variants:
     """Return the same variants with float64 NumPy arrays."""
     arrays = {
-        name: None if (value := getattr(variants, name)) is None else np.asarray(host(value), dtype=float)
+        name: None if (value := getattr(variants, name)) is None else np.asarray(to_host(value), dtype=float)
         for name in (*SPHERE_FIELDS, "qpos", "qvel")
     }
-    fields: Mapping[str, np.ndarray] = {k: np.asarray(host(v), dtype=float) for k, v in variants.fields.items()}
+    fields: Mapping[str, np.ndarray] = {k: np.asarray(to_host(v), dtype=float) for k, v in variants.fields.items()}
     force_models = None
     if variants.force_models is not None:
         given = variants.force_models
-        force_models = tuple((force_model, np.asarray(host(values), dtype=float)) for force_model, values in given)
+        force_models = tuple((force_model, np.asarray(to_host(values), dtype=float)) for force_model, values in given)
     return Variants(variants.count, fields=fields, force_models=force_models, **arrays)
 
 

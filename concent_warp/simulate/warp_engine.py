@@ -211,7 +211,7 @@ class WarpEngine:
             return self._programs[plan]
         while len(self._programs) >= MAX_PROGRAMS:
             self._programs.popitem(last=False)
-        typical = {name: largest(value) + (name in edited) for name, value in fields.items()}
+        typical = {name: largest_by_magnitude(value) + (name in edited) for name, value in fields.items()}
         try:
             program = Program(self._compiled, self._sphere_geom, plan, self._buffers, typical, self.device)
         except RuntimeError as error:
@@ -351,7 +351,7 @@ def _rung(size: float) -> int:
     return step
 
 
-def largest(value: Any) -> np.ndarray:
+def largest_by_magnitude(value: Any) -> np.ndarray:
     """Return the entry largest in magnitude over the variants of a field (N, ...), shape (...)."""
     array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value, dtype=float)
     return np.take_along_axis(array, np.abs(array).argmax(axis=0)[None], axis=0)[0]

@@ -16,7 +16,7 @@ import warp as wp
 from concent_warp.errors import EngineError
 from concent_warp.kernels import rollout as kernels
 from concent_warp.simulate.fields import CONSTANTS, SOURCES_OF_CONSTANTS, apply_fields, derived_constants
-from concent_warp.simulate.inputs import host
+from concent_warp.simulate.inputs import to_host
 
 SPHERE_ARRAYS = {
     "sphere_position": ("geom_pos",),
@@ -107,7 +107,7 @@ class WorldModel:
             target.copy_(values + self._folded[name] if name in self._folded else values)
         if self._derived:
             names = (*SOURCES_OF_CONSTANTS, *CONSTANTS)
-            sources = {name: host(value) for name, value in fields.items() if name in names}
+            sources = {name: to_host(value) for name, value in fields.items() if name in names}
             for name, value in derived_constants(self._compiled, sources, self._worlds).items():
                 wp.to_torch(getattr(self.mjw, name)).copy_(self.tensor(value))
 

@@ -16,7 +16,7 @@ import numpy as np
 from concent_warp.reality.hidden.registry import hidden
 from concent_warp.reality.rigs.pendulum import PENDULUM
 from concent_warp.reality.rigs.rig import RigTrial, record_rig
-from concent_warp.reality.rigs.signals import glide, hold, joined, sweep
+from concent_warp.reality.rigs.signals import hold, joined, minimum_jerk_profile, sweep
 from concent_warp.recording.formats.hdf5 import write_hdf5
 
 FRICTION = 0.03
@@ -29,7 +29,7 @@ def plan(rng: np.random.Generator, k: int) -> RigTrial:
     del k
     reach = rng.uniform(1.0, 1.2)
     parts = [hold(0.0, 0.2), sweep(0.0, reach, 1.5), hold(reach, 0.2), sweep(reach, -0.6, 3.0), hold(-0.6, 0.2)]
-    parts += [sweep(-0.6, -0.4, 0.4), sweep(-0.4, -0.6, 0.4), glide(-0.6, 0.0, 0.5)]
+    parts += [sweep(-0.6, -0.4, 0.4), sweep(-0.4, -0.6, 0.4), minimum_jerk_profile(-0.6, 0.0, 0.5)]
     parts += [hold(0.0, max(0.1, 4.0 - sum(map(len, parts)) / 100))]
     return RigTrial(4.0, {"servo": joined(parts)}, settling_time=0.5)
 

@@ -25,7 +25,7 @@ MIN_TRANSMITTANCE = wp.constant(1.0e-4)
 
 
 @wp.struct
-class Lists:
+class TileLists:
     """Gaussians of each tile, and their projections."""
 
     first: wp.array[int]  # where a tile's list begins, and the end of the last, shape (images * tiles + 1,)
@@ -46,7 +46,7 @@ def exponent(place: wp.vec4, shape: wp.vec4, x: float, y: float) -> float:
 @wp.kernel
 def blend(
     frame: Frame,
-    lists: Lists,
+    lists: TileLists,
     hidden: wp.array3d[float],
     margin: float,
     rgb: wp.array3d[wp.vec3],
@@ -107,7 +107,7 @@ def blend(
 @wp.kernel
 def blend_gradient(
     frame: Frame,
-    lists: Lists,
+    lists: TileLists,
     alpha: wp.array3d[float],
     depth: wp.array3d[float],
     left: wp.array3d[float],

@@ -15,9 +15,9 @@ from typing import Any
 
 import warp as wp
 
-from .blend import Lists, blend, blend_gradient
+from .blend import TileLists, blend, blend_gradient
 from .projection import Frame, SplatPoses, project
-from .tiles import DEPTH_BITS, emit, find_tiles, measure, pad
+from .tiles import DEPTH_BITS, count_pairs, fill_unused_keys, find_tiles, write_keys
 
 TILES = {"cpu": 8, "cuda": 16}
 """Edge of a tile that is quickest on a kind of device [px]."""
@@ -159,7 +159,7 @@ class SplatPlan:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         rows = images * self._splats
-        self._lists = Lists()
+        self._lists = TileLists()
         self._lists.place, self._lists.shape, self._lists.colour = (
             new(rows, wp.vec4),
             new(rows, wp.vec4),
@@ -186,9 +186,11 @@ class SplatPlan:
         lists, device, splats, frame = self._lists, self.device, self._splats, self._frame
         wp.launch(project, (self.images, splats), self._projection(), device=device)
         wp.utils.array_scan(self._count, self._end, inclusive=True)
-        wp.launch(measure, self.images, [self._end, splats, self.capacity, self.pairs, self.overflow], device=device)
         wp.launch(
-            emit,
+            count_pairs, self.images, [self._end, splats, self.capacity, self.pairs, self.overflow], device=device
+        )
+        wp.launch(
+            write_keys,
             (self.images, splats),
             [frame, splats, self.capacity, lists.place, self._bounds, self._count, self._end, self._key, self._order],
             device=device,
@@ -196,7 +198,7 @@ class SplatPlan:
         used = self.capacity
         if device.is_cpu and not device.is_capturing:
             used = min(used, max(1, int(self._end.numpy()[-1])))
-        wp.launch(pad, used, [self._end, self._tiles, self._key], device=device)
+        wp.launch(fill_unused_keys, used, [self._end, self._tiles, self._key], device=device)
         wp.utils.radix_sort_pairs(self._key, self._order, used, 0, self._bits)
         wp.launch(find_tiles, self._tiles + 1, [self._key, used, lists.first], device=device)
         self._on_pixels(

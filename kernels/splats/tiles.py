@@ -30,7 +30,7 @@ def depth_key(depth: float) -> int:
 
 
 @wp.kernel
-def measure(end: wp.array[int], splats: int, capacity: int, pairs: wp.array[int], overflow: wp.array[int]):
+def count_pairs(end: wp.array[int], splats: int, capacity: int, pairs: wp.array[int], overflow: wp.array[int]):
     """How many pairs of Gaussian and tile an image has, and how many of these find no room."""
     image = wp.tid()
     last = end[(image + 1) * splats - 1]
@@ -42,7 +42,7 @@ def measure(end: wp.array[int], splats: int, capacity: int, pairs: wp.array[int]
 
 
 @wp.kernel
-def emit(
+def write_keys(
     frame: Frame,
     splats: int,
     capacity: int,
@@ -70,7 +70,7 @@ def emit(
 
 
 @wp.kernel
-def pad(end: wp.array[int], beyond: wp.int64, key: wp.array[wp.int64]):
+def fill_unused_keys(end: wp.array[int], beyond: wp.int64, key: wp.array[wp.int64]):
     """Give what is not used the number of a tile after the last."""
     i = wp.tid()
     if i >= end[end.shape[0] - 1]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from concent_warp.render.dataset.layout import EpisodeLayout, Staging, published, replace_text
-from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged, of_values
+from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged_statistics, statistics_of_values
 from concent_warp.render.dataset.video import PIXELS, Codec, VideoWriter, join_videos
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class LeRobotWriter:
         for feature in names:
             prefix = f"stats/{feature}/"
             parts = [{n[len(prefix) :]: np.array(v) for n, v in row.items() if n.startswith(prefix)} for row in rows]
-            stats[feature] = {name: value.tolist() for name, value in merged(parts).items()}
+            stats[feature] = {name: value.tolist() for name, value in merged_statistics(parts).items()}
         replace_text(self.folder / "meta" / "stats.json", json.dumps(stats, indent=1))
         info = {
             "codebase_version": VERSION,
@@ -274,9 +274,9 @@ class LeRobotEpisode:
         pq.write_table(pa.table(columns), self._folder / "data.parquet")
         stats: dict[str, Statistics] = {_image_key(c): seen.statistics() for c, seen in self._seen.items()}
         stats |= {
-            "observation.state": of_values(state),
-            "action": of_values(action),
-            "timestamp": of_values(time[:, None]),
+            "observation.state": statistics_of_values(state),
+            "action": statistics_of_values(action),
+            "timestamp": statistics_of_values(time[:, None]),
         }
         plain = {feature: {name: value.tolist() for name, value in named.items()} for feature, named in stats.items()}
         note = {"task": self._task, "length": len(state), "stats": plain}

@@ -11,7 +11,7 @@ Statistics = dict[str, np.ndarray]
 """By name: min, max, mean, std, the quantiles, and count, shape (1,)."""
 
 
-def of_values(values: np.ndarray) -> Statistics:
+def statistics_of_values(values: np.ndarray) -> Statistics:
     """Return the statistics of values (T, n), each of shape (n,)."""
     values = np.asarray(values, dtype=float)
     found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
@@ -47,7 +47,7 @@ class ImageHistogram:
         return {name: value.reshape(3, 1, 1) for name, value in found.items()} | {"count": np.array([self._frames])}
 
 
-def merged(parts: Sequence[Mapping[str, np.ndarray]]) -> Statistics:
+def merged_statistics(parts: Sequence[Mapping[str, np.ndarray]]) -> Statistics:
     """Return the statistics of all episodes from those of each.
 
     Means and deviations are exact; quantiles are the mean of the episodes' quantiles by their lengths, as LeRobot

@@ -14,7 +14,7 @@ from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, SuperResolutionCfg
 from concent_warp.render.networks.flow import sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
-from concent_warp.render.networks.super_resolution import SuperResolution, reduced
+from concent_warp.render.networks.super_resolution import SuperResolution, downsampled
 from concent_warp.render.networks.train import CHECKPOINT, ENLARGE, load_checkpoint, network_of
 
 Network = TypeVar("Network", bound=torch.nn.Module)
@@ -114,7 +114,7 @@ class Painter:
             )
         frames = []
         for c, name in enumerate(cameras):
-            seen = reduced(simulated[:, c].permute(0, 3, 1, 2).to(self.device), self.size)
+            seen = downsampled(simulated[:, c].permute(0, 3, 1, 2).to(self.device), self.size)
             # Rounded to 8 bits like the training images.
             seen = (255 * seen).round() / 127.5 - 1
             network = self.networks[name]

@@ -58,6 +58,6 @@ def _enlarged(image: torch.Tensor) -> torch.Tensor:
     return functional.interpolate(image, scale_factor=FACTOR, mode="bicubic", align_corners=False)
 
 
-def reduced(image: torch.Tensor, size: int) -> torch.Tensor:
+def downsampled(image: torch.Tensor, size: int) -> torch.Tensor:
     """Return images (N, 3, size, size) by bilinear interpolation without aliasing, as the paper resizes them."""
     return functional.interpolate(image, size=(size, size), mode="bilinear", align_corners=False, antialias=True)

@@ -22,7 +22,7 @@ from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, Re
 from concent_warp.render.networks.flow import flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.pairs import ImagePairs, to_signed
-from concent_warp.render.networks.super_resolution import FACTOR, SuperResolution, reduced
+from concent_warp.render.networks.super_resolution import FACTOR, SuperResolution, downsampled
 
 CHECKPOINT = "checkpoint.pt"
 """File of the state of a training."""
@@ -248,7 +248,7 @@ def _small_pairs(pairs: ImagePairs, size: int) -> ImagePairs:
     """Return the pairs at the size that the flow paints."""
 
     def less(images: torch.Tensor) -> torch.Tensor:
-        parts = [reduced(part.float(), size).round().clamp(0, 255).to(torch.uint8) for part in images.split(64)]
+        parts = [downsampled(part.float(), size).round().clamp(0, 255).to(torch.uint8) for part in images.split(64)]
         return torch.cat(parts)
 
     return replace(pairs, real=less(pairs.real), simulated=less(pairs.simulated))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from concent_warp.fit.fit_geometry import FitCfg, cut
+from concent_warp.fit.fit_geometry import FitCfg, cut_segments
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.geometry.search import Search
 from concent_warp.simulate.engine import Variants
@@ -15,7 +15,7 @@ def benchmark(script):
 
 def test_the_bare_loop_simulates_what_the_generation_does(benchmark, drop, swollen):
     cfg = FitCfg(evolution=EvolutionCfg(population=3, neighbours=2))
-    search = Search(swollen, cut(swollen, drop.demonstrations, cfg), cfg, "warp")
+    search = Search(swollen, cut_segments(swollen, drop.demonstrations, cfg), cfg, "warp")
     found = search.survey(search.used)
     mask, reachable = found.mask, found.reachable
     engine = WarpEngine(swollen, collidable=reachable | mask, device="cpu")

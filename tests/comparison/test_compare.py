@@ -10,7 +10,7 @@ from rich.console import Console
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import Phase
 from concent_warp.comparison.table import markdown_table, rich_table
-from concent_warp.comparison.units import shown, times
+from concent_warp.comparison.units import ratio_text, value_text
 from concent_warp.effects.library.drives import ActuatorDelay
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.errors import ModelError, RecordingError
@@ -159,7 +159,7 @@ def test_one_model_alone_has_no_difference_and_a_shorter_table():
 def test_tables_show_lengths_in_mm_with_the_interval(comparison):
     text = markdown_table(comparison)
     summary = comparison.summarise("wrong", "rail")
-    assert f"{shown(summary.mean, 'm')} [{shown(summary.low, 'm')}, {shown(summary.high, 'm')}]" in text
+    assert f"{value_text(summary.mean, 'm')} [{value_text(summary.low, 'm')}, {value_text(summary.high, 'm')}]" in text
     assert text.count("\n") == 2 + 1 + 4
     assert rich_table(comparison).row_count == 1 + 4
     assert rich_table(comparison, every_phase=True).row_count == 2 * 4
@@ -182,7 +182,7 @@ def test_the_table_fits_a_narrow_terminal_and_keeps_what_matters(comparison, wid
     [(0.0123, "m", "12.3"), (np.pi, "rad", "180"), (0.5, "N", "0.50"), (None, "m", "-"), (np.inf, "m", "diverged")],
 )
 def test_numbers_are_shown_in_mm_and_degrees(value, unit, text):
-    assert shown(value, unit) == text
+    assert value_text(value, unit) == text
 
 
 def test_only_the_named_demonstrations_are_compared():
@@ -282,7 +282,7 @@ def test_html_has_a_row_for_each_channel_and_escapes_names():
     assert "<6>" not in page
     ratio = found.summarise("right", "rail").ratio
     assert ratio is not None
-    assert f"<td>{times(ratio)}</td>" in page
+    assert f"<td>{ratio_text(ratio)}</td>" in page
     assert "<td>fallen</td>" in page
     assert "<ol>" not in page  # the last model is nowhere above the noise
     (span, *_) = compare_replays({"right": truth, "wrong": model(6)}, recorded(truth), "mujoco").worst_spans

@@ -94,9 +94,9 @@ def test_bodies_are_selected_by_what_carries_them(m):
     assert select.free_body_targets(m) == (("ball",),)
     assert bodies(m, select.fingers(m)) == ["left", "right"]
     assert bodies(m, select.robot_bodies(m)) == ["base", "bracket", "arm", "left", "right", "third"]
-    assert bodies(m, select.last_links(m)) == ["third", "cardan", "ground slide", "ground slide too"]
+    assert bodies(m, select.outermost_links(m)) == ["third", "cardan", "ground slide", "ground slide too"]
     gripper = mujoco.MjModel.from_xml_string(GRIPPER)
-    assert bodies(gripper, select.last_links(gripper)) == ["hand"]
+    assert bodies(gripper, select.outermost_links(gripper)) == ["hand"]
 
 
 def test_actuators_are_the_grippers_or_the_arms(m):

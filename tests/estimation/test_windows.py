@@ -8,7 +8,7 @@ from concent_warp.estimation.local_polynomial import LocalPolynomial, LocalPolyn
 from concent_warp.estimation.object_tracks import whole_demonstration
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.estimation.windows import cut_windows, mark_held_out
-from concent_warp.fit.fit_geometry import FitCfg, cut, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, cut_segments, fit_geometry
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
@@ -89,7 +89,7 @@ def test_windows_of_free_flight_are_left_out(scene):
     assert len(cut_windows(scene, flight, ("cube",), LENGTH, only_contact=False)) == 4
     model = Model(scene, ContactGeometryCfg(count=30).build(scene))
     with pytest.raises(RecordingError, match="no window shows contact"):
-        cut(model, [flight], FitCfg(window=LENGTH))
+        cut_segments(model, [flight], FitCfg(window=LENGTH))
 
 
 def test_a_bounce_between_two_flights_counts_as_contact(scene):

@@ -1,6 +1,6 @@
 import numpy as np
 
-from concent_warp.events.filter import close_gaps, debounce, drop_short_contacts, runs, steps_of, windowed
+from concent_warp.events.filter import close_gaps, debounce, drop_short_contacts, steps_of, true_runs, window_sums
 
 
 def frames(text: str) -> np.ndarray:
@@ -12,8 +12,8 @@ def text(touching: np.ndarray) -> str:
 
 
 def test_runs_are_half_open_spans():
-    assert runs(frames("##..#")).tolist() == [[0, 2], [4, 5]]
-    assert runs(frames("...")).shape == (0, 2)
+    assert true_runs(frames("##..#")).tolist() == [[0, 2], [4, 5]]
+    assert true_runs(frames("...")).shape == (0, 2)
 
 
 def test_breaks_shorter_than_the_gap_are_closed_and_longer_ones_kept():
@@ -38,11 +38,11 @@ def test_durations_become_whole_steps():
 
 
 def test_windows_are_centred_and_cut_at_the_ends():
-    assert windowed(np.arange(5.0), 3).tolist() == [1, 3, 6, 9, 7]
-    assert windowed(np.ones((4, 2)), 100).tolist() == [[4, 4]] * 4
+    assert window_sums(np.arange(5.0), 3).tolist() == [1, 3, 6, 9, 7]
+    assert window_sums(np.ones((4, 2)), 100).tolist() == [[4, 4]] * 4
 
 
 def test_windows_without_contact_give_exact_zeros():
     value = np.zeros(50)
     value[:10] = 0.1
-    assert (windowed(value, 5)[12:] == 0).all()
+    assert (window_sums(value, 5)[12:] == 0).all()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import ModelError, RecordingError
-from concent_warp.fit.fit_geometry import FitCfg, cut, fit_geometry
+from concent_warp.fit.fit_geometry import FitCfg, cut_segments, fit_geometry
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.fit.geometry.search import FitResult, Progress, Search, Survey
@@ -120,7 +120,9 @@ def test_the_fit_ends_when_nothing_gets_better(drop, swollen):
 
 
 def test_small_gains_add_up_before_the_fit_ends(drop, swollen):
-    search = Search(swollen, cut(swollen, [drop[0]], CFG), replace(CFG, plateau_generations=3, min_gain=0.05), "mujoco")
+    search = Search(
+        swollen, cut_segments(swollen, [drop[0]], CFG), replace(CFG, plateau_generations=3, min_gain=0.05), "mujoco"
+    )
 
     def seen(generation: int, loss: float, held_out: float) -> int:
         search.evolution.generation = generation

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.reality.sensors.camera import _edges, film
-from concent_warp.reality.sensors.sensing import SensingCfg, seen
+from concent_warp.reality.sensors.camera import _edges, record_depth_images
+from concent_warp.reality.sensors.sensing import SensingCfg, are_visible
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 
 SCENE = ShapeSorterCfg().build()
@@ -22,7 +22,7 @@ def scenes(shown):
     world = cfg.world.build(SCENE)
     held = int(truths[0].contacts["block", "left_finger"].argmax()) + 800
     qpos = truths[0].qpos[[0, held, -1]]
-    stream = film(SENSING, world, SCENE.objects(), np.arange(3) / 10, qpos, np.random.default_rng(0))
+    stream = record_depth_images(SENSING, world, SCENE.objects(), np.arange(3) / 10, qpos, np.random.default_rng(0))
     return world.compile(), qpos, stream
 
 
@@ -112,7 +112,9 @@ def test_pattern_is_fixed_to_the_body():
     address = model.joint("block_joint").qposadr[0]
     end[address : address + 3] += [0.03, -0.02, 0.01]
     end[address + 3 : address + 7] = [np.cos(0.1), 0, 0, np.sin(0.1)]
-    stream = film(sensing, world, SCENE.objects(), np.arange(2.0), np.array([start, end]), np.random.default_rng(0))
+    stream = record_depth_images(
+        sensing, world, SCENE.objects(), np.arange(2.0), np.array([start, end]), np.random.default_rng(0)
+    )
     u, v = np.meshgrid(np.linspace(-0.016, 0.016, 40), np.linspace(-0.016, 0.016, 40))
     top = np.stack([u.ravel(), v.ravel(), np.full(u.size, 0.02)], axis=1)
     sampled = []
@@ -131,7 +133,7 @@ def test_pattern_is_fixed_to_the_body():
 def test_filming_leaves_the_world_as_it_is():
     world = SCENE.spec()
     before = world.to_xml()
-    film(SENSING, world, SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0))
+    record_depth_images(SENSING, world, SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0))
     assert world.to_xml() == before
 
 
@@ -141,8 +143,12 @@ def test_worlds_that_only_c_mujoco_can_move_are_filmed_all_the_same():
     for actuator in world.actuators:
         actuator.delay, actuator.nsample = 0.01, 4
     world.compile()
-    stream = film(SENSING, world, SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0))
-    plain = film(SENSING, SCENE.spec(), SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0))
+    stream = record_depth_images(
+        SENSING, world, SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0)
+    )
+    plain = record_depth_images(
+        SENSING, SCENE.spec(), SCENE.objects(), np.zeros(1), home(SCENE.model)[None], np.random.default_rng(0)
+    )
     np.testing.assert_array_equal(stream.depth, plain.depth)
     assert stream.depth.max() > 0.5
 
@@ -157,14 +163,14 @@ def test_points_outside_the_image_are_not_seen():
     corners = np.array([[0.0, height - 1], [width - 1, height - 1], [width / 2, height / 2]])
     _, depth = cast(model, data.qpos, camera, height, width)
     inside = camera.lift(corners, np.array([depth[-1, 0], depth[-1, -1], depth[height // 2, width // 2]]))
-    np.testing.assert_array_equal(seen(SENSING, model, data, inside, SENSING.visibility_slack), True)
+    np.testing.assert_array_equal(are_visible(SENSING, model, data, inside, SENSING.visibility_slack), True)
     pixels = np.array([[width + 2.0, 60], [80, height + 2.0], [-3, 60], [80, 60]])
     outside = camera.lift(pixels, np.array([0.5, 0.5, 0.5, -0.5]))
-    np.testing.assert_array_equal(seen(SENSING, model, data, outside, SENSING.visibility_slack), False)
+    np.testing.assert_array_equal(are_visible(SENSING, model, data, outside, SENSING.visibility_slack), False)
     # Nearer and in view, a point in the air is seen; under the table it is not.
     between = camera.lift(corners[2:], np.array([0.5]))
-    assert seen(SENSING, model, data, between, SENSING.visibility_slack)[0]
-    assert not seen(SENSING, model, data, np.array([[0.48, -0.02, -0.1]]), SENSING.visibility_slack)[0]
+    assert are_visible(SENSING, model, data, between, SENSING.visibility_slack)[0]
+    assert not are_visible(SENSING, model, data, np.array([[0.48, -0.02, -0.1]]), SENSING.visibility_slack)[0]
 
 
 def test_camera_looks_at_its_target_upright():

@@ -7,7 +7,7 @@ import pytest
 from concent_warp.errors import RecordingError
 from concent_warp.perception.point_tracking import _chosen_stream
 from concent_warp.reality.record import RealityCfg
-from concent_warp.reality.sensors.footage import FootageCfg, developed, footage
+from concent_warp.reality.sensors.footage import FootageCfg, apply_tone_curve, footage
 from concent_warp.recording.formats.hdf5 import read_hdf5, write_hdf5
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.scene.cameras import add_cameras
@@ -79,6 +79,6 @@ def test_camera_on_a_body_is_kept_in_the_file_and_no_points_are_tracked_from_it(
 
 
 def test_tone_curve_keeps_black_and_order():
-    levels = developed(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1), FootageCfg())
+    levels = apply_tone_curve(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1), FootageCfg())
     assert np.allclose(levels[0], 0)
     assert (np.diff(levels, axis=0) >= 0).all()

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.reality.hidden.drives import Late, Sluggish
+from concent_warp.reality.hidden.drives import CommandDelay, CommandLag
 from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig, drives
 from concent_warp.reality.hidden.registry import EVERY, INSIDE, hidden
 from concent_warp.reality.hidden.sizes import MAGNITUDES
@@ -88,7 +88,7 @@ def test_drive_does_not_exceed_its_hidden_limit():
 
 
 def test_delayed_commands_arrive_later_by_the_delay_and_begin_anew_with_each_trial():
-    late = Late(0.01)
+    late = CommandDelay(0.01)
     for _ in range(2):
         acting = np.array([late(k * 1e-3, np.array([float(k)]))[0] for k in range(30)])
         np.testing.assert_allclose(acting[10:], np.arange(20), atol=1e-12)
@@ -96,13 +96,13 @@ def test_delayed_commands_arrive_later_by_the_delay_and_begin_anew_with_each_tri
 
 
 def test_late_command_acts_for_the_rest_of_the_step_in_which_its_delay_ends():
-    late = Late(2.25e-3)
+    late = CommandDelay(2.25e-3)
     acting = [late(k * 1e-3, np.full(1, float(k >= 5)))[0] for k in range(12)]
     np.testing.assert_allclose(acting, [0] * 7 + [0.75] + [1] * 4, atol=1e-9)
 
 
 def test_lagging_set_point_covers_63_percent_in_a_time_constant():
-    lag = Sluggish(0.05)
+    lag = CommandLag(0.05)
     lag(-1e-3, np.zeros(1))
     path = np.array([lag(k * 1e-3, np.ones(1))[0] for k in range(100)])
     assert path[49] == pytest.approx(1 - np.exp(-0.0495 / 0.05), abs=1e-5)

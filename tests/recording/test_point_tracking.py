@@ -10,7 +10,7 @@ from concent_warp.errors import RecordingError
 from concent_warp.perception.point_tracking import TrackingCfg, track_points
 from concent_warp.perception.rigid_motion import inverse, transformed
 from concent_warp.reality.record import RealityCfg, record
-from concent_warp.reality.sensors.camera import film
+from concent_warp.reality.sensors.camera import record_depth_images
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
@@ -29,7 +29,7 @@ def carried() -> tuple[Recording, np.ndarray]:
     time = np.arange(0, STOP - START + 1e-9, 1 / RATE)
     qpos = truths[0].qpos[np.round((START + time) / cfg.world.timestep).astype(int)]
     scene = Scene(recording.scene)
-    stream = film(sensing, cfg.world.build(scene), scene.objects(), time, qpos, np.random.default_rng(0))
+    stream = record_depth_images(sensing, cfg.world.build(scene), scene.objects(), time, qpos, np.random.default_rng(0))
     return Recording(recording.scene, (Demonstration("demo_0", qpos=qpos[0], image={"camera": stream}),)), qpos
 
 

@@ -14,7 +14,7 @@ from concent_warp.errors import RenderError
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
-from concent_warp.render.dataset.statistics import ImageHistogram, merged, of_values
+from concent_warp.render.dataset.statistics import ImageHistogram, merged_statistics, statistics_of_values
 from concent_warp.render.dataset.video import VideoWriter
 
 
@@ -195,7 +195,10 @@ def test_frame_that_does_not_fit_is_refused(tmp_path):
 def test_statistics_of_parts_make_those_of_the_whole():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(50, 3))
-    whole, parts = of_values(values), merged([of_values(values[:20]), of_values(values[20:])])
+    whole, parts = (
+        statistics_of_values(values),
+        merged_statistics([statistics_of_values(values[:20]), statistics_of_values(values[20:])]),
+    )
     for name in ("min", "max", "mean", "std", "count"):
         assert np.allclose(whole[name], parts[name]), name
     images = rng.integers(0, 256, (5, 16, 16, 3), dtype=np.uint8)

@@ -17,7 +17,7 @@ from concent_warp.render.networks.flow import flow_loss, sample_images
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.painter import Painter
 from concent_warp.render.networks.pairs import ImagePairs, _columns, _frames_before
-from concent_warp.render.networks.super_resolution import SuperResolution, _enlarged, reduced
+from concent_warp.render.networks.super_resolution import SuperResolution, _enlarged, downsampled
 from concent_warp.render.networks.train import RenderTraining
 
 SMALL = FlowNetworkCfg(size=16, width=8, factors=(1, 2))
@@ -95,7 +95,7 @@ def test_super_resolution_starts_as_bicubic_and_enlarges_four_times():
     assert network(small).shape == (2, 3, 40, 48)
     assert torch.allclose(network(small), _enlarged(small))
     flat = torch.full((1, 3, 32, 32), 0.3)
-    assert torch.allclose(reduced(flat, 8), torch.full((1, 3, 8, 8), 0.3))
+    assert torch.allclose(downsampled(flat, 8), torch.full((1, 3, 8, 8), 0.3))
 
 
 def test_training_that_goes_on_comes_to_the_same_weights(tmp_path):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from concent_warp.errors import RenderError
-from concent_warp.render.shadows import ShadowCfg, Shadows, shaded
+from concent_warp.render.shadows import ShadowCfg, Shadows, with_shadow
 from concent_warp.render.splats.rasterise import intrinsics_of
 from concent_warp.render.splats.splats import Splats
 
@@ -111,7 +111,7 @@ def test_soft_shadows_keep_their_sum_and_lose_their_edge():
 
 def test_shaded_image_loses_the_share_that_the_shadow_takes():
     shadow = torch.tensor([[0.0, 0.5]])
-    torch.testing.assert_close(shaded(torch.ones(1, 2, 3), shadow), torch.tensor([[[1.0] * 3, [0.5] * 3]]))
+    torch.testing.assert_close(with_shadow(torch.ones(1, 2, 3), shadow), torch.tensor([[[1.0] * 3, [0.5] * 3]]))
 
 
 def test_lights_that_cannot_be_are_refused():

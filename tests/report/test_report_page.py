@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.comparison.compare import compare_replays
-from concent_warp.comparison.units import shown
+from concent_warp.comparison.units import value_text
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.report.headline import _overlap_note
@@ -80,10 +80,10 @@ def test_the_cards_show_the_errors_of_fitted_and_unseen_demonstrations(case, tex
     assert channel == "block_position"
     for chosen in (("demo_0",), ("demo_1",)):
         for model in ("before", "after"):
-            assert f">{shown(c.summarise(model, channel, phases, chosen).mean, 'm')}</span>" in text
+            assert f">{value_text(c.summarise(model, channel, phases, chosen).mean, 'm')}</span>" in text
     assert "0.41" in text
     assert "0.93" in text
-    assert shown(c.summarise("no contact", channel, phases).mean, "m") in text
+    assert value_text(c.summarise("no contact", channel, phases).mean, "m") in text
 
 
 def test_lines_carry_the_errors_of_every_channel_and_model(case, data):

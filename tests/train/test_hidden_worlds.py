@@ -8,7 +8,7 @@ import torch
 
 from concent_warp.cli import main
 from concent_warp.errors import ConcentError
-from concent_warp.reality.hidden.in_task import APPLICABLE, TaskWorld, pads, wanted
+from concent_warp.reality.hidden.in_task import APPLICABLE, TaskWorld, pad_geoms, parse_effects
 from concent_warp.reality.rigs.grasp import SCENE
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
@@ -43,7 +43,7 @@ MAGNITUDES = {
 
 
 def world(*given: str) -> TaskWorld:
-    return TaskWorld(SCENE, WorldCfg(), "block", ("gripper",), wanted(given))
+    return TaskWorld(SCENE, WorldCfg(), "block", ("gripper",), parse_effects(given))
 
 
 def moved(given: Sequence[str], worlds: int = 1) -> np.ndarray:
@@ -96,16 +96,16 @@ def test_several_effects_act_together():
 
 def test_what_cannot_be_hidden_is_refused_with_what_can():
     with pytest.raises(ConcentError, match=r"'joint_frction'.*joint_friction, stribeck_friction"):
-        wanted(["joint_frction=1"])
+        parse_effects(["joint_frction=1"])
     with pytest.raises(ConcentError, match="name=value"):
-        wanted(["mass"])
+        parse_effects(["mass"])
     with pytest.raises(ConcentError, match="twice"):
-        wanted(["mass=1.1", "mass=1.2"])
+        parse_effects(["mass=1.1", "mass=1.2"])
     with pytest.raises(ConcentError, match=r"cannot be built.*mass=-1"):
         world("mass=-1").compile()
     nameless = Scene(SCENE.xml.replace('name="left_pad"', "").replace('name="right_pad"', ""))
     with pytest.raises(ConcentError, match="no geom of the fingers"):
-        TaskWorld(nameless, WorldCfg(), "block", ("gripper",), wanted(["pad_friction=0.5"]))
+        TaskWorld(nameless, WorldCfg(), "block", ("gripper",), parse_effects(["pad_friction=0.5"]))
 
 
 def test_unknown_effects_are_refused_before_anything_runs(capsys):
@@ -116,5 +116,5 @@ def test_unknown_effects_are_refused_before_anything_runs(capsys):
 
 
 def test_pads_are_the_geoms_of_all_fingers():
-    assert pads(SCENE.model, ["gripper"]) == ("left_pad", "right_pad")
-    assert pads(SCENE.model, ["nothing"]) == ()
+    assert pad_geoms(SCENE.model, ["gripper"]) == ("left_pad", "right_pad")
+    assert pad_geoms(SCENE.model, ["nothing"]) == ()

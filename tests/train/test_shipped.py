@@ -14,7 +14,7 @@ from concent_warp.errors import TrainError
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.learning.ppo import CHECKPOINT
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, names, pretrained_checkpoint
+from concent_warp.train.policy.pretrained import FOLDER, ORIGIN, pretrained_checkpoint, pretrained_names
 from concent_warp.train.policy.write_pretrained import write_pretrained
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -63,8 +63,8 @@ def test_scaled_policy_takes_smaller_the_steps_and_leads_of_the_commands(capsys)
 
 
 def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_small():
-    assert set(names()) == {"shape_sorter", "pick_align_insert"}
-    for name in names():
+    assert set(pretrained_names()) == {"shape_sorter", "pick_align_insert"}
+    for name in pretrained_names():
         origin = tomllib.loads((FOLDER / name / ORIGIN).read_text())
         assert origin["command"].startswith(("concent train ", "torchrun "))
         assert "/" not in origin["command"]

@@ -256,7 +256,7 @@ class WarpPhysics:
         """
         import mujoco_warp as mjw
 
-        from concent_warp.simulate.warp_engine import largest
+        from concent_warp.simulate.warp_engine import largest_by_magnitude
         from concent_warp.simulate.warp_model import WorldModel, check_drag
 
         self.model, self.worlds = model, worlds
@@ -270,7 +270,7 @@ class WarpPhysics:
             varied[name] = np.tile(value, (worlds, *[1] * value.ndim))
         check_drag(model, varied)
         # A field that a force model edits can be zero at times, which must not disable it.
-        typical = {name: largest(values) + (name in edited) for name, values in varied.items()}
+        typical = {name: largest_by_magnitude(values) + (name in edited) for name, values in varied.items()}
         with wp.ScopedDevice(self._warp_device):
             made = WorldModel(model, np.zeros(0, dtype=int), worlds, (), typical)
             made.load({}, varied)

@@ -384,8 +384,8 @@ def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, process: Distribute
     settings = {
         "num_steps_per_env": cfg.steps,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": network(cfg, actor=True),
-        "critic": network(cfg, actor=False),
+        "actor": network_settings(cfg, actor=True),
+        "critic": network_settings(cfg, actor=False),
         "multi_gpu": process.rsl_rl(),
         "algorithm": {
             "class_name": "PPO",
@@ -414,7 +414,7 @@ def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, process: Distribute
     return algorithm
 
 
-def network(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
+def network_settings(cfg: PpoCfg, *, actor: bool) -> dict[str, Any]:
     """Return rsl-rl's settings of the policy, or of the value function."""
     settings: dict[str, Any] = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
     settings["obs_normalization"] = cfg.normalise

@@ -25,7 +25,7 @@ from concent_warp.kernels.contact_pairs import DIRECTION, DISPLACEMENT, MASK, NO
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.learning.normalisation import bound_observations
-from concent_warp.train.learning.ppo import network
+from concent_warp.train.learning.ppo import network_settings
 from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
 
@@ -62,7 +62,7 @@ def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str,
 def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapping[str, Any]) -> nn.Module:
     """Return the policy as a module from observations (N, O), as the environment gives them, to actions (N, A)."""
     example = TensorDict({"policy": torch.zeros(1, observations)}, batch_size=[1])
-    settings = network(cfg.ppo, actor=True)
+    settings = network_settings(cfg.ppo, actor=True)
     del settings["class_name"]
     actor = MLPModel(example, {"actor": ["policy"]}, "actor", actions, **settings)
     bound_observations(actor, cfg.ppo.max_observation)

@@ -12,7 +12,7 @@ from concent_warp.run_folder import check_training
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
 from concent_warp.train.policy.episodes import PolicyFunction
-from concent_warp.train.policy.pretrained import FOLDER, names, pretrained_checkpoint
+from concent_warp.train.policy.pretrained import FOLDER, pretrained_checkpoint, pretrained_names
 from concent_warp.train.run import TrainingRun
 
 
@@ -46,8 +46,8 @@ class Policy:
         """
         path = Path(source)
         if isinstance(source, str) and not path.exists() and path.name == source:
-            if source not in names():
-                expected = f"a run folder, a checkpoint file, or one of {names()}"
+            if source not in pretrained_names():
+                expected = f"a run folder, a checkpoint file, or one of {pretrained_names()}"
                 raise TrainError("no such policy", expected=expected, found=source)
             path = pretrained_checkpoint(source)
         check_training(path)

@@ -12,7 +12,7 @@ ORIGIN = "origin.toml"
 """File with command and versions of the training; it marks the folder of a pretrained policy."""
 
 
-def names() -> list[str]:
+def pretrained_names() -> list[str]:
     """Return the names of the pretrained policies."""
     return sorted(path.parent.name for path in FOLDER.glob(f"*/{ORIGIN}"))
 
@@ -23,6 +23,6 @@ def pretrained_checkpoint(name: str) -> Path:
     Raises:
         TrainError: The name is unknown.
     """
-    if name not in names():
-        raise TrainError("no such policy comes with the package", expected=f"one of {names()}", found=name)
+    if name not in pretrained_names():
+        raise TrainError("no such policy comes with the package", expected=f"one of {pretrained_names()}", found=name)
     return FOLDER / name / TRAIN_CHECKPOINT

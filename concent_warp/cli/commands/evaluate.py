@@ -12,8 +12,8 @@ import tyro
 from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
-from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check
-from concent_warp.reality.hidden.in_task import wanted
+from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check_evaluation
+from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.run_folder import check_folder
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     """Evaluate and print."""
     cfg = arguments.cfg
     worlds: tuple[WorldName, ...] = ("simulation", "reality") if arguments.world == "both" else (arguments.world,)
-    check(cfg, worlds[-1], arguments.episodes)
+    check_evaluation(cfg, worlds[-1], arguments.episodes)
     if arguments.out is not None:
         check_folder(arguments.out)
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
@@ -78,7 +78,11 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
                 say_written(*found[world].videos)
     if arguments.json:
         named = str(arguments.checkpoint) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
-        document: dict[str, Any] = {"checkpoint": named, "seed": arguments.seed, "hidden": dict(wanted(cfg.hide))}
+        document: dict[str, Any] = {
+            "checkpoint": named,
+            "seed": arguments.seed,
+            "hidden": dict(parse_effects(cfg.hide)),
+        }
         document |= {"action_scale": cfg.action_scale, "setpoint_lead_scale": cfg.setpoint_lead_scale}
         document["worlds"] = {name: evaluation.to_json() for name, evaluation in found.items()}
         print(json.dumps(document, indent=1, allow_nan=False))

@@ -39,7 +39,7 @@ class Arguments:
 def run(arguments: Arguments) -> list[str]:
     """Serve until the last episode or an interruption, and return the outcomes."""
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
-    from concent_warp.deploy.play import counted, play
+    from concent_warp.deploy.play import outcome_counts_text, play
 
     ended = play(
         policy,
@@ -50,5 +50,5 @@ def run(arguments: Arguments) -> list[str]:
         device=arguments.device,
         serving=lambda address: say(f"{address} shows it; Ctrl-C ends it"),
     )
-    say(f"\n{counted(ended)}")
+    say(f"\n{outcome_counts_text(ended)}")
     return ended

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from concent_warp.comparison.units import words
+from concent_warp.comparison.units import channel_text
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, heavier, slope_turned
-from concent_warp.effects.select import driven_joints, gripper_actuators, last_links, servo_gain
+from concent_warp.effects.select import driven_joints, gripper_actuators, outermost_links, servo_gain
 from concent_warp.recording.recording import Channel
 
 
@@ -87,7 +87,7 @@ def drive_motions(recorded: RecordedRange, tilted: bool) -> Iterator[ProposedMot
     for link in _payload_links(recorded, drives):
         for motion in made:
             if motion.name != "steps":
-                text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {words(link)}, {motion.text}"
+                text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(link)}, {motion.text}"
                 change = heavier(link, recorded.cfg)
                 yield replace(motion, name=f"{motion.name} with payload", text=text, change=change)
 
@@ -96,7 +96,9 @@ def _payload_links(recorded: RecordedRange, drives: Drives) -> list[str]:
     """Return the names of the last links that the drives carry and that can carry a payload."""
     m = recorded.m
     moved = {int(m.jnt_bodyid[j]) for a in drives.ids for j in driven_joints(m, a)}
-    return [m.body(b).name for b in last_links(m) if m.body(b).name and m.body_mass[b] > 0 and _above(m, b) & moved]
+    return [
+        m.body(b).name for b in outermost_links(m) if m.body(b).name and m.body_mass[b] > 0 and _above(m, b) & moved
+    ]
 
 
 def _above(m: mujoco.MjModel, body: int) -> set[int]:
@@ -111,7 +113,7 @@ def _above(m: mujoco.MjModel, body: int) -> set[int]:
 def _trajectories(recorded: RecordedRange, drives: Drives) -> Iterator[ProposedMotion]:
     """Yield motions of all drives together, each in its own range, with objects out of the way."""
     m, cfg = recorded.m, recorded.cfg
-    who = words(m.actuator(drives.ids[0]).name) if len(drives.ids) == 1 else "all drives together"
+    who = channel_text(m.actuator(drives.ids[0]).name) if len(drives.ids) == 1 else "all drives together"
     linear = all(m.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in drives.ids for j in driven_joints(m, a))
     unit = "m" if linear else "rad"
     middle = -1.0 + 2.0 * float(np.mean((drives.middle - drives.low) / (2 * drives.half)))
@@ -161,7 +163,7 @@ def _trajectories(recorded: RecordedRange, drives: Drives) -> Iterator[ProposedM
 
 def _cleared_text(recorded: RecordedRange) -> str:
     """Return which objects are out of the way, in words."""
-    names = [words(recorded.m.body(b).name) for b in recorded.bodies]
+    names = [channel_text(recorded.m.body(b).name) for b in recorded.bodies]
     return f", with {' and '.join(names)} out of the way" if names else ""
 
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.comparison.units import words
+from concent_warp.comparison.units import channel_text
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange, heavier, slope_turned
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
@@ -101,7 +101,7 @@ def body_motions(recorded: RecordedRange, engine: EngineName, tilted: bool) -> I
         yield from _turned_starts(obj)
         first = moves[:1]
         for motion in first:
-            text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {words(obj.name)}, {motion.text}"
+            text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(obj.name)}, {motion.text}"
             yield replace(motion, name=f"{motion.name}, heavier", text=text, change=heavier(obj.name, recorded.cfg))
             if tilted:
                 text = f"turn the table by 180 deg, so that its slope runs the other way, and {motion.text}"
@@ -110,7 +110,7 @@ def body_motions(recorded: RecordedRange, engine: EngineName, tilted: bool) -> I
 
 def _surface_motions(obj: ThrowableBody) -> Iterator[ProposedMotion]:
     """Yield slides, spins, rolls and drops where the body rests on something."""
-    rest, what, v, cfg = obj.rest, words(obj.name), obj.speed, obj.recorded.cfg
+    rest, what, v, cfg = obj.rest, channel_text(obj.name), obj.speed, obj.recorded.cfg
     if rest is None:
         return
     still = np.zeros(3)
@@ -158,7 +158,7 @@ def _flights(obj: ThrowableBody) -> Iterator[ProposedMotion]:
     velocity = qvel[obj.dof : obj.dof + 3]
     level = velocity * np.array([1.0, 1.0, 0.0])
     spin = Rotation.from_quat(qpos[obj.at + 3 : obj.at + 7], scalar_first=True).apply(qvel[obj.dof + 3 : obj.dof + 6])
-    what, fast = words(obj.name), float(np.linalg.norm(level))
+    what, fast = channel_text(obj.name), float(np.linalg.norm(level))
     duration = obj.recorded.longest.duration
     ways = (
         (f"throw {what} as before but at {cfg.faster * fast:.2g} m/s", cfg.faster * level, spin),
@@ -184,9 +184,9 @@ def _turned_starts(obj: ThrowableBody) -> Iterator[ProposedMotion]:
     qpos, qvel = recorded.starts[recorded.recording.demonstrations.index(d)]
     for degrees in (90, 180):
         turned = obj.pose(qpos, np.zeros(3), np.radians(degrees) * UP)
-        text = f"turn {words(obj.name)} by {degrees} deg and repeat the same commands"
+        text = f"turn {channel_text(obj.name)} by {degrees} deg and repeat the same commands"
         yield ProposedMotion("repeat with the turned object", text, d.duration, turned, qvel, d.action)
-    text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {words(obj.name)}, repeat the same commands"
+    text = f"with {100 * recorded.cfg.extra_mass:.0f} % more mass on {channel_text(obj.name)}, repeat the same commands"
     yield ProposedMotion(
         "repeat, heavier", text, d.duration, qpos, qvel, d.action, change=heavier(obj.name, recorded.cfg)
     )

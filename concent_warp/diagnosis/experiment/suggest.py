@@ -16,7 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from concent_warp.comparison.units import times, words
+from concent_warp.comparison.units import channel_text, ratio_text
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
@@ -251,12 +251,12 @@ def _experiment(
     first = next(iter(models))
     best = max(found, key=lambda pair: found[pair][0])
     pairs = sorted((pair for pair in found if first in pair), key=lambda pair: -found[pair][0])
-    differ = [f"{a} and {b} then differ by {times(found[a, b][0])} noise" for a, b in pairs[:1]]
-    differ += [f"{a} and {b} by {times(found[a, b][0])}" for a, b in pairs[1:]]
+    differ = [f"{a} and {b} then differ by {ratio_text(found[a, b][0])} noise" for a, b in pairs[:1]]
+    differ += [f"{a} and {b} by {ratio_text(found[a, b][0])}" for a, b in pairs[1:]]
     separation, channel = found[best]
     return SuggestedExperiment(
         name=motion.name,
-        sentence=f"{motion.text}: {', '.join(differ)} ({words(found[pairs[0]][1])}).",
+        sentence=f"{motion.text}: {', '.join(differ)} ({channel_text(found[pairs[0]][1])}).",
         separation=separation,
         pair=best,
         channel=channel,

@@ -24,7 +24,7 @@ from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandida
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null, null_p_value
 from concent_warp.diagnosis.search.screening import screen, with_residuals
 from concent_warp.effects.effect import Effect
-from concent_warp.effects.select import SINGLE, dof_of, free_bodies, name, typical_torque
+from concent_warp.effects.select import SINGLE, dof_of, element_name, free_bodies, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
 from concent_warp.fit.effects.cross_validation import sign_flip_p
 from concent_warp.simulate.engine import Variants
@@ -191,7 +191,7 @@ def _body_forces(
         high = float(np.percentile(values, 100 - cfg.percentile))
         if high > 1e-3:
             basis.append((words, way, np.linspace(0, high, count)[:, None], high / (count - 1), scale))
-    label = name(m, mujoco.mjtObj.mjOBJ_BODY, body) or f"body {body}"
+    label = element_name(m, mujoco.mjtObj.mjOBJ_BODY, body) or f"body {body}"
     return [
         UnknownForce(f"{words} of {label}", UnknownBodyForce(body, place, dof, c, w, s, way, cfg.fade_speed))
         for words, way, c, w, s in basis
@@ -234,5 +234,5 @@ def _visited(base: FittedModel, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarr
 
 def _listed(m: mujoco.MjModel, joints: np.ndarray) -> str:
     """Return the names of joints in words."""
-    names = [name(m, mujoco.mjtObj.mjOBJ_JOINT, int(j)) or f"joint {int(j)}" for j in joints]
+    names = [element_name(m, mujoco.mjtObj.mjOBJ_JOINT, int(j)) or f"joint {int(j)}" for j in joints]
     return names[0] if len(names) == 1 else f"each of {len(names)} joints"

@@ -13,11 +13,11 @@ from concent_warp.effects.library.contact_forces import AdhesionForce, Anisotrop
 from concent_warp.effects.library.drives import GRIP_FACTORS
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
+    element_name,
     fingers,
     free_bodies,
     free_body_targets,
     geoms_of,
-    name,
     surfaces,
 )
 
@@ -245,7 +245,7 @@ class PadFriction(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the fingers that collide."""
-        found = tuple(n for b in fingers(m) if _collides(m, b) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        found = tuple(n for b in fingers(m) if _collides(m, b) and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:

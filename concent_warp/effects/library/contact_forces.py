@@ -87,7 +87,7 @@ class AnisotropicForce(ForceModel):
 
         if self._device is None:
             self._device = (wp.array(self.moving, dtype=bool), wp.array(self.still, dtype=bool))
-        force_models.anisotropic(m, d, *self._device, values, FADE_SPEED)
+        force_models.add_anisotropic_friction(m, d, *self._device, values, FADE_SPEED)
 
 
 class AdhesionForce(ForceModel):
@@ -199,7 +199,7 @@ class AdhesionForce(ForceModel):
                 wp.array(self.round, dtype=bool),
                 wp.array(self.still, dtype=int),
             )
-        force_models.pull(m, d, *self._device, values, self.gap)
+        force_models.add_adhesion(m, d, *self._device, values, self.gap)
 
 
 def _outermost(m: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -15,8 +15,8 @@ from concent_warp.effects.select import (
     arm_actuators,
     dof_of,
     driven_joints,
+    element_name,
     gripper_actuators,
-    name,
     robot_bodies,
     servo_gain,
 )
@@ -104,7 +104,7 @@ class GripForce(ActuatorGain):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the actuators of the fingers."""
-        found = tuple(n for a in gripper_actuators(m) if (n := name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a)))
+        found = tuple(n for a in gripper_actuators(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_ACTUATOR, a)))
         return (found,) if found else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
@@ -333,7 +333,9 @@ class GravityCompensation(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return the links of the robot."""
-        found = tuple(n for b in robot_bodies(m) if m.body_mass[b] > 0 and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        found = tuple(
+            n for b in robot_bodies(m) if m.body_mass[b] > 0 and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b))
+        )
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import warp as wp
 
 
-class DofLaw(ForceModel):
+class DofForce(ForceModel):
     """A force model that acts on some degrees of freedom."""
 
     def __init__(self, dof: np.ndarray) -> None:
@@ -33,7 +33,7 @@ class DofLaw(ForceModel):
         return self._device
 
 
-class StribeckFriction(DofLaw):
+class StribeckFriction(DofForce):
     """Friction loss + extra exp(-(qd / speed)^2); parameters are the extras, shape (n,), then the speed.
 
     qd is the velocity in the middle of the step, after the acceleration of the step before: stick-slip feeds on lag.
@@ -62,10 +62,10 @@ class StribeckFriction(DofLaw):
         """See `ForceModel.launch`."""
         from concent_warp.kernels import force_models
 
-        force_models.stribeck(m, d, self.device_dof(), values)
+        force_models.add_stribeck_friction(m, d, self.device_dof(), values)
 
 
-class LoadFriction(DofLaw):
+class LoadFriction(DofForce):
     """Friction loss + c |tau_m - tau_e| / 2, of the step before; parameters are the c, shape (n,).
 
     tau_m is what the motor exerts, tau_e what the link's weight and motion do; in a static hold they are opposite, and
@@ -93,4 +93,4 @@ class LoadFriction(DofLaw):
         """See `ForceModel.launch`."""
         from concent_warp.kernels import force_models
 
-        force_models.load(m, d, self.device_dof(), values)
+        force_models.add_load_friction(m, d, self.device_dof(), values)

@@ -67,7 +67,7 @@ class BacklashForce(ForceModel):
 
         if self._device is None:
             self._device = wp.array(self.actuators, dtype=int)
-        force_models.loose_gear(m, d, self._device, self.first, values)
+        force_models.apply_loose_gear(m, d, self._device, self.first, values)
 
 
 @dataclass(frozen=True)

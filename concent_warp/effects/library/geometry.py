@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.library.objects import BodyEffect, keep_inertia
-from concent_warp.effects.select import free_bodies, name
+from concent_warp.effects.select import element_name, free_bodies
 
 GEOM = mujoco.mjtGeom
 SPHERE = int(GEOM.mjGEOM_SPHERE)
@@ -46,7 +46,9 @@ class ContactGeometryOffset(BodyEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body with shapes that can be moved."""
-        return tuple((n,) for b in free_bodies(m) if len(_shapes(m, b)) and (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return tuple(
+            (n,) for b in free_bodies(m) if len(_shapes(m, b)) and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b))
+        )
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
         """Return whether a body has shapes that can be moved."""

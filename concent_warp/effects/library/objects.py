@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter
-from concent_warp.effects.select import free_bodies, last_links, name
+from concent_warp.effects.select import element_name, free_bodies, outermost_links
 
 
 class BodyEffect(Effect):
@@ -18,7 +18,11 @@ class BodyEffect(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body and each last link of an arm."""
-        found = [name(m, mujoco.mjtObj.mjOBJ_BODY, b) for b in (*free_bodies(m), *last_links(m)) if m.body_mass[b] > 0]
+        found = [
+            element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)
+            for b in (*free_bodies(m), *outermost_links(m))
+            if m.body_mass[b] > 0
+        ]
         return tuple((n,) for n in found if n)
 
 
@@ -110,7 +114,7 @@ class Size(BodyEffect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return each free body."""
-        return tuple((n,) for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        return tuple((n,) for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """One factor."""

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.joints import MUJOCO
-from concent_warp.effects.select import free_bodies, name
+from concent_warp.effects.select import element_name, free_bodies
 from concent_warp.scene.spheres.contact_geometry import GROUP as SPHERES
 
 AIR_DENSITY = 1.2
@@ -57,7 +57,7 @@ class AirEffect(Effect):
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
         """Return all free bodies together: there is one air."""
-        found = tuple(n for b in free_bodies(m) if (n := name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
+        found = tuple(n for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
         return (found,) if found else ()
 
     def prepare(self, spec: mujoco.MjSpec) -> None:

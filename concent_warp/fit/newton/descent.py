@@ -250,7 +250,7 @@ def chosen_iterates(state: Descent, each: int) -> np.ndarray:
     return np.array(result).reshape(-1, *state.now.shape[1:])
 
 
-def identity(cfg: GradientCfg, seed: int, base: np.ndarray, names: Sequence[str]) -> dict[str, Any]:
+def descent_identity(cfg: GradientCfg, seed: int, base: np.ndarray, names: Sequence[str]) -> dict[str, Any]:
     """Return what identifies the descent that a state file belongs to."""
     start = zlib.crc32(np.ascontiguousarray(base).tobytes())
     return {"cfg": asdict(cfg), "seed": seed, "start": start, "segments": list(names)}

@@ -21,7 +21,7 @@ from concent_warp.fit.newton.descent import (
     Metric,
     chosen_iterates,
     descend,
-    identity,
+    descent_identity,
     start_descent,
 )
 from concent_warp.fit.newton.horizon import gradient_segments
@@ -67,7 +67,7 @@ class GradientWarmStart:
             search.model, search.used, self.demonstrations, cfg.horizon,
             held_out=search.cfg.held_out, block=search.cfg.block,
         )  # fmt: skip
-        mine = identity(cfg, search.cfg.seed, self.base, [s.name for s in segments])
+        mine = descent_identity(cfg, search.cfg.seed, self.base, [s.name for s in segments])
         state = start_descent(self.starts(), self.first_step())
         if resume and file is not None and file.is_file():
             state = Descent.load(file, mine)

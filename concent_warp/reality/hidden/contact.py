@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.rigs.rig import Rig
-from concent_warp.reality.sliding_friction import Coefficients, frictionless, normal_forces, rub
+from concent_warp.reality.sliding_friction import Coefficients, apply_sliding_friction, frictionless, normal_forces
 from concent_warp.reality.world import HiddenEffect
 
 FADE_RATE = 0.05
@@ -21,35 +21,35 @@ def nominal_friction(rig: Rig) -> float:
     return float(rig.scene.model.geom(rig.surface).friction[0])
 
 
-def instead(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
+def with_friction(rig: Rig, name: str, coefficients: Coefficients) -> HiddenEffect:
     """Return the effect of other coefficients of sliding, which may depend on time and place.
 
     If Reality computes friction by its own formula, only the difference is added: friction is linear in the
     coefficients.
     """
     if rig.physics.force is None:
-        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in own_geoms(rig)))
+        geoms = (rig.surface, *(rig.scene.model.geom(g).name for g in body_geoms(rig)))
         edit = partial(frictionless, geoms=geoms)
-        return HiddenEffect(name, edit=edit, force=rub(coefficients, rig.body, rig.surface))
+        return HiddenEffect(name, edit=edit, force=apply_sliding_friction(coefficients, rig.body, rig.surface))
     mu = nominal_friction(rig)
-    return HiddenEffect(name, force=rub(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
+    return HiddenEffect(name, force=apply_sliding_friction(lambda t, p: coefficients(t, p) - mu, rig.body, rig.surface))
 
 
-def own_geoms(rig: Rig) -> np.ndarray:
+def body_geoms(rig: Rig) -> np.ndarray:
     """Return the geoms of the rig's body, ids of shape (n,)."""
     return np.flatnonzero(rig.scene.model.geom_bodyid == rig.scene.model.body(rig.body).id)
 
 
 def sliding_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Another coefficient [-]."""
-    effect = instead(rig, "sliding_friction", lambda _t, _p: np.array([magnitude, magnitude]))
+    effect = with_friction(rig, "sliding_friction", lambda _t, _p: np.array([magnitude, magnitude]))
     return HiddenEffectOfRig("sliding_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
 def anisotropic_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Friction along the surface's y is that along x times a ratio [-]."""
     mu = nominal_friction(rig) * np.array([1.0, magnitude])
-    effect = instead(rig, "anisotropic_friction", lambda _t, _p: mu)
+    effect = with_friction(rig, "anisotropic_friction", lambda _t, _p: mu)
     return HiddenEffectOfRig("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
 
 
@@ -105,7 +105,7 @@ def contact_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> HiddenEffectOfRig:
     """A force [N] that pulls each lower corner of a box to the surface while it is within a gap [m] of it."""
-    half = rig.scene.model.geom_size[own_geoms(rig)[0]]
+    half = rig.scene.model.geom_size[body_geoms(rig)[0]]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -7,12 +7,19 @@ from collections import deque
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, Drive, HiddenEffectOfRig, PerTrialState, drives, each
+from concent_warp.reality.hidden.hidden_effect import (
+    Builder,
+    Drive,
+    HiddenEffectOfRig,
+    PerTrialState,
+    drives,
+    true_values,
+)
 from concent_warp.reality.rigs.rig import Rig, perform
 from concent_warp.reality.world import HiddenEffect
 
 
-class Late(PerTrialState):
+class CommandDelay(PerTrialState):
     """Commands pass through a queue and act after a delay; over a step, the mean of what acts in it."""
 
     def __init__(self, delay: float) -> None:
@@ -35,7 +42,7 @@ class Late(PerTrialState):
         return np.diff(starts) @ np.stack([value for _, value in self.queue])
 
 
-class Sluggish(PerTrialState):
+class CommandLag(PerTrialState):
     """Set points follow the commands by dy/dt = (u - y) / time constant."""
 
     def __init__(self, time_constant: float) -> None:
@@ -54,7 +61,7 @@ class Sluggish(PerTrialState):
         return ctrl + self.time_constant * (before - self.y) / elapsed
 
 
-def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
+def arm_only(rig: Rig, hook: CommandDelay | CommandLag) -> HiddenEffect:
     """Return the effect of a hook on the commands of the arm; the gripper's pass."""
     columns = [rig.scene.model.actuator(d.actuator).id for d in drives(rig)]
 
@@ -68,13 +75,15 @@ def arm_only(rig: Rig, hook: Late | Sluggish) -> HiddenEffect:
 
 def actuator_delay(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Commands act later [s]."""
-    return HiddenEffectOfRig("actuator_delay", arm_only(rig, Late(magnitude)), {"delay": magnitude}, names(drives(rig)))
+    return HiddenEffectOfRig(
+        "actuator_delay", arm_only(rig, CommandDelay(magnitude)), {"delay": magnitude}, actuator_names(drives(rig))
+    )
 
 
 def actuator_lag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Set points follow with a time constant [s]."""
     return HiddenEffectOfRig(
-        "actuator_lag", arm_only(rig, Sluggish(magnitude)), {"time_constant": magnitude}, names(drives(rig))
+        "actuator_lag", arm_only(rig, CommandLag(magnitude)), {"time_constant": magnitude}, actuator_names(drives(rig))
     )
 
 
@@ -90,8 +99,8 @@ def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
             # The armature that compensates the nominal time step is proportional to the damping.
             spec.joint(d.joint).armature += (magnitude - 1.0) * rig.physics.armature.get(d.joint, 0.0)
 
-    truth = each("gain", names(found), np.full(len(found), magnitude))
-    return HiddenEffectOfRig("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, names(found))
+    truth = true_values("gain", actuator_names(found), np.full(len(found), magnitude))
+    return HiddenEffectOfRig("actuator_gain", HiddenEffect("actuator_gain", edit=edit), truth, actuator_names(found))
 
 
 def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
@@ -112,10 +121,10 @@ def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
                 data.qfrc_applied[dof] += rig.physics.armature.get(d.joint, 0.0) * data.qacc[dof]
 
     effect = HiddenEffect("actuator_saturation", edit=edit, force=force)
-    return HiddenEffectOfRig("actuator_saturation", effect, {"limit": magnitude}, names(found))
+    return HiddenEffectOfRig("actuator_saturation", effect, {"limit": magnitude}, actuator_names(found))
 
 
-def strain(rig: Rig, demonstrations: int, seed: int) -> float:
+def peak_drive_force(rig: Rig, demonstrations: int, seed: int) -> float:
     """Return the force [N m or N] that the hardest-working drive exceeds for a hundredth of the time, nothing hidden.
 
     Motions and seeds differ in what they ask of a drive; a limit that shows on all of them goes with this.
@@ -151,10 +160,10 @@ def joint_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
     joints = tuple(d.joint for d in found)
     effect = HiddenEffect("joint_offset", command=command, measure=measure)
-    return HiddenEffectOfRig("joint_offset", effect, each("offset", joints, offset), joints)
+    return HiddenEffectOfRig("joint_offset", effect, true_values("offset", joints, offset), joints)
 
 
-def names(found: tuple[Drive, ...]) -> tuple[str, ...]:
+def actuator_names(found: tuple[Drive, ...]) -> tuple[str, ...]:
     """Return the actuators of drives."""
     return tuple(d.actuator for d in found)
 

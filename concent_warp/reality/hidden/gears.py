@@ -13,8 +13,15 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.drives import names
-from concent_warp.reality.hidden.hidden_effect import Builder, Drive, HiddenEffectOfRig, PerTrialState, drives, each
+from concent_warp.reality.hidden.drives import actuator_names
+from concent_warp.reality.hidden.hidden_effect import (
+    Builder,
+    Drive,
+    HiddenEffectOfRig,
+    PerTrialState,
+    drives,
+    true_values,
+)
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -53,7 +60,7 @@ class Rotor(PerTrialState):
         raise NotImplementedError
 
 
-class Sprung(Rotor):
+class ElasticRotor(Rotor):
     """A rotor behind a spring; the servo takes the speed from the link, so that the rotor follows at once."""
 
     def __init__(self, drive: Drive, column: int, compliance: float) -> None:
@@ -69,7 +76,7 @@ class Sprung(Rotor):
         return self.stiffness * self.after
 
 
-class Loose(Rotor):
+class BacklashRotor(Rotor):
     """A rotor with play."""
 
     def __init__(self, drive: Drive, column: int, play: float) -> None:
@@ -91,7 +98,7 @@ class Loose(Rotor):
         return through
 
 
-def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
+def with_rotors(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor: bool) -> HiddenEffect:
     """Return the effect of rotors in all drives; encoders read the rotor or the link."""
     m = rig.scene.model
     found = drives(rig)
@@ -126,17 +133,19 @@ def geared(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_rotor
 
 def backlash(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
-    effect = geared(rig, "backlash", lambda d, i: Loose(d, i, magnitude), on_rotor=False)
-    return HiddenEffectOfRig("backlash", effect, {"play": magnitude}, names(drives(rig)))
+    effect = with_rotors(rig, "backlash", lambda d, i: BacklashRotor(d, i, magnitude), on_rotor=False)
+    return HiddenEffectOfRig("backlash", effect, {"play": magnitude}, actuator_names(drives(rig)))
 
 
 def joint_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
     found = drives(rig)
     compliance = {d.actuator: magnitude / d.weight for d in found}
-    effect = geared(rig, "joint_compliance", lambda d, i: Sprung(d, i, compliance[d.actuator]), on_rotor=True)
-    truth = each("compliance", names(found), np.array(list(compliance.values())))
-    return HiddenEffectOfRig("joint_compliance", effect, truth, names(found))
+    effect = with_rotors(
+        rig, "joint_compliance", lambda d, i: ElasticRotor(d, i, compliance[d.actuator]), on_rotor=True
+    )
+    truth = true_values("compliance", actuator_names(found), np.array(list(compliance.values())))
+    return HiddenEffectOfRig("joint_compliance", effect, truth, actuator_names(found))
 
 
 GEARS: dict[str, Builder] = {f.__name__: f for f in (backlash, joint_compliance)}

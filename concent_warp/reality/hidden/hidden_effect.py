@@ -81,7 +81,7 @@ class PerTrialState:
         return elapsed
 
 
-def each(name: str, owners: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
+def true_values(name: str, owners: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
     """Return true values of a parameter of each owner."""
     return {f"{name}[{owner}]": float(value) for owner, value in zip(owners, values, strict=True)}
 

@@ -44,12 +44,12 @@ class TaskWorld:
     """The manipulated object, on which effects on a body act."""
     grippers: tuple[str, ...] = ()
     """Actuators that grasp it."""
-    wanted: tuple[tuple[str, float], ...] = ()
+    magnitudes: tuple[tuple[str, float], ...] = ()
     """Names of the hidden effects with their magnitudes, in the unit of their main parameter."""
 
     def __post_init__(self) -> None:
-        names = [name for name, _ in self.wanted]
-        if "pad_friction" in names and not pads(self.scene.model, self.grippers):
+        names = [name for name, _ in self.magnitudes]
+        if "pad_friction" in names and not pad_geoms(self.scene.model, self.grippers):
             raise ConcentError(
                 "pad_friction cannot be hidden: no geom of the fingers has a name", where=self.scene.source
             )
@@ -60,17 +60,17 @@ class TaskWorld:
         return Rig(
             "task",
             self.scene,
-            unplanned,
+            no_plan,
             WorldPhysics(timestep=self.physics.timestep),
             body=self.body,
-            grippers=tuple(name for name in self.grippers if name in actuators(m)),
-            pads=pads(m, self.grippers),
+            grippers=tuple(name for name in self.grippers if name in actuator_names(m)),
+            pads=pad_geoms(m, self.grippers),
         )
 
     def hidden(self) -> tuple[HiddenEffectOfRig, ...]:
         """Return the effects, made anew: many have a state, so that each world needs its own."""
         rig = self.rig()
-        return tuple(hidden(name, magnitude, rig) for name, magnitude in self.wanted)
+        return tuple(hidden(name, magnitude, rig) for name, magnitude in self.magnitudes)
 
     def spec(self) -> mujoco.MjSpec:
         """Return the world with the effects in it."""
@@ -82,7 +82,7 @@ class TaskWorld:
             else:
                 rest.append(one.effect)
         scene = self.scene
-        if len(rest) < len(self.wanted):
+        if len(rest) < len(self.magnitudes):
             scene = Scene.from_spec(nominal, source=scene.source)
         return self.physics.build(scene, tuple(rest))
 
@@ -95,11 +95,13 @@ class TaskWorld:
         try:
             return self.spec().compile()
         except (ValueError, ZeroDivisionError, mujoco.FatalError) as error:
-            found = f"{', '.join(f'{name}={value:g}' for name, value in self.wanted)}: {' '.join(str(error).split())}"
+            found = (
+                f"{', '.join(f'{name}={value:g}' for name, value in self.magnitudes)}: {' '.join(str(error).split())}"
+            )
             raise ConcentError("Reality cannot be built with these hidden effects", found=found) from None
 
 
-def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
+def parse_effects(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
     """Return names and magnitudes of effects written as ``name=value``.
 
     Raises:
@@ -124,21 +126,21 @@ def wanted(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
     return tuple(found.items())
 
 
-def unplanned(rng: np.random.Generator, k: int) -> RigTrial:
+def no_plan(rng: np.random.Generator, k: int) -> RigTrial:
     """No motion is planned: the policy moves."""
     del rng, k
     raise NotImplementedError("a policy moves the world of a task")
 
 
-def actuators(m: mujoco.MjModel) -> list[str]:
+def actuator_names(m: mujoco.MjModel) -> list[str]:
     """Return the names of a model's actuators."""
     return [m.actuator(a).name for a in range(m.nu)]
 
 
-def pads(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
+def pad_geoms(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
     """Return the named geoms that can touch and whose bodies the grippers move."""
     joints: set[int] = set()
-    for name in set(grippers) & set(actuators(m)):
+    for name in set(grippers) & set(actuator_names(m)):
         a = m.actuator(name).id
         target = int(m.actuator_trnid[a, 0])
         if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:

@@ -13,7 +13,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, PerTrialState, drives, each
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, PerTrialState, drives, true_values
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -67,7 +67,7 @@ def joint_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     levels: dict[str, Level] = {d.joint: lambda _m, _d, _i, t=t: t for d, t in zip(found, torque, strict=True)}
     joints = tuple(d.joint for d in found)
     return HiddenEffectOfRig(
-        "joint_friction", friction("joint_friction", levels), each("torque", joints, torque), joints
+        "joint_friction", friction("joint_friction", levels), true_values("torque", joints, torque), joints
     )
 
 
@@ -84,7 +84,7 @@ def stribeck_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
     levels: dict[str, Level] = {d.joint: partial(level, top=t) for d, t in zip(found, extra, strict=True)}
     joints = tuple(d.joint for d in found)
-    truth = {**each("extra", joints, extra), "speed": speed}
+    truth = {**true_values("extra", joints, extra), "speed": speed}
     return HiddenEffectOfRig("stribeck_friction", friction("stribeck_friction", levels), truth, joints)
 
 
@@ -96,7 +96,7 @@ def load_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
         del model
         return magnitude * 0.5 * abs(data.qfrc_actuator[dof] + data.qfrc_bias[dof])
 
-    truth = each("coefficient", joints, np.full(len(joints), magnitude))
+    truth = true_values("coefficient", joints, np.full(len(joints), magnitude))
     return HiddenEffectOfRig("load_friction", friction("load_friction", dict.fromkeys(joints, level)), truth, joints)
 
 
@@ -112,7 +112,7 @@ def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
             dof = model.joint(joint).dofadr[0]
             data.qfrc_applied[dof] -= damping * data.qvel[dof]
 
-    truth = each("damping", joints, nominal + added)
+    truth = true_values("damping", joints, nominal + added)
     return HiddenEffectOfRig("joint_damping", HiddenEffect("joint_damping", force=force), truth, joints)
 
 
@@ -128,7 +128,7 @@ def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
             spec.joint(joint).armature += inertia
 
     return HiddenEffectOfRig(
-        "armature", HiddenEffect("armature", edit=edit), each("inertia", joints, nominal + added), joints
+        "armature", HiddenEffect("armature", edit=edit), true_values("inertia", joints, nominal + added), joints
     )
 
 

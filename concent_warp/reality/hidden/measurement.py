@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, each
+from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, true_values
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
@@ -16,20 +16,24 @@ Written = tuple[np.ndarray, np.ndarray]
 """Times (T,) [s] and values (T, dim)."""
 
 
-def channels(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
+def sensors_of_kinds(rig: Rig, *kinds: mujoco.mjtSensor) -> tuple[str, ...]:
     """Return the sensors of some kinds."""
     m = rig.scene.model
     return tuple(m.sensor(i).name for i in range(m.nsensor) if SENSOR(int(m.sensor_type[i])) in kinds)
 
 
-def clocked(rig: Rig) -> tuple[str, ...]:
+def clock_channels(rig: Rig) -> tuple[str, ...]:
     """Return the channels whose clock may be wrong: the tracker's where an object is tracked, else the encoders'."""
-    return channels(rig, *POSES) if rig.body_tracked else channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    return (
+        sensors_of_kinds(rig, *POSES)
+        if rig.body_tracked
+        else sensors_of_kinds(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    )
 
 
 def time_base(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """A clock that runs fast by a share [-]."""
-    wrong = clocked(rig)
+    wrong = clock_channels(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time * (1 + magnitude) if name in wrong else time), value
@@ -39,7 +43,7 @@ def time_base(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def latency(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Readings are stamped too late [s]; those older than the recording are lost."""
-    wrong = clocked(rig)
+    wrong = clock_channels(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return (time + magnitude if name in wrong else time), value
@@ -49,7 +53,7 @@ def latency(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def length_scale(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Positions too large by a share [-]."""
-    wrong = channels(rig, SENSOR.mjSENS_FRAMEPOS)
+    wrong = sensors_of_kinds(rig, SENSOR.mjSENS_FRAMEPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
@@ -62,7 +66,7 @@ def frame_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     shift = magnitude * np.array([1.0, -1.0, 0.5])
     turn = magnitude * 3.0 * np.array([1.0, 0.5, -1.0])
     rotation = Rotation.from_rotvec(turn)
-    wrong = channels(rig, *POSES)
+    wrong = sensors_of_kinds(rig, *POSES)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         if name not in wrong:
@@ -78,23 +82,23 @@ def frame_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 def sensor_bias(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Encoders read too much by a constant [rad or m]."""
-    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS)
+    wrong = sensors_of_kinds(rig, SENSOR.mjSENS_JOINTPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value + magnitude if name in wrong else value
 
-    truth = each("bias", wrong, np.full(len(wrong), magnitude))
+    truth = true_values("bias", wrong, np.full(len(wrong), magnitude))
     return HiddenEffectOfRig("sensor_bias", HiddenEffect("sensor_bias", measure=measure), truth, wrong)
 
 
 def sensor_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Encoders read too much by a share [-]."""
-    wrong = channels(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
+    wrong = sensors_of_kinds(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
         return time, value * (1 + magnitude) if name in wrong else value
 
-    truth = each("scale", wrong, np.full(len(wrong), magnitude))
+    truth = true_values("scale", wrong, np.full(len(wrong), magnitude))
     return HiddenEffectOfRig("sensor_gain", HiddenEffect("sensor_gain", measure=measure), truth, wrong)
 
 

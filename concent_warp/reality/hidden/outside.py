@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.reality.hidden.contact import instead, nominal_friction
+from concent_warp.reality.hidden.contact import nominal_friction, with_friction
 from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig, drives, fixed_inertia
 from concent_warp.reality.hidden.joints import Level, friction
 from concent_warp.reality.rigs.rig import Rig
@@ -86,7 +86,7 @@ def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
         rough = float(np.linalg.norm(point[:2] - SPOT) < radius)
         return np.full(2, mu + magnitude * rough)
 
-    return HiddenEffectOfRig("patch", instead(rig, "patch", coefficients))
+    return HiddenEffectOfRig("patch", with_friction(rig, "patch", coefficients))
 
 
 def warming(rig: Rig, magnitude: float) -> HiddenEffectOfRig:

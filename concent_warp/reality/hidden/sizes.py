@@ -2,9 +2,9 @@
 
 With the middle size, a replay of the nominal model has residuals of about four standard deviations of the noise in the
 channels concerned (two to three for throws, whose refitted start absorbs a part), with the large size two to three
-times as much, with the small size half as much. The limit of saturation is in units of `drives.strain` of the motion,
-since motions differ in the forces that they require. Sizes of grip effects lie closer together, since a grasp is kept
-or lost.
+times as much, with the small size half as much. The limit of saturation is in units of `drives.peak_drive_force` of
+the motion, since motions differ in the forces that they require. Sizes of grip effects lie closer together, since a
+grasp is kept or lost.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, chirp, glide, hold
+from concent_warp.reality.rigs.signals import RATE, chirp, hold, minimum_jerk_profile
 from concent_warp.scene.robot import FINGER_TRAVEL, HOME, panda
 from concent_warp.scene.scene import Scene
 
@@ -36,10 +36,16 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
         reach = SWING[joint] * rng.uniform(0.7, 1.0) * rng.choice([-1, 1])
         there, back = rng.uniform(1.0, 1.6), rng.uniform(1.0, 1.8)
         a, b = home + reach, home - 0.6 * reach
-        parts = [hold(home, 0.3), glide(home, a, there), hold(a, 0.3), glide(a, b, back), hold(b, 0.3)]
-        parts += [glide(b, home, 0.8)]
+        parts = [
+            hold(home, 0.3),
+            minimum_jerk_profile(home, a, there),
+            hold(a, 0.3),
+            minimum_jerk_profile(a, b, back),
+            hold(b, 0.3),
+        ]
+        parts += [minimum_jerk_profile(b, home, 0.8)]
         parts += [chirp(home, 0.12 * rng.uniform(0.6, 1.0), 0.3, rng.uniform(1.5, 3.0), 2.5), hold(home, 0.2)]
-        parts += [glide(home, home - 0.3 * reach, 0.7), hold(home - 0.3 * reach, 3.0)]
+        parts += [minimum_jerk_profile(home, home - 0.3 * reach, 0.7), hold(home - 0.3 * reach, 3.0)]
         value = np.concatenate(parts)[: round(DURATION * RATE)]
         action[f"joint{joint + 1}"] = (np.arange(len(value)) / RATE, value)
     time = np.arange(round(DURATION * RATE)) / RATE

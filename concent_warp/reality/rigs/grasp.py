@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, chirp, glide, hold
+from concent_warp.reality.rigs.signals import RATE, chirp, hold, minimum_jerk_profile
 from concent_warp.scene.scene import Scene
 
 HALF = 0.02
@@ -82,16 +82,16 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     lift = rng.uniform(0.07, 0.1)
     high = LOW + lift
     x = [hold(0.0, 0.3), hold(0.0, 0.7), hold(0.0, 0.3), hold(0.0, 0.7), hold(0.0, 0.2)]
-    z = [hold(LOW, 0.3), hold(LOW, 0.7), hold(LOW, 0.3), glide(LOW, high, 0.7), hold(high, 0.2)]
+    z = [hold(LOW, 0.3), hold(LOW, 0.7), hold(LOW, 0.3), minimum_jerk_profile(LOW, high, 0.7), hold(high, 0.2)]
     x += [chirp(0.0, rng.uniform(0.018, 0.024), 0.6, 2.6, 2.2), hold(0.0, 0.2), hold(0.0, 2.2), hold(0.0, 0.2)]
     z += [hold(high, 2.4), chirp(high, rng.uniform(0.012, 0.016), 0.6, 2.6, 2.2), hold(high, 0.2)]
-    x += [glide(0.0, 0.03, 0.5), hold(0.03, 2.0)]
-    z += [hold(high, 0.5), glide(high, LOW + 0.0005, 1.0), hold(LOW + 0.0005, 1.0)]
+    x += [minimum_jerk_profile(0.0, 0.03, 0.5), hold(0.03, 2.0)]
+    z += [hold(high, 0.5), minimum_jerk_profile(high, LOW + 0.0005, 1.0), hold(LOW + 0.0005, 1.0)]
     command = {"drive_x": np.concatenate(x), "drive_z": np.concatenate(z)}
     count = len(command["drive_x"])
-    grip = [hold(OPEN, 0.3), glide(OPEN, CLOSED, 0.7)]
+    grip = [hold(OPEN, 0.3), minimum_jerk_profile(OPEN, CLOSED, 0.7)]
     closed = count - sum(map(len, grip)) - round(0.7 * RATE)
-    grip += [hold(CLOSED, closed / RATE), glide(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
+    grip += [hold(CLOSED, closed / RATE), minimum_jerk_profile(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
     command["gripper"] = np.concatenate(grip)
     time = np.arange(count) / RATE
     place = rng.uniform(-0.003, 0.003, 2)

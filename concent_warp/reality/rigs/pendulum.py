@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import chirp, glide, hold, joined, sweep
+from concent_warp.reality.rigs.signals import chirp, hold, joined, minimum_jerk_profile, sweep
 from concent_warp.scene.scene import Scene
 
 DURATION = 10.0
@@ -46,9 +46,9 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     slow = rng.uniform(0.12, 0.2)
     parts = [hold(0.0, 0.3), sweep(0.0, a, speeds[0])]
     parts += [sweep(a, b, speeds[1]), sweep(b, a, speeds[2]), hold(a, 0.4)]
-    parts += [glide(a, centre, 0.6), chirp(centre, rng.uniform(0.2, 0.3), 0.5, 5.0, 2.5)]
+    parts += [minimum_jerk_profile(a, centre, 0.6), chirp(centre, rng.uniform(0.2, 0.3), 0.5, 5.0, 2.5)]
     parts += [sweep(centre, centre - 0.15, slow), sweep(centre - 0.15, centre, slow)]
-    parts += [sweep(centre, b, 0.8), hold(b, 0.4), glide(b, 0.0, 0.5)]
+    parts += [sweep(centre, b, 0.8), hold(b, 0.4), minimum_jerk_profile(b, 0.0, 0.5)]
     parts += [hold(0.0, max(0.1, DURATION - sum(map(len, parts)) / 100))]
     return RigTrial(DURATION, {"servo": joined(parts)}, settling_time=0.5)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, glide, hold
+from concent_warp.reality.rigs.signals import RATE, hold, minimum_jerk_profile
 from concent_warp.scene.scene import Scene
 
 HALF = 0.04
@@ -58,8 +58,8 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     x, y = [hold(0.0, 0.3)], [hold(0.0, 0.3)]
 
     def go(dx: float, dy: float, duration: float) -> None:
-        x.append(glide(x[-1][-1], dx, duration))
-        y.append(glide(y[-1][-1], dy, duration))
+        x.append(minimum_jerk_profile(x[-1][-1], dx, duration))
+        y.append(minimum_jerk_profile(y[-1][-1], dy, duration))
 
     touch = 0.15 - REACH + place[0]
     first, second = rng.uniform(0.09, 0.11), rng.uniform(0.05, 0.06)

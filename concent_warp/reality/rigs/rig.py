@@ -13,7 +13,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from concent_warp.reality.sensors.instruments import Instruments, read
+from concent_warp.reality.sensors.instruments import Instruments, instrument_reading
 from concent_warp.reality.world import HiddenEffect
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -265,7 +265,7 @@ def _sensor_channels(
         address, dim = model.sensor_adr[sensor], model.sensor_dim[sensor]
         quaternion = model.sensor_type[sensor] == mujoco.mjtSensor.mjSENS_FRAMEQUAT
         truth = motion.sensordata[:, address : address + dim]
-        channel = read(rig.instruments.of(model, sensor), motion.time, truth, rng, quaternion=quaternion)
+        channel = instrument_reading(rig.instruments.of(model, sensor), motion.time, truth, rng, quaternion=quaternion)
         for effect in effects:
             if effect.measure is not None:
                 time, value = effect.measure(name, channel.time, channel.value)

@@ -21,7 +21,7 @@ def sweep(start: float, end: float, speed: float) -> np.ndarray:
     return start + (end - start) * np.arange(1, count + 1) / count
 
 
-def glide(start: float, end: float, duration: float) -> np.ndarray:
+def minimum_jerk_profile(start: float, end: float, duration: float) -> np.ndarray:
     """Return a minimum-jerk path from start (excluded) to end in a duration [s]."""
     count = max(1, round(duration * RATE))
     s = np.arange(1, count + 1) / count

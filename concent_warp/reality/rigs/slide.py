@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
-from concent_warp.reality.sliding_friction import frictionless, rub
+from concent_warp.reality.sliding_friction import apply_sliding_friction, frictionless
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import yaw_quaternion
 
@@ -65,5 +65,5 @@ def _coulomb(time: float, point: np.ndarray) -> np.ndarray:
     return np.array([FRICTION, FRICTION])
 
 
-PHYSICS = WorldPhysics(edit=_glossy, force=rub(_coulomb, "block", "table"))
+PHYSICS = WorldPhysics(edit=_glossy, force=apply_sliding_friction(_coulomb, "block", "table"))
 SLIDE = Rig("slide", Scene(XML, "slide rig"), _plan, PHYSICS, throws=6, start="resting", body="block", surface="table")

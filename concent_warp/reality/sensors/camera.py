@@ -15,7 +15,7 @@ CAMERA = "camera"
 """Name of the camera in a recording."""
 
 
-def film(
+def record_depth_images(
     sensing: SensingCfg,
     world: mujoco.MjSpec,
     bodies: tuple[str, ...],
@@ -38,7 +38,7 @@ def film(
 
     height, width = sensing.image_size
     camera = sensing.pinhole()
-    model = staged(world, bodies, sensing).compile()
+    model = camera_world(world, bodies, sensing).compile()
     data = mujoco.MjData(model)
     rgb = np.zeros((len(time), height, width, 3), dtype=np.uint8)
     depth = np.zeros((len(time), height, width), dtype=np.float32)
@@ -67,7 +67,7 @@ def film(
     return ImageStream(np.asarray(time, float), rgb, depth, camera.intrinsics, camera.pose)
 
 
-def staged(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: SensingCfg) -> mujoco.MjSpec:
+def camera_world(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: SensingCfg) -> mujoco.MjSpec:
     """Return a copy of the world with the camera in it, the pattern on the bodies, and nothing that only moves it.
 
     States come from the world itself, so what its motion takes is left out, whether the ray tracer's simulator knows it

@@ -81,7 +81,7 @@ def footage(
             mjw.render(warp_model, warp_data, context)
             for c in range(len(rows)):
                 mjw.get_rgb(context, c, seen)
-                light = developed(seen.numpy()[0] * shade, cfg)
+                light = apply_tone_curve(seen.numpy()[0] * shade, cfg)
                 frames[c, t] = np.clip(np.round(255 * light + rng.normal(0, cfg.noise, light.shape)), 0, 255)
     return {
         name: ImageStream(
@@ -96,7 +96,7 @@ def footage(
     }
 
 
-def developed(light: np.ndarray, cfg: FootageCfg) -> np.ndarray:
+def apply_tone_curve(light: np.ndarray, cfg: FootageCfg) -> np.ndarray:
     """Return the colours 0..1 that the cameras report for light in 0..1, shape (..., 3)."""
     return np.clip(light * np.array(cfg.white_balance), 0, 1) ** cfg.gamma
 

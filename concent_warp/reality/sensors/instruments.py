@@ -93,7 +93,7 @@ class Instruments:
         raise ValueError(f"no instrument reads sensor {model.sensor(sensor).name!r} of type {kind.name}")
 
 
-def read(
+def instrument_reading(
     instrument: Instrument,
     time: np.ndarray,
     value: np.ndarray,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from concent_warp.reality.sensors.camera import staged
+from concent_warp.reality.sensors.camera import camera_world
 from concent_warp.reality.sensors.sensing import SensingCfg
 
 VISIBLE_GROUP, HIDDEN_GROUP = 0, 5
@@ -60,7 +60,7 @@ def photographs(world: mujoco.MjSpec, body: str, cfg: PhotographsCfg | None = No
 
     cfg = cfg or PhotographsCfg()
     fine = cfg.size * cfg.samples
-    spec = staged(world, (body,), SensingCfg(image_size=(fine, fine), camera_fovy=cfg.fovy))
+    spec = camera_world(world, (body,), SensingCfg(image_size=(fine, fine), camera_fovy=cfg.fovy))
     for geom in spec.geoms:
         geom.group = VISIBLE_GROUP if geom.parent.name == body else HIDDEN_GROUP
     model = spec.compile()

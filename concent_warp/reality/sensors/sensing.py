@@ -110,7 +110,7 @@ def _surface_points(scene: Scene, body: str, count: int, rng: np.random.Generato
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[0])
 
 
-def seen(
+def are_visible(
     sensing: SensingCfg, model: mujoco.MjModel, data: mujoco.MjData, points: np.ndarray, slack: float
 ) -> np.ndarray:
     """Return which world points (M, 3) [m] the camera sees.
@@ -139,7 +139,7 @@ def visible_points(
     local = _surface_points(scene, body, 40 * sensing.point_count, rng)
     place = data.body(body)
     points = place.xpos + local @ place.xmat.reshape(3, 3).T
-    local = local[seen(sensing, model, data, points, sensing.visibility_slack)]
+    local = local[are_visible(sensing, model, data, points, sensing.visibility_slack)]
     return local[rng.choice(len(local), sensing.point_count, replace=False)]
 
 
@@ -160,7 +160,7 @@ def measure(
         name, address, dim = model.sensor(i).name, model.sensor_adr[i], model.sensor_dim[i]
         joint = int(model.sensor_type[i]) in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_TENDONPOS)
         rate = sensing.encoder_rate if joint else sensing.pose_rate
-        rows = sampled(time, rate)
+        rows = reading_steps(time, rate)
         value = readings[rows, address : address + dim]
         if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_FRAMEQUAT:
             std = sensing.orientation_std
@@ -172,6 +172,6 @@ def measure(
     return channels
 
 
-def sampled(time: np.ndarray, rate: float) -> np.ndarray:
+def reading_steps(time: np.ndarray, rate: float) -> np.ndarray:
     """Return the steps, at times (T,) [s] and evenly spaced, that an instrument with a rate [Hz] reads."""
     return np.unique(np.round(np.arange(0, time[-1], 1 / rate) / (time[1] - time[0])).astype(int))

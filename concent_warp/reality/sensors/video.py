@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.errors import ConcentError
 from concent_warp.files import new_file
-from concent_warp.reality.sensors.camera import film
+from concent_warp.reality.sensors.camera import record_depth_images
 from concent_warp.reality.sensors.sensing import SensingCfg
 
 SIZE = (240, 320)
@@ -25,7 +25,7 @@ CODECS = ("vp09", "mp4v")
 """Codecs of the MP4, by preference: browsers play the first; the second is there wherever OpenCV is."""
 
 
-def filmed(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray, period: float) -> np.ndarray:
+def render_video(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray, period: float) -> np.ndarray:
     """Return frames of a motion, uint8, shape (T, H, W, 3).
 
     Args:
@@ -51,7 +51,7 @@ def filmed(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray, peri
         image_size=SIZE,
         rgb_std=0.0,
     )
-    return film(camera, world, bodies, period * np.arange(len(qpos)), qpos, np.random.default_rng(0)).rgb
+    return record_depth_images(camera, world, bodies, period * np.arange(len(qpos)), qpos, np.random.default_rng(0)).rgb
 
 
 def write_video(path: Path, frames: np.ndarray, rate: float) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.shapes.solid import Distances, Solid, unit
+from concent_warp.scene.shapes.solid import Distances, Solid, normalised
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
@@ -89,7 +89,7 @@ class PointCloud(Solid):
         if normals is None:
             return PointCloud(points, _outward_normals(points, cfg), cfg)
         normals = np.asarray(normals, dtype=float)[first]
-        return PointCloud(points, unit(normals, np.linalg.norm(normals, axis=1)), cfg)
+        return PointCloud(points, normalised(normals, np.linalg.norm(normals, axis=1)), cfg)
 
     @cached_property
     def tree(self) -> KDTree:
@@ -116,7 +116,7 @@ class PointCloud(Solid):
         weight /= weight.sum(axis=1, keepdims=True)
         height = np.einsum("nkd,nkd->nk", points[:, None] - self.points[nearest], self.normals[nearest])
         gradient = np.einsum("nk,nkd->nd", weight, self.normals[nearest])
-        return np.sum(weight * height, axis=1), unit(gradient, np.linalg.norm(gradient, axis=1))
+        return np.sum(weight * height, axis=1), normalised(gradient, np.linalg.norm(gradient, axis=1))
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """See `Solid.sample`; draws from the points, the sparser the place the more often."""

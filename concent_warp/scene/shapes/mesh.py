@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from concent_warp.errors import SceneError
-from concent_warp.scene.shapes.solid import Distances, Solid, unit
+from concent_warp.scene.shapes.solid import Distances, Solid, normalised
 
 if TYPE_CHECKING:
     import trimesh
@@ -101,7 +101,7 @@ class MeshSolid(Solid):
         away = points - _nearest_on_triangles(points, corners)
         length = np.linalg.norm(away, axis=1)
         touching = length < self.cfg.surface_tolerance * self.extent
-        gradient = unit(sign[:, None] * away, length)
+        gradient = normalised(sign[:, None] * away, length)
         return sign * length, np.where(touching[:, None], _face_normals(corners), gradient)
 
 
@@ -152,7 +152,7 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 def _face_normals(corners: np.ndarray) -> np.ndarray:
     """Return unit normals, shape (n, 3), of triangles (n, 3, 3)."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return unit(cross, np.linalg.norm(cross, axis=1))
+    return normalised(cross, np.linalg.norm(cross, axis=1))
 
 
 def _nearest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

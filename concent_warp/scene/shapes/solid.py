@@ -32,7 +32,7 @@ class Solid(ABC):
 
 
 @dataclass(frozen=True)
-class Placed(Solid):
+class PlacedSolid(Solid):
     """A solid moved into the body frame."""
 
     solid: Solid
@@ -118,7 +118,7 @@ class Capsule(Solid):
         away = points.astype(float)
         away[:, 2] -= np.clip(away[:, 2], -self.half_length, self.half_length)
         length = np.linalg.norm(away, axis=1)
-        return length - self.radius, unit(away, length)
+        return length - self.radius, normalised(away, length)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """See `Solid.sample`."""
@@ -152,7 +152,7 @@ class Cylinder(Solid):
         flat = points.astype(float)
         flat[:, 2] = 0
         across = np.linalg.norm(flat, axis=1)
-        radial = unit(flat, across, fallback=(1.0, 0.0, 0.0))
+        radial = normalised(flat, across, fallback=(1.0, 0.0, 0.0))
         axial = np.zeros_like(flat)
         axial[:, 2] = np.where(points[:, 2] < 0, -1, 1)
         side, cap = across - self.radius, np.abs(points[:, 2]) - self.half_length
@@ -224,7 +224,7 @@ class Ellipsoid(Solid):
         nearest *= np.where(points < 0, -1.0, 1.0)
         inside = np.sum((points / self.half) ** 2, axis=1) < 1
         gradient = nearest / square
-        gradient = unit(gradient, np.linalg.norm(gradient, axis=1))
+        gradient = normalised(gradient, np.linalg.norm(gradient, axis=1))
         return np.where(inside, -1, 1) * np.linalg.norm(points - nearest, axis=1), gradient
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -236,10 +236,12 @@ class Ellipsoid(Solid):
             kept.append(direction[rng.random(2 * count) * most < self.stretch(direction)])
         direction = np.concatenate(kept)[:count]
         normals = direction / self.half
-        return direction * self.half, unit(normals, np.linalg.norm(normals, axis=1))
+        return direction * self.half, normalised(normals, np.linalg.norm(normals, axis=1))
 
 
-def unit(vectors: np.ndarray, length: np.ndarray, fallback: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> np.ndarray:
+def normalised(
+    vectors: np.ndarray, length: np.ndarray, fallback: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> np.ndarray:
     """Divide vectors (n, 3) by their lengths (n,); a vector without length becomes `fallback`."""
     short = length < 1e-300
     divided = vectors / np.where(short, 1.0, length)[:, None]
@@ -250,7 +252,7 @@ def unit(vectors: np.ndarray, length: np.ndarray, fallback: tuple[float, float, 
 def _directions(count: int, rng: np.random.Generator) -> np.ndarray:
     """Draw unit vectors uniformly from the sphere, shape (count, 3)."""
     vectors = rng.standard_normal((count, 3))
-    return unit(vectors, np.linalg.norm(vectors, axis=1))
+    return normalised(vectors, np.linalg.norm(vectors, axis=1))
 
 
 def _circle(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from concent_warp.errors import SceneError
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, Placed, Solid
+from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, PlacedSolid, Solid
 
 
 @dataclass(frozen=True)
@@ -180,4 +180,4 @@ def _geom_solid(scene: Scene, geom: int) -> Solid:
         )
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    return Placed(solid, rotation.reshape(3, 3), model.geom_pos[geom].copy())
+    return PlacedSolid(solid, rotation.reshape(3, 3), model.geom_pos[geom].copy())

@@ -15,7 +15,7 @@ from concent_warp.diagnosis.search.fit_candidate import _better, polish_candidat
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
 from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
 from concent_warp.diagnosis.search.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
-from concent_warp.diagnosis.tasks import TaskRunner, run_tasks, silent
+from concent_warp.diagnosis.tasks import TaskRunner, ignore_progress, run_tasks
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 
@@ -399,8 +399,8 @@ def test_tasks_report_their_share_in_order():
     assert runner.share == pytest.approx(0.7)
     assert runner.run(lambda: 1, [], "nothing") == []
     assert runner.share == pytest.approx(0.7)
-    assert (TaskRunner().jobs, TaskRunner().progress) == (1, silent)
-    silent(0.5, "half")
+    assert (TaskRunner().jobs, TaskRunner().progress) == (1, ignore_progress)
+    ignore_progress(0.5, "half")
     done: list[int] = []
     lazy = run_tasks(done.append, [(k,) for k in range(3)], 1)
     assert done == []

@@ -6,7 +6,7 @@ from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline, refit_without_effect
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
 from concent_warp.diagnosis.search.screening import screen
-from concent_warp.diagnosis.tasks import silent
+from concent_warp.diagnosis.tasks import ignore_progress
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
@@ -27,7 +27,7 @@ def nodes():
 
 def procedure(recording, nodes, folder=None):
     cfg = DiagnoseCfg(jobs=1)
-    runner = None if folder is None else CheckpointedRunner(1, silent, nodes[0].model, folder, "key")
+    runner = None if folder is None else CheckpointedRunner(1, ignore_progress, nodes[0].model, folder, "key")
     made = Procedure(nodes[0].model, recording, cfg, runner)
     for last in nodes[1:]:
         # What a search leaves behind after each addition.

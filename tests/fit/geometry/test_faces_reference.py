@@ -10,7 +10,7 @@ import pytest
 
 from concent_warp.fit.geometry import faces as of_faces
 from concent_warp.fit.geometry import offset as of_offset
-from concent_warp.fit.geometry.faces import FaceCfg, Faces, _neighbourhoods, _places, flattened
+from concent_warp.fit.geometry.faces import FaceCfg, Faces, _face_memberships, _neighbourhoods, flattened
 from concent_warp.fit.geometry.mask import touched_spheres, with_neighbours
 from concent_warp.fit.geometry.offset import offset_directions
 from concent_warp.scene.scene import Scene
@@ -55,7 +55,7 @@ def test_a_sphere_has_a_place_in_each_face_that_it_is_near(monkeypatch):
     ]
     tilted = np.array([np.cos(0.4), np.sin(0.4), 0.0])  # 23 degrees
     asked = surface_of(monkeypatch, of_faces, points, [X, tilted, Y, Z, -X])
-    found = _places(spheres([[9.0, 9.0, 9.0], centre]), SCENE, "block", CFG)[-2:]
+    found = _face_memberships(spheres([[9.0, 9.0, 9.0], centre]), SCENE, "block", CFG)[-2:]
     assert [(row, first) for row, _, _, first in found] == [(1, True), (1, False)]
     np.testing.assert_array_equal([normal for _, normal, _, _ in found], [X, Y])
     np.testing.assert_array_equal([foot for _, _, foot, _ in found], [points[0], points[2]])
@@ -67,17 +67,17 @@ def test_a_face_ends_where_its_normal_turns_by_25_degrees(monkeypatch, degrees, 
     angle = np.radians(degrees)
     turned = np.array([np.cos(angle), np.sin(angle), 0.0])
     surface_of(monkeypatch, of_faces, [4e-3 * X, 4.5e-3 * turned], [X, turned])
-    assert len(_places(spheres([[0.0, 0.0, 0.0]]), SCENE, "block", CFG)) == 1 + other
+    assert len(_face_memberships(spheres([[0.0, 0.0, 0.0]]), SCENE, "block", CFG)) == 1 + other
 
 
 @pytest.mark.parametrize(("beside", "counted"), [(0.9e-3, True), (1.1e-3, False)])
 def test_a_second_face_counts_where_its_foot_is_hardly_beside_it_and_the_nearest_always(monkeypatch, beside, counted):
     surface_of(monkeypatch, of_faces, [4e-3 * X + 3e-3 * Y, 5.5e-3 * -Z + beside * Y], [X, -Z])
-    found = _places(spheres([[0.0, 0.0, 0.0]]), SCENE, "block", CFG)
+    found = _face_memberships(spheres([[0.0, 0.0, 0.0]]), SCENE, "block", CFG)
     assert [first for *_, first in found] == [True, False][: 1 + counted]
 
 
-def random_places(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_face_memberships(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return feet, normals and bodies of places on two faces of two bodies."""
     rng = np.random.default_rng(seed)
     foot = rng.normal(0, 0.02, (30, 3))
@@ -87,8 +87,8 @@ def random_places(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return foot, normal, rng.integers(2, size=30)
 
 
-def test_neighbours_are_places_of_the_same_face_weighed_by_their_distance():
-    foot, normal, body = random_places()
+def test_neighbours_are_face_memberships_of_the_same_face_weighed_by_their_distance():
+    foot, normal, body = random_face_memberships()
     basis, weight = _neighbourhoods(foot, normal, body, 0.03, CFG)
     for i, j in np.ndindex(30, 30):
         offset = foot[j] - foot[i]
@@ -119,7 +119,7 @@ def test_far_neighbours_do_not_count():
 
 def made_faces(seed: int = 1) -> Faces:
     """Return faces of 30 places of 20 spheres."""
-    foot, normal, body = random_places(seed)
+    foot, normal, body = random_face_memberships(seed)
     rng = np.random.default_rng(seed)
     faces: Any = object.__new__(Faces)
     faces.cfg, faces.count = CFG, 20

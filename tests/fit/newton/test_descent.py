@@ -15,7 +15,7 @@ from concent_warp.fit.newton.descent import (
     Metric,
     chosen_iterates,
     descend,
-    identity,
+    descent_identity,
     start_descent,
 )
 from concent_warp.fit.newton.horizon import _tilt, shortened
@@ -127,7 +127,7 @@ def test_iterates_to_score_again_are_the_last_and_some_before_it():
 
 def test_a_saved_state_is_read_for_the_same_descent_alone(tmp_path):
     state, path = run(started(2)), tmp_path / "descent.npz"
-    mine = identity(CFG, 0, GEOMETRY.position, ["a"])
+    mine = descent_identity(CFG, 0, GEOMETRY.position, ["a"])
     state.save(path, mine)
     again = Descent.load(path, mine)
     for name in ("now", "best", "direction", "lowest", "step", "kept"):
@@ -135,10 +135,10 @@ def test_a_saved_state_is_read_for_the_same_descent_alone(tmp_path):
     for name in ("kept_start", "lows", "losses", "finished"):
         assert getattr(again, name) == getattr(state, name)
     for other in (
-        identity(CFG, 1, GEOMETRY.position, ["a"]),
-        identity(CFG, 0, GEOMETRY.position + 1e-9, ["a"]),
-        identity(CFG, 0, GEOMETRY.position, ["b"]),
-        identity(replace(CFG, starts=3), 0, GEOMETRY.position, ["a"]),
+        descent_identity(CFG, 1, GEOMETRY.position, ["a"]),
+        descent_identity(CFG, 0, GEOMETRY.position + 1e-9, ["a"]),
+        descent_identity(CFG, 0, GEOMETRY.position, ["b"]),
+        descent_identity(replace(CFG, starts=3), 0, GEOMETRY.position, ["a"]),
     ):
         with pytest.raises(ModelError, match="other settings"):
             Descent.load(path, other)

@@ -15,7 +15,7 @@ from concent_warp.fit.geometry.objective import Losses
 from concent_warp.fit.geometry.perturbation import Perturbation
 from concent_warp.fit.geometry.search import GeometrySearchCfg, Survey
 from concent_warp.fit.newton import scale_factors, warm_start
-from concent_warp.fit.newton.descent import Descent, GradientCfg, identity, start_descent
+from concent_warp.fit.newton.descent import Descent, GradientCfg, descent_identity, start_descent
 from concent_warp.fit.newton.scale_factors import FactorCfg, FactorDescent, _stretches
 from concent_warp.fit.newton.warm_start import GradientWarmStart
 from tests.fit.conftest import HALF, corner_spheres
@@ -346,7 +346,7 @@ def test_gradients_help_where_the_best_iterate_is_clearly_better(gradients, tmp_
     assert base is found.base
     assert (metric.swelling, bounded) == (0.7, found.bounded)
     np.testing.assert_allclose(gradients["scene"][0][1].position, found.base)
-    mine = identity(cfg, 5, found.base, ["s1"])
+    mine = descent_identity(cfg, 5, found.base, ["s1"])
     assert len(Descent.load(tmp_path / "d.npz", mine).losses) == 4
 
 

@@ -20,7 +20,7 @@ from concent_warp.fit.newton.descent import (
     Metric,
     chosen_iterates,
     descend,
-    identity,
+    descent_identity,
     start_descent,
 )
 from concent_warp.fit.newton.horizon import HorizonCfg, _tilt, _windows_of, gradient_segments, shortened
@@ -412,7 +412,7 @@ def test_iterates_of_each_start_are_chosen_evenly_without_the_model_itself(start
 
 
 def test_a_state_is_written_in_one_piece_and_read_back(tmp_path):
-    state, mine = kept([0, 2]), identity(CFG, 3, BASE, ("a", "b"))
+    state, mine = kept([0, 2]), descent_identity(CFG, 3, BASE, ("a", "b"))
     state.losses, state.lows, state.finished = [[1.0, np.inf, 2.0]], [0.5], True
     path = tmp_path / "deep" / "er" / "state.npz"
     state.save(path, mine)
@@ -430,7 +430,7 @@ def test_a_state_is_written_in_one_piece_and_read_back(tmp_path):
 @pytest.mark.parametrize("kind", ["missing", "empty", "cut", "key", "json", "flipped", "squeezed"])
 def test_a_state_that_is_not_whole_is_refused(kind, tmp_path):
     path = tmp_path / "state.npz"
-    mine = identity(CFG, 0, BASE, ["a"])
+    mine = descent_identity(CFG, 0, BASE, ["a"])
     kept([0, 1]).save(path, mine)
     content: dict[str, Any] = dict(np.load(path))
     data = bytearray(path.read_bytes())
