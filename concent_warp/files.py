@@ -201,10 +201,14 @@ def _locked(path: Path, *, wait: bool = True) -> int:
         os.close(lock)
 
 
-def not_written(path: Path, error: OSError) -> ConcentError:
+class NotWrittenError(ConcentError):
+    """A file that the system refuses to write, as on a full disk."""
+
+
+def not_written(path: Path, error: OSError) -> NotWrittenError:
     """Return the error that says why a file could not be written."""
     fix = "make room on the disk, or choose another place"
-    return ConcentError("the file cannot be written", where=path, found=error.strerror or error, fix=fix)
+    return NotWrittenError("the file cannot be written", where=path, found=error.strerror or error, fix=fix)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

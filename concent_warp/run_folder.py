@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import ConcentError, TrainError
-from concent_warp.files import claim, write_text
+from concent_warp.files import NotWrittenError, claim, write_text
 from concent_warp.version import __version__
 
 SETTINGS = "settings.toml"
@@ -139,6 +139,9 @@ class RunFolder:
                 shutil.rmtree(self.path, ignore_errors=True)
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(self._interrupted()) from None
+        if isinstance(error, NotWrittenError) and self.can_be_resumed():
+            said = f"{str(error).rstrip('.')}; the state is saved, continue with `{resuming_command()}`"
+            raise NotWrittenError(said) from None
 
     def _interrupted(self) -> str:
         """Return what an interruption has left and how to go on."""

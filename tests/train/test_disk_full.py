@@ -59,8 +59,10 @@ def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_pat
     command = training(tmp_path, "--resume", "--iterations", "5000", "--checkpoint", "5000")
     [(code, said)] = run_limited([(size + 20_000, command)])
     assert code == 2
-    full = "the file cannot be written; found File too large; make room on the disk, or choose another place."
-    assert said in [f"concent train: {run}/{name}: {full}" for name in ("curve.jsonl", "events.out.tfevents")]
+    full = "the file cannot be written; found File too large; make room on the disk, or choose another place; the state"
+    sentences = [f"concent train: {run}/{name}: {full}" for name in ("curve.jsonl", "events.out.tfevents")]
+    assert said.split(" is saved, continue with `concent train ")[0] in sentences
+    assert said.endswith(" --resume`.")
     assert not list(tmp_path.rglob("*partial*"))
     [(code, said)] = run_limited([(1 << 30, training(tmp_path, "--resume", "--iterations", "2"))])
     assert code == 0
