@@ -259,7 +259,7 @@ def make_environment(
     physics = ChosenPhysics(task.compiled, cfg.worlds, cfg.decimation)
     states = made_up_states(task) if states is None else states
     environment = Environment(task, cfg, physics, states)
-    environment.start_from(np.arange(cfg.worlds) % len(states.qpos))
+    environment.start_from([k % len(states.qpos) for k in range(cfg.worlds)])
     environment.read_log()
     return environment, physics
 

@@ -225,7 +225,9 @@ class Reference:
         cfg, reward, task, stage = self.cfg, self.cfg.reward, self.task, episode.stage
         ctrl = self.command(before, action)
         failure, success, result = [False, False, False], False, EpisodeState(**vars(episode))
-        terms = dict.fromkeys(("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure"), 0.0)
+        terms: dict[str, float] = dict.fromkeys(
+            ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure"), 0.0
+        )
         strict = reward.lenience + (1 - reward.lenience) * self.success_average**2
         failure[2] = not (
             (np.abs(after.qpos) < cfg.max_position).all()
