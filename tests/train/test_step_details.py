@@ -1,6 +1,6 @@
 """Thresholds, counts, resets, logs and saved states of the environment, on states that are chosen exactly."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -428,7 +428,7 @@ def test_environment_tells_its_sizes_and_gives_copies_of_its_observation():
     assert environment.buffers is None
     physics.buffers = (3, 4)
     assert environment.buffers == (3, 4)
-    assert environment.cfg["reward"]["reach"] == 1.3
+    assert environment.cfg == asdict(SETTINGS)
     observation = environment.get_observations()
     assert observation.batch_size == (10,)
     environment.observation.zero_()

@@ -47,7 +47,9 @@ def virtual_collision(task: Task, physics: Physics, stage: object, cfg: Collisio
             sets.append(SphereSet(m.body(body).id, *covered))
     links = {int(i) for i in m.jnt_bodyid[task.robot.joint]}
     tool = int(m.site_bodyid[task.robot.tool])
-    links |= {i for i in range(m.nbody) if i == tool or int(m.body_parentid[i]) in links | {tool}}
+    for i in range(m.nbody):  # parents come before their children
+        if i == tool or int(m.body_parentid[i]) in links:
+            links.add(i)
     scene = task.model.scene.model
     targets: list[SphereSet | TargetMesh] = []
     for body in (*task.objects, *sorted(links - set(task.objects))):
