@@ -47,6 +47,7 @@ class GroundCfg:
     geometry: ContactGeometryCfg = field(default_factory=ContactGeometryCfg)
     """The starting geometry."""
     fit: FitCfg = field(default_factory=FitCfg)
+    """Settings of the fit."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations to fit; all where empty. The comparison is about all in any case."""
     method: Method = "es"

@@ -209,7 +209,7 @@ def load_kernel(
     bias: wp.array2d[float],
     frictionloss: wp.array2d[float],
 ):
-    """See `load`; dim (N, n).
+    """See `add_load_friction`; dim (N, n).
 
     Args:
         dof: Shape (n,).
@@ -403,7 +403,7 @@ def adhesion_kernel(
     xipos: wp.array2d[wp.vec3],
     applied: wp.array2d[wp.spatial_vector],
 ):
-    """See `pull`; dim (N, P, n).
+    """See `add_adhesion`; dim (N, P, n).
 
     Args:
         geom: Shape (P,).

@@ -81,11 +81,11 @@ class RewardCfg:
     kind: Literal["contact", "engineered"] = "contact"
     """The contact-event reward, or the engineered reward as a baseline."""
     reach: float = 1.0
-    """Weight of the reaching term."""
+    """Weight of the reaching term [-]."""
     regularisation: float = 1.0
-    """Weight of the regularisation."""
+    """Weight of the regularisation [-]."""
     vcp: float = 1.0
-    """Weight of the virtual collision penalty."""
+    """Weight of the virtual collision penalty [-]."""
     far: Range = (1.0, 0.05)
     """Amplitude and length scale [m] of the far reaching term."""
     near: Range = (2.0, 0.008)
@@ -95,7 +95,7 @@ class RewardCfg:
     stage: float = 5.0
     """Reward per step for each completed stage; larger than the reaching terms, so that the next stage pays off."""
     action: float = 0.01
-    """Penalty of the squared action."""
+    """Penalty of the squared action [-]."""
     velocity: float = 0.001
     """Penalty of the squared arm joint velocity [s^2/rad^2]."""
     press: float = 0.0
@@ -107,7 +107,7 @@ class RewardCfg:
     disturb_rotation: float = 1.0
     """Penalty of an object's rotation between steps [1/rad], likewise."""
     failure: float = 5.0
-    """Penalty of an episode that ends in failure."""
+    """Penalty of an episode that ends in failure [-]."""
     lenience: float = 0.0
     """Factor on the penalties of virtual collisions and failure while no episode succeeds; it rises to 1 with the
     square of the success rate. Large penalties from the start keep a policy away from its target."""
@@ -115,6 +115,7 @@ class RewardCfg:
     """Factor on the whole reward, divided by the number of chained stages; the value function learns faster when
     returns are of order 1."""
     engineered: EngineeredCfg = field(default_factory=EngineeredCfg)
+    """Settings of the engineered reward."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,9 @@ class ResetCfg:
     """Inverse kinematics: "newton" solves all states at once, "posture" one by one; "auto" takes "newton" on a GPU (its
     kernels take a minute to compile on a CPU)."""
     posture_solver: PostureSolverCfg = field(default_factory=PostureSolverCfg)
+    """Inverse kinematics of single poses."""
     newton_solver: NewtonSolverCfg = field(default_factory=NewtonSolverCfg)
+    """Inverse kinematics of batches of poses."""
 
 
 @dataclass(frozen=True)
@@ -318,12 +321,19 @@ class EnvironmentCfg:
     fuse: bool = False
     """Compile the torch operations of a captured step into few kernels: faster steps, longer start."""
     action: ActionCfg = field(default_factory=ActionCfg)
+    """Actions."""
     observation: ObservationCfg = field(default_factory=ObservationCfg)
+    """Observations."""
     reward: RewardCfg = field(default_factory=RewardCfg)
+    """Reward."""
     virtual: CollisionCfg = field(default_factory=CollisionCfg)
+    """Virtual collisions."""
     reset: ResetCfg = field(default_factory=ResetCfg)
+    """Reset states."""
     chain: ChainCfg = field(default_factory=ChainCfg)
+    """Stages in turn."""
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
+    """Domain randomisation."""
 
     @property
     def simulation_steps(self) -> int:
@@ -351,13 +361,13 @@ class PpoCfg:
     iterations: int = 300
     """Iterations of collecting steps and updating the policy."""
     learning_rate: float = 1e-3
-    """Initial learning rate."""
+    """Initial learning rate [-]."""
     steps: int = 24
     """Steps of each environment per iteration."""
     entropy: float = 0.002
-    """Weight of the entropy."""
+    """Weight of the entropy [-]."""
     discount: float = 0.98
-    """Discount factor of a step."""
+    """Discount factor of a step [-]."""
     epochs: int = 5
     """Passes over the collected steps per iteration."""
     batches: int = 4
@@ -367,7 +377,7 @@ class PpoCfg:
     activation: str = "swish"
     """Activation function of both networks."""
     std: float = 0.6
-    """Initial standard deviation of the Gaussian before squashing."""
+    """Initial standard deviation of the Gaussian before squashing [-]."""
     max_mean: float = 4.0
     """Largest magnitude of the mean before squashing: tanh(4) is 0.9993. Outputs for observations far from those seen
     before can be in the hundreds, where single precision does not represent the change of density by an update."""
@@ -376,17 +386,17 @@ class PpoCfg:
     max_observation: float = 10.0
     """Largest magnitude of a normalised observation [standard deviations]; it bounds networks' outputs and losses."""
     lam: float = 0.95
-    """Lambda of the generalised advantage estimate."""
+    """Lambda of the generalised advantage estimate [-]."""
     clip: float = 0.2
     """Clipping of the probability ratio."""
     value: float = 1.0
-    """Weight of the value loss."""
+    """Weight of the value loss [-]."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """Whether the learning rate adapts to the Kullback-Leibler divergence of an update."""
     divergence: float = 0.01
-    """Target Kullback-Leibler divergence of the adaptive learning rate."""
+    """Target Kullback-Leibler divergence of the adaptive learning rate [-]."""
     gradient: float = 1.0
-    """Largest norm of the gradient."""
+    """Largest norm of the gradient [-]."""
     tf32: bool = True
     """Multiply matrices in TF32 (10 bits of mantissa) on a GPU, which is faster."""
 
@@ -409,7 +419,9 @@ class TrainCfg:
     checkpoint: int = 50
     """Iterations between checkpoints; one is also written at the end and on interruption."""
     environment: EnvironmentCfg = field(default_factory=EnvironmentCfg)
+    """The environment."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
+    """Settings of PPO."""
 
     def __post_init__(self) -> None:
         check_cfg(self)

@@ -155,9 +155,9 @@ class UnknownForce(Effect):
         self.words, self._force_model = words, force_model
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """The sizes of the bumps."""
+        """Return the sizes of the bumps."""
         return tuple(Parameter(f"size[{k}]", "-", 0.0, -100.0, 100.0, 1.0) for k in range(self._force_model.count))
 
     def force_model(self, m: mujoco.MjModel) -> UnknownJointForce | UnknownBodyForce:  # noqa: ARG002
-        """The force."""
+        """Return the force."""
         return self._force_model

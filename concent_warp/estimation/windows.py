@@ -27,11 +27,11 @@ class WindowCfg:
     max_shift: float = 0.25
     """How far a start may move to a time with less scatter, as a share of the stride [-]."""
     max_scatter: float = 10.0
-    """A start whose readings scatter more than this many times as much as usual is left out: an impact lies there."""
+    """Scatter of the readings over its median above which a start is left out [-]: it lies in an impact."""
     contact_share: float = 0.75
     """Contact must begin within this share of a window, so that its outcome is observed [-]."""
     min_frames: int = 3
-    """A window with fewer observed frames of every body is left out."""
+    """Fewest observed frames of a body in a window [-]."""
     tracks: ObjectTrackCfg = field(default_factory=ObjectTrackCfg)
     """How observations become target points."""
 

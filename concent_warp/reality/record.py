@@ -29,9 +29,13 @@ class RealityCfg:
     task: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
     """Nominal positions and sizes; the block's pose is sampled around these for each demonstration."""
     expert: ExpertCfg = field(default_factory=ExpertCfg)
+    """Settings of the scripted expert."""
     world: WorldCfg = field(default_factory=WorldCfg)
+    """Differences of Reality from the nominal scene."""
     sensing: SensingCfg = field(default_factory=SensingCfg)
+    """Noise and rates of encoders, pose tracker and depth camera."""
     footage: FootageCfg = field(default_factory=FootageCfg)
+    """Colour cameras."""
     place_spread: float = 0.02
     """Half width of the square in which the block's position is sampled [m]."""
     yaw_spread: float = 0.15

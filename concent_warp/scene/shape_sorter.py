@@ -18,6 +18,7 @@ class ShapeSorterCfg:
     """Sizes and places of the shape sorter."""
 
     robot: RobotCfg = field(default_factory=RobotCfg)
+    """The arm."""
     block_size: float = 0.04
     """Edge of the block [m]."""
     block_mass: float = 0.08

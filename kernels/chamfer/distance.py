@@ -88,7 +88,7 @@ def chamfer_parts(
     *,
     squared: bool = False,
 ) -> ChamferParts:
-    """The two directional means of `chamfer` and the counts behind them; takes the same arguments."""
+    """Return the two directional means of `chamfer` and the counts behind them; takes the same arguments."""
     _check_tensors(a, b, a_valid, b_valid)
     return ChamferParts(*_Chamfer.apply(a, b, a_valid, b_valid, squared))  # pyright: ignore[reportArgumentType]
 
@@ -256,7 +256,7 @@ def _pairs_of_tensors(
     whole = _leading_shape(a, b, a_valid, b_valid)
 
     def compact(tensor: torch.Tensor | None, own: int) -> torch.Tensor | None:
-        """The tensor in contiguous memory, dimensions that an expand() only repeats taken once."""
+        """Return the tensor in contiguous memory, dimensions that an expand() only repeats taken once."""
         if tensor is None:
             return None
         tensor = tensor.detach()
@@ -279,7 +279,7 @@ def _nearest_tensors(pairs: PointSetPairs, device: torch.device) -> list[torch.T
 
 
 def _on_torch_stream(device: torch.device) -> AbstractContextManager[Any]:
-    """On CUDA, Warp launches on torch's current stream, so that neither waits for the other."""
+    """Return a context in which Warp launches on torch's current CUDA stream, so that neither waits for the other."""
     if device.type != "cuda":
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)

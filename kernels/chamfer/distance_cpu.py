@@ -141,7 +141,7 @@ NEAREST = """
 
 @functools.cache
 def one_pass_kernel() -> Any:
-    """The kernel of both directions in one pass; launch with dim `problems`."""
+    """Return the kernel of both directions in one pass; launch with dim `problems`."""
 
     @wp.func_native((COMMON + ONE_PASS).replace("@CAPACITY@", str(GATHERED_POINTS)))
     def both_directions(
@@ -192,7 +192,7 @@ def one_pass_kernel() -> Any:
 
 @functools.cache
 def nearest_kernel() -> Any:
-    """The kernel of nearest points; launch with dim `problems`."""
+    """Return the kernel of nearest points; launch with dim `problems`."""
 
     @wp.func_native((COMMON + NEAREST).replace("@CAPACITY@", str(GATHERED_POINTS)))
     def search(

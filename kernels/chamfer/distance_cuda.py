@@ -64,7 +64,7 @@ def instructions(n: int, m: int, tiling: Tiling | None = None) -> int:
 
 
 def best_tiling(n: int) -> Tiling:
-    """The tiling with the fewest instructions for a first set of `n` points."""
+    """Return the tiling with the fewest instructions for a first set of `n` points."""
     candidates = (Tiling(16, blocks=4), Tiling(8), Tiling(4), Tiling(2))
     return min(candidates, key=lambda tiling: instructions(n, 1, tiling))
 
@@ -233,7 +233,7 @@ ONE_PASS = """
 
 
 def filled(template: str, **fields: object) -> str:
-    """The source with a value for each @FIELD@."""
+    """Return the source with a value for each @FIELD@."""
     for name, value in fields.items():
         template = template.replace(f"@{name.upper()}@", str(value))
     return template
@@ -241,7 +241,7 @@ def filled(template: str, **fields: object) -> str:
 
 @functools.cache
 def one_pass_kernel(tiling: Tiling) -> Any:
-    """The kernel of both directions in one pass; launch with dim (problems, tiling.threads)."""
+    """Return the kernel of both directions in one pass; launch with dim (problems, tiling.threads)."""
     source = filled(
         COMMON + (EXPANDED if tiling.expanded else DIFFERENCE) + ONE_PASS,
         k=tiling.points_per_lane,

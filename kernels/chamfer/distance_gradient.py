@@ -15,13 +15,13 @@ import warp as wp
 
 @wp.func
 def batch_index(problem: int, batch: wp.vec2i) -> int:
-    """The set that a problem uses: its index divided by batch[0], modulo batch[1]."""
+    """Return the set that a problem uses: its index divided by batch[0], modulo batch[1]."""
     return (problem / batch[0]) % batch[1]
 
 
 @wp.func
 def slope(difference: wp.vec3, squared: bool) -> wp.vec3:
-    """The derivative of |d| (or |d|^2) with respect to d [-, or m]."""
+    """Return the derivative of |d| (or |d|^2) with respect to d [-, or m]."""
     if squared:
         return 2.0 * difference
     return wp.normalize(difference)  # zero for zero

@@ -144,7 +144,7 @@ GATHER = """
 
 @functools.cache
 def nearest_kernel() -> Any:
-    """The kernel of nearest points; launch with dim (problems, chunks of queries, NEAREST_THREADS)."""
+    """Return the kernel of nearest points; launch with dim (problems, chunks of queries, NEAREST_THREADS)."""
 
     @wp.func_native(filled(COMMON + DIFFERENCE + NEAREST, k=NEAREST_PER_THREAD, threads=NEAREST_THREADS))
     def search(
@@ -188,7 +188,7 @@ def nearest_kernel() -> Any:
 
 @functools.cache
 def gradient_kernel() -> Any:
-    """The kernel of the gradient; launch with dim (problems, chunks of points, GATHER_THREADS)."""
+    """Return the kernel of the gradient; launch with dim (problems, chunks of points, GATHER_THREADS)."""
 
     @wp.func_native(filled(COMMON + GATHER, threads=GATHER_THREADS))
     def gather(

@@ -21,7 +21,7 @@ MEAN_THREADS = 128
 
 
 def broadcast_shape(shapes: Sequence[Sequence[int]]) -> tuple[int, ...]:
-    """The shape that the shapes broadcast to.
+    """Return the shape that the shapes broadcast to.
 
     Raises:
         ValueError: if two sizes of a dimension differ and neither is 1.
@@ -142,7 +142,7 @@ class PointSetPairs:
         return distance_cuda.SHARED_POINTS if self.device.is_cuda else distance_cpu.GATHERED_POINTS
 
     def swapped(self) -> PointSetPairs:
-        """The same pairs with first and second set exchanged."""
+        """Return the same pairs with first and second set exchanged."""
         return PointSetPairs(
             self.b, self.a, self.b_valid, self.a_valid,
             self.b_batch, self.a_batch, self.b_valid_batch, self.a_valid_batch, self.count,
@@ -155,7 +155,7 @@ class PointSetPairs:
         return [wp.empty((self.count, k), dtype=dtype, device=device) for k in (self.n, self.m)]
 
     def kernels(self, tiling: Tiling | None, gradient: bool) -> list[tuple[Any, int]]:
-        """The kernels that a batch like this launches, each with its threads a block, to load them beforehand."""
+        """Return the kernels that a batch like this launches, each with its threads per block, to load beforehand."""
         cuda = self.device.is_cuda
         found: list[tuple[Any, int]] = []
         if self.fits_one_pass:
@@ -173,7 +173,7 @@ class PointSetPairs:
         return found
 
     def _ordered(self) -> tuple[bool, Tiling]:
-        """Whether to exchange the sets for the one-pass kernel, and the tiling to use."""
+        """Return whether to exchange the sets for the one-pass kernel, and the tiling to use."""
         most = self._most_second_points
         orders = [swap for swap, second in ((False, self.m), (True, self.n)) if second <= most]
         sizes = {False: (self.n, self.m), True: (self.m, self.n)}

@@ -37,7 +37,7 @@ class TileLists:
 
 @wp.func
 def exponent(place: wp.vec4, shape: wp.vec4, x: float, y: float) -> float:
-    """d^T Q d / 2 at a pixel."""
+    """Return d^T Q d / 2 at a pixel."""
     dx = place[0] - x
     dy = place[1] - y
     return 0.5 * (shape[0] * dx * dx + shape[2] * dy * dy) + shape[1] * dx * dy

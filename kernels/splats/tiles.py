@@ -25,13 +25,13 @@ MIN_DEPTH_BITS = wp.constant(struct.unpack("<i", struct.pack("<f", MIN_DEPTH))[0
 
 @wp.func
 def depth_key(depth: float) -> int:
-    """The depth as an integer that grows with it."""
+    """Return the depth as an integer that grows with it."""
     return wp.min((wp.cast(depth, int) - MIN_DEPTH_BITS) >> 3, MAX_DEPTH_KEY)
 
 
 @wp.kernel
 def count_pairs(end: wp.array[int], splats: int, capacity: int, pairs: wp.array[int], overflow: wp.array[int]):
-    """How many pairs of Gaussian and tile an image has, and how many of these find no room."""
+    """Count the pairs of Gaussian and tile of an image, and those of them beyond the capacity."""
     image = wp.tid()
     last = end[(image + 1) * splats - 1]
     first = wp.int32(0)
@@ -79,7 +79,7 @@ def fill_unused_keys(end: wp.array[int], beyond: wp.int64, key: wp.array[wp.int6
 
 @wp.kernel
 def find_tiles(key: wp.array[wp.int64], capacity: int, first: wp.array[int]):
-    """Where a tile's keys begin in the sorted list, by bisection; those of the next begin where they end."""
+    """Find where a tile's keys begin in the sorted list, by bisection; those of the next begin where they end."""
     tile = wp.tid()
     sought = wp.int64(tile) << TILE_SHIFT
     low = wp.int32(0)

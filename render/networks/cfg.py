@@ -73,12 +73,15 @@ class RenderTrainCfg:
     seed: int = 0
     """Seed of all random numbers."""
     flow: NetworkTrainCfg = field(default_factory=NetworkTrainCfg)
+    """Training of the network for robot and background."""
     enlarge: NetworkTrainCfg = field(default_factory=lambda: NetworkTrainCfg(batch=16))
     """Training of the super-resolution."""
     network: FlowNetworkCfg = field(default_factory=FlowNetworkCfg)
     """Sizes of the flow's U-Net; the pose is a condition where the camera moves."""
     super_resolution: SuperResolutionCfg = field(default_factory=SuperResolutionCfg)
+    """The network that enlarges images."""
     augment: AugmentCfg = field(default_factory=AugmentCfg)
+    """Augmentation of previous images."""
     crop: int = 24
     """Edge of the pieces that the super-resolution learns from, in its input [px]."""
     checkpoint: float = 60.0

@@ -14,6 +14,7 @@ class RatesCfg:
     means: float = 0.004
     """Of centres, relative to the size of the object; it falls to a hundredth by the end."""
     quats: float = 0.002
+    """Of quaternions."""
     scales: float = 0.015
     """Of the logarithms of scales."""
     opacities: float = 0.06
@@ -57,7 +58,9 @@ class SplatFitCfg:
     checkpoint_period: float = 20.0
     """Time between checkpoints [s]."""
     rates: RatesCfg = field(default_factory=RatesCfg)
+    """Learning rates."""
     seed: int = 0
+    """Seed of the order of the views."""
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.start, self.most, self.views, self.every) < 1 or self.degree not in range(4):

@@ -100,7 +100,7 @@ class SlidingFriction(FrictionEffect):
     column, condim = SLIDING, 3
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One coefficient."""
+        """Return one coefficient."""
         null = self.null(m)
         return (Parameter("coefficient", "-", null, 0.0, 3.0, 0.15, scan=(0.7 * null, 1.4 * null)),)
 
@@ -116,7 +116,7 @@ class TorsionalFriction(FrictionEffect):
     column, condim = TORSIONAL, 4
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One coefficient, a length."""
+        """Return one coefficient, a length."""
         return (Parameter("coefficient", "m", self.null(m), 0.0, 0.2, 0.005, scan=(0.002, 0.01)),)
 
 
@@ -131,7 +131,7 @@ class RollingFriction(FrictionEffect):
     column, condim = ROLLING, 6
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One coefficient, a length."""
+        """Return one coefficient, a length."""
         return (Parameter("coefficient", "m", self.null(m), 0.0, 0.1, 0.002, scan=(0.0005, 0.002)),)
 
 
@@ -148,7 +148,7 @@ class AnisotropicFriction(SurfaceEffect):
     confusions = ("sliding_friction", "gravity_tilt")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One ratio."""
+        """Return one ratio."""
         return (Parameter("ratio", "-", 1.0, 0.05, 10.0, 0.4),)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
@@ -215,13 +215,13 @@ class Adhesion(SurfaceEffect):
     GAP = 0.001
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One force for each point."""
+        """Return one force for each point."""
         weight = float(m.body_mass[self.ids(m)].sum() * np.linalg.norm(m.opt.gravity))
         scan = tuple(weight * x for x in (0.1, 0.3, 1.0, 3.0))
         return (Parameter("force", "N", 0.0, 0.0, 30 * weight, 0.3 * weight, scan=scan),)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
-        """The pull."""
+        """Return the pull."""
         moving = np.flatnonzero(np.isin(m.body_weldid, m.body_weldid[self.ids(m)]))
         return AdhesionForce(m, moving, self.GAP)
 
@@ -268,7 +268,7 @@ class PadFriction(Effect):
         return np.unique(np.concatenate([geoms_of(m, b) for b in self.ids(m)]))
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One coefficient."""
+        """Return one coefficient."""
         held = [geoms_of(m, b) for b in free_bodies(m)]
         among = np.concatenate([self.geoms(m), *held])
         among = among[(m.geom_contype[among] != 0) | (m.geom_conaffinity[among] != 0)]

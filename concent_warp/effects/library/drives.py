@@ -77,7 +77,7 @@ class ActuatorGain(DriveEffect):
     confusions = ("joint_compliance", "gravity_compensation", "load_friction", "mass")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One factor for each actuator."""
+        """Return one factor for each actuator."""
         return self.parameter_per_target("gain", "-", 1.0, low=0.05, high=5.0, scale=0.2)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -108,7 +108,7 @@ class GripForce(ActuatorGain):
         return (found,) if found else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One factor for all."""
+        """Return one factor for all."""
         return (Parameter("gain", "-", 1.0, 0.02, 10.0, 0.3, scan=GRIP_FACTORS),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ class ActuatorSaturation(DriveEffect):
                 actuator.forcerange = [-self.FREE, self.FREE]
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One limit for all actuators of the target, as a share of the largest typical torque of each."""
+        """Return one limit for all actuators of the target, as a share of the largest typical torque of each."""
         joints = np.array([driven_joints(m, a)[0] for a in self.ids(m)])
         top = float(np.max(20 * m.dof_M0[dof_of(m, joints)]))
         scan = tuple((top * np.geomspace(0.05, 20.0, 36)).tolist())  # a limit shows in a narrow range only
@@ -170,7 +170,7 @@ class ActuatorDelay(DriveEffect):
     history = 0.3
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One delay for all."""
+        """Return one delay for all."""
         return (Parameter("delay", "s", 0.0, 0.0, self.history, 0.02),)
 
     def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -201,7 +201,7 @@ class ActuatorLag(DriveEffect):
     history = 0.5
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One time constant for all."""
+        """Return one time constant for all."""
         return (Parameter("time_constant", "s", 0.0, 0.0, 1.0, 0.02),)
 
     def command(self, m: mujoco.MjModel, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -243,7 +243,7 @@ class Backlash(ServoEffect):
         spec.nuserdata += len(spec.actuators)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One width of the play for all."""
+        """Return one width of the play for all."""
         slide = all(m.jnt_type[driven_joints(m, a)[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in self.ids(m))
         unit, size = ("m", 0.1) if slide else ("rad", 1.0)
         scan = tuple(size * x for x in (0.005, 0.01, 0.02, 0.04, 0.08))
@@ -279,7 +279,7 @@ class JointCompliance(ServoEffect):
                 )
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One compliance for each joint."""
+        """Return one compliance for each joint."""
         gains = np.array([servo_gain(m, a) for a in self.ids(m)])
         slide = all(m.jnt_type[driven_joints(m, a)[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in self.ids(m))
         unit = "m/N" if slide else "rad/(N m)"
@@ -343,7 +343,7 @@ class GravityCompensation(Effect):
         spec.worldbody.gravcomp = 1.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One share for all links: positive lifts."""
+        """Return one share for all links: positive lifts."""
         return (Parameter("share", "-", 0.0, -1.5, 1.5, 0.1),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002

@@ -55,7 +55,7 @@ class ContactGeometryOffset(BodyEffect):
         return i > 0 and len(_shapes(m, i)) > 0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """An outward offset of each face."""
+        """Return an outward offset of each face."""
         return tuple(Parameter(face, "m", 0.0, -5e-3, 5e-3, 5e-4) for face in FACES)
 
     def edit(self, spec: mujoco.MjSpec, values: np.ndarray) -> None:

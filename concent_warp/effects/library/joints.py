@@ -72,7 +72,7 @@ class JointFriction(DryFriction):
     confusions = ("joint_damping", "stribeck_friction", "load_friction")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One torque for each joint."""
+        """Return one torque for each joint."""
         ids = self.ids(m)
         scale = typical_torque(m, ids)
         null = m.dof_frictionloss[dof_of(m, ids)]
@@ -99,7 +99,7 @@ class JointDamping(JointEffect):
     confusions = ("joint_friction", "actuator_gain", "air_drag")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One coefficient for each joint."""
+        """Return one coefficient for each joint."""
         ids = self.ids(m)
         scale, null = typical_torque(m, ids), m.dof_damping[dof_of(m, ids)]
         unit = self.units(m, "N m s/rad", "N s/m")
@@ -124,7 +124,7 @@ class Armature(JointEffect):
     confusions = ("mass", "inertia", "actuator_lag")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One inertia for each joint."""
+        """Return one inertia for each joint."""
         ids = self.ids(m)
         inertia, null = m.dof_M0[dof_of(m, ids)], m.dof_armature[dof_of(m, ids)]
         return self.parameter_per_joint(
@@ -150,7 +150,7 @@ class JointOffset(JointEffect):
     confusions = ("sensor_bias", "gravity_tilt", "frame_offset")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One offset for each joint: how far the true angle is beyond the reading."""
+        """Return one offset for each joint: how far the true angle is beyond the reading."""
         slide = self.units(m, "rad", "m") == "m"
         high, scale = (0.05, 0.003) if slide else (0.5, 0.03)
         return self.parameter_per_target("offset", "m" if slide else "rad", 0.0, low=-high, high=high, scale=scale)
@@ -176,7 +176,7 @@ class Stribeck(DryFriction):
     confusions = ("joint_friction", "backlash")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """One torque for each joint, and the speed at which it has fallen to a third."""
+        """Return one torque for each joint, and the speed at which it has fallen to a third."""
         ids = self.ids(m)
         torque, zero = typical_torque(m, ids), np.zeros(len(ids))
         parameters = self.parameter_per_joint("extra", self.units(m, "N m", "N"), zero, 0.3 * torque, 20 * torque)
@@ -201,7 +201,7 @@ class LoadDependentFriction(DryFriction):
     confusions = ("joint_friction", "actuator_gain")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One coefficient for each joint."""
+        """Return one coefficient for each joint."""
         return self.parameter_per_target("coefficient", "-", 0.0, low=0.0, high=0.9, scale=0.1)
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:

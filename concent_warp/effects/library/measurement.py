@@ -35,7 +35,7 @@ class TimeBase(MeasurementEffect):
     rarity = 4.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One scale."""
+        """Return one scale."""
         return (Parameter("scale", "-", 0.0, -0.2, 0.2, 0.01),)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
@@ -52,7 +52,7 @@ class Latency(MeasurementEffect):
     confusions = ("actuator_delay", "time_base")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One delay."""
+        """Return one delay."""
         return (Parameter("delay", "s", 0.0, -0.1, 0.3, 0.01),)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
@@ -80,7 +80,7 @@ class LengthScale(MeasurementEffect):
         return (group,) if group else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One scale."""
+        """Return one scale."""
         return (Parameter("scale", "-", 0.0, -0.5, 0.5, 0.01),)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
@@ -147,7 +147,7 @@ class SensorBias(MeasurementEffect):
         return (group,) if group else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One constant for each sensor."""
+        """Return one constant for each sensor."""
         return self.parameter_per_target("bias", "rad or m", 0.0, low=-0.5, high=0.5, scale=0.01)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
@@ -171,7 +171,7 @@ class SensorGain(MeasurementEffect):
         return (group,) if group else ()
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One scale for each sensor."""
+        """Return one scale for each sensor."""
         return self.parameter_per_target("scale", "-", 0.0, low=-0.9, high=5.0, scale=0.03)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002

@@ -36,7 +36,7 @@ class Mass(BodyEffect):
     confusions = ("actuator_gain", "sliding_friction", "armature", "grip_force")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One factor."""
+        """Return one factor."""
         return (Parameter("mass", "-", 1.0, 0.1, 10.0, 0.3, scan=(0.7, 1.4)),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -64,7 +64,7 @@ class CenterOfMass(BodyEffect):
             spec.body(n).simple = False
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """An offset along each axis of the body."""
+        """Return an offset along each axis of the body."""
         body = self.ids(m)[0]
         size = float(np.sqrt(m.body_inertia[body].max() / max(m.body_mass[body], 1e-9)))
         return tuple(Parameter(axis, "m", 0.0, -3 * size, 3 * size, 0.3 * size) for axis in "xyz")
@@ -88,7 +88,7 @@ class Inertia(BodyEffect):
     confusions = ("armature", "size", "center_of_mass")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One factor."""
+        """Return one factor."""
         return (Parameter("inertia", "-", 1.0, 0.1, 10.0, 0.3),)
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
@@ -117,7 +117,7 @@ class Size(BodyEffect):
         return tuple((n,) for b in free_bodies(m) if (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)))
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """One factor."""
+        """Return one factor."""
         return (Parameter("size", "-", 1.0, 0.5, 2.0, 0.02),)
 
     def edit(self, spec: mujoco.MjSpec, values: np.ndarray) -> None:

@@ -54,7 +54,7 @@ class EvolutionCfg:
     elite_share: float = 0.25
     """Share of the candidates that move the estimate."""
     momentum: float = 0.6
-    """Weight of the elites' mean in the exponential moving average."""
+    """Weight of the elites' mean in the exponential moving average [-]."""
     mean_smoothing: float = 0.0
     """Length [m] of a further smoothing of the update inside the mask; 0 leaves it as smooth as the noise is."""
     neighbours: int = 8
@@ -66,11 +66,11 @@ class EvolutionCfg:
     fit_radius: bool = False
     """Fit radii too."""
     radius_sigma: float = 0.05
-    """Standard deviation of the logarithm of a radius."""
+    """Standard deviation of the logarithm of a radius [-]."""
     fit_friction: bool = False
     """Fit friction coefficients too."""
     friction_sigma: float = 0.1
-    """Standard deviation of the logarithm of a friction coefficient."""
+    """Standard deviation of the logarithm of a friction coefficient [-]."""
 
     @property
     def flattens(self) -> bool:

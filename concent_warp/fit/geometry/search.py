@@ -27,6 +27,7 @@ class GeometrySearchCfg:
     """Settings of the evolution strategy's search."""
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
+    """Settings of the evolution strategy."""
     generations: int = 70
     """Generations at most."""
     plateau_generations: int = 20

@@ -31,9 +31,9 @@ class FactorCfg:
     iterations: int = 8
     """Steps at most; each costs two simulations of each factor on each stretch in Newton."""
     step: float = 0.3
-    """First step, of the logarithm of a factor."""
+    """First step of the logarithm of a factor [-]."""
     smallest_step: float = 0.03
-    """A factor whose steps are shorter is finished."""
+    """Step of the logarithm of a factor below which its descent ends [-]."""
     min_gain: float = 0.05
     """Share by which a factor must lower the loss; otherwise it counts as 1 [-]. Empirical."""
     friction_range: tuple[float, float] = (0.2, 5.0)
@@ -43,8 +43,8 @@ class FactorCfg:
     mass_range: tuple[float, float] = (0.7, 2.0)
     """Smallest and largest factor on masses [-]: contacts stay stable within them."""
     max_engine_ratio: float = 5.0
-    """How many times farther from what was observed the model may be in Newton than in MuJoCo: beyond that
-    Newton simulates another motion, as of a grasp that slips [-]. Empirical."""
+    """Loss of the model in Newton over that in MuJoCo above which gradients are not used [-]: Newton then simulates
+    another motion, such as a slipping grasp. Empirical."""
     device: str | None = None
     """Where Newton runs, "cpu" or "cuda:0"; None takes CUDA where there is a device."""
     horizon: HorizonCfg = field(default_factory=HorizonCfg)

@@ -36,7 +36,7 @@ class ExpertCfg:
     yaw_error: float = 0.02
     """Spread of the block's rotation against the hole [rad]."""
     speed: float = 1.0
-    """Speed factor of the whole script."""
+    """Factor on the speed of the whole motion [-]."""
 
 
 @dataclass(frozen=True)

@@ -41,13 +41,13 @@ def body_geoms(rig: Rig) -> np.ndarray:
 
 
 def sliding_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another coefficient [-]."""
+    """Return the effect of another coefficient [-]."""
     effect = with_friction(rig, "sliding_friction", lambda _t, _p: np.array([magnitude, magnitude]))
     return HiddenEffectOfRig("sliding_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
 def anisotropic_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Friction along the surface's y is that along x times a ratio [-]."""
+    """Return the effect of friction along the surface's y that is that along x times a ratio [-]."""
     mu = nominal_friction(rig) * np.array([1.0, magnitude])
     effect = with_friction(rig, "anisotropic_friction", lambda _t, _p: mu)
     return HiddenEffectOfRig("anisotropic_friction", effect, {"ratio": magnitude}, (rig.body,))
@@ -79,19 +79,19 @@ def turning_friction(rig: Rig, magnitude: float, *, rolling: bool) -> HiddenEffe
 
 
 def torsional_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another coefficient against spinning in place [m]."""
+    """Return the effect of another coefficient against spinning in place [m]."""
     effect = turning_friction(rig, magnitude, rolling=False)
     return HiddenEffectOfRig("torsional_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
 def rolling_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another coefficient against rolling [m]."""
+    """Return the effect of another coefficient against rolling [m]."""
     effect = turning_friction(rig, magnitude, rolling=True)
     return HiddenEffectOfRig("rolling_friction", effect, {"coefficient": magnitude}, (rig.body,))
 
 
 def contact_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another damping ratio [-] of the contact, and a time constant that goes with its root."""
+    """Return the effect of another damping ratio [-] of the contact, and of a time constant that goes with its root."""
     nominal = rig.scene.model.geom(rig.surface).solref
     time_constant = float(nominal[0] * np.sqrt(magnitude / nominal[1]))
 
@@ -104,7 +104,7 @@ def contact_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> HiddenEffectOfRig:
-    """A force [N] that pulls each lower corner of a box to the surface while it is within a gap [m] of it."""
+    """Return a force [N] that pulls each lower corner of a box to the surface while it is within a gap [m] of it."""
     half = rig.scene.model.geom_size[body_geoms(rig)[0]]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
 
@@ -122,7 +122,7 @@ def adhesion(rig: Rig, magnitude: float, *, gap: float = 1e-3) -> HiddenEffectOf
 
 
 def grip_force(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """The gripper's stiffness, damping and limit times a factor [-]."""
+    """Return the effect of a factor [-] on the gripper's stiffness, damping and limit."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name in rig.grippers:
@@ -135,7 +135,7 @@ def grip_force(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def pad_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Another friction coefficient of the pads on the grasped object [-]."""
+    """Return the effect of another friction coefficient of the pads on the grasped object [-]."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for name in rig.pads:

@@ -74,21 +74,21 @@ def arm_only(rig: Rig, hook: CommandDelay | CommandLag) -> HiddenEffect:
 
 
 def actuator_delay(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Commands act later [s]."""
+    """Return the effect of commands that act later [s]."""
     return HiddenEffectOfRig(
         "actuator_delay", arm_only(rig, CommandDelay(magnitude)), {"delay": magnitude}, actuator_names(drives(rig))
     )
 
 
 def actuator_lag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Set points follow with a time constant [s]."""
+    """Return the effect of set points that follow with a time constant [s]."""
     return HiddenEffectOfRig(
         "actuator_lag", arm_only(rig, CommandLag(magnitude)), {"time_constant": magnitude}, actuator_names(drives(rig))
     )
 
 
 def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """The force of every drive is the nominal one times a factor [-]."""
+    """Return the effect of a factor [-] on the force of every drive."""
     found = drives(rig)
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -104,7 +104,7 @@ def actuator_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """No drive exceeds a limit [N m or N]."""
+    """Return the effect of a limit [N m or N] of every drive."""
     found = drives(rig)
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -138,7 +138,7 @@ def peak_drive_force(rig: Rig, demonstrations: int, seed: int) -> float:
 
 
 def joint_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """How far the true angle is beyond what encoder and drive take it for [rad or m], in alternate directions."""
+    """Return the effect of true angles beyond those of encoder and drive [rad or m], in alternate directions."""
     found = drives(rig)
     m = rig.scene.model
     offset = magnitude * np.array([(-1.0) ** k for k in range(len(found))])

@@ -132,13 +132,13 @@ def with_rotors(rig: Rig, name: str, make: Callable[[Drive, int], Rotor], *, on_
 
 
 def backlash(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Full width of the play between rotor and link [rad or m]; the encoder reads the link."""
+    """Return play of a full width [rad or m] between rotor and link; the encoder reads the link."""
     effect = with_rotors(rig, "backlash", lambda d, i: BacklashRotor(d, i, magnitude), on_rotor=False)
     return HiddenEffectOfRig("backlash", effect, {"play": magnitude}, actuator_names(drives(rig)))
 
 
 def joint_compliance(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Compliance [rad/(N m) or m/N] of the strongest drive's joint, more in others; the encoder reads the rotor."""
+    """Return a compliance [rad/(N m) or m/N] of the strongest drive's joint, more of others; encoders read rotors."""
     found = drives(rig)
     compliance = {d.actuator: magnitude / d.weight for d in found}
     effect = with_rotors(

@@ -127,7 +127,7 @@ def parse_effects(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
 
 
 def no_plan(rng: np.random.Generator, k: int) -> RigTrial:
-    """No motion is planned: the policy moves."""
+    """Raise an error: the motion of a task is the policy's, and none is planned."""
     del rng, k
     raise NotImplementedError("a policy moves the world of a task")
 

@@ -61,7 +61,7 @@ def friction(name: str, levels: dict[str, Level]) -> HiddenEffect:
 
 
 def joint_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Coulomb friction [N m or N] of the strongest drive; less in weaker ones."""
+    """Return Coulomb friction [N m or N] of the strongest drive, less of weaker ones."""
     found = drives(rig)
     torque = np.array([magnitude * d.weight for d in found])
     levels: dict[str, Level] = {d.joint: lambda _m, _d, _i, t=t: t for d, t in zip(found, torque, strict=True)}
@@ -72,7 +72,7 @@ def joint_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def stribeck_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Friction [N m or N] at rest that fades with speed."""
+    """Return friction [N m or N] at rest that fades with speed."""
     found = drives(rig)
     speed = 0.03 if rig.slides else 0.3
     extra = np.array([magnitude * d.weight for d in found])
@@ -89,7 +89,7 @@ def stribeck_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def load_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Friction by a coefficient [-] of the load between motor and link, the mean of the torques on both sides."""
+    """Return friction by a coefficient [-] of the load between motor and link, the mean of both sides' torques."""
     joints = tuple(d.joint for d in drives(rig))
 
     def level(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float:
@@ -101,7 +101,7 @@ def load_friction(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Viscous friction beyond the nominal one [N m s/rad or N s/m] of the strongest drive."""
+    """Return viscous friction beyond the nominal one [N m s/rad or N s/m] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
     joints = tuple(d.joint for d in found)
@@ -117,7 +117,7 @@ def joint_damping(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Rotor inertia beyond the nominal one [kg m^2 or kg] of the strongest drive."""
+    """Return rotor inertia beyond the nominal one [kg m^2 or kg] of the strongest drive."""
     found = drives(rig)
     added = np.array([magnitude * d.weight for d in found])
     joints = tuple(d.joint for d in found)
@@ -133,7 +133,7 @@ def armature(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def gravity_compensation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A share [-] of each link's weight that its controller holds up too much."""
+    """Return the effect of a controller that holds up each link by a share [-] of its weight too much."""
     m = rig.scene.model
     free = {m.jnt_bodyid[j] for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE}
     links = tuple(m.body(b).name for b in range(1, m.nbody) if b not in free and m.body_mass[b] > 0)

@@ -32,7 +32,7 @@ def clock_channels(rig: Rig) -> tuple[str, ...]:
 
 
 def time_base(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A clock that runs fast by a share [-]."""
+    """Return the effect of a clock that runs fast by a share [-]."""
     wrong = clock_channels(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
@@ -42,7 +42,7 @@ def time_base(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def latency(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Readings are stamped too late [s]; those older than the recording are lost."""
+    """Return the effect of readings stamped too late [s]; those before the recording are lost."""
     wrong = clock_channels(rig)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
@@ -52,7 +52,7 @@ def latency(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def length_scale(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Positions too large by a share [-]."""
+    """Return the effect of positions too large by a share [-]."""
     wrong = sensors_of_kinds(rig, SENSOR.mjSENS_FRAMEPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
@@ -62,7 +62,7 @@ def length_scale(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def frame_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """The tracker stands elsewhere than calibrated: shifted [m] along x, -y and half along z, and turned."""
+    """Return the effect of a tracker shifted [m] along x, -y and half along z, and turned against its calibration."""
     shift = magnitude * np.array([1.0, -1.0, 0.5])
     turn = magnitude * 3.0 * np.array([1.0, 0.5, -1.0])
     rotation = Rotation.from_rotvec(turn)
@@ -81,7 +81,7 @@ def frame_offset(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def sensor_bias(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Encoders read too much by a constant [rad or m]."""
+    """Return the effect of encoders that read too much by a constant [rad or m]."""
     wrong = sensors_of_kinds(rig, SENSOR.mjSENS_JOINTPOS)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:
@@ -92,7 +92,7 @@ def sensor_bias(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def sensor_gain(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Encoders read too much by a share [-]."""
+    """Return the effect of encoders that read too much by a share [-]."""
     wrong = sensors_of_kinds(rig, SENSOR.mjSENS_JOINTPOS, SENSOR.mjSENS_JOINTVEL)
 
     def measure(name: str, time: np.ndarray, value: np.ndarray) -> Written:

@@ -11,7 +11,7 @@ from concent_warp.reality.world import HiddenEffect, chamfered_box
 
 
 def mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Mass and inertia times a factor [-]."""
+    """Return the effect of a factor [-] on mass and inertia."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)
@@ -22,7 +22,7 @@ def mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def center_of_mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Centre of mass displaced from the nominal one by this much along x and half as much along -y [m], body frame."""
+    """Return a centre of mass displaced along x [m], and half as much along -y, body frame."""
     shift = magnitude * np.array([1.0, -0.5, 0.0])
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -34,7 +34,7 @@ def center_of_mass(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def inertia(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Inertia times a factor [-] at the same mass: more of it far out."""
+    """Return the effect of a factor [-] on the inertia at the same mass."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)
@@ -44,7 +44,7 @@ def inertia(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def size(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Lengths times a factor [-] at the same mass and inertia."""
+    """Return the effect of a factor [-] on lengths at the same mass and inertia."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)
@@ -56,7 +56,7 @@ def size(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def contact_geometry(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A box that is wider on one side [m], with worn edges; mass and inertia are nominal."""
+    """Return the effect of a box wider on one side [m], with worn edges; mass and inertia are nominal."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)

@@ -22,7 +22,7 @@ SPOT = np.array([0.03, 0.02])
 
 
 def cogging(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Torque that ripples with the angle, as magnets pass teeth [N m or N]."""
+    """Return a torque that ripples with the angle, as magnets pass teeth [N m or N]."""
     pitch = 2 * np.pi / PITCH if rig.slides else POLES
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -35,7 +35,7 @@ def cogging(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def cable(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A cable [N/m] that is as long as the way to where the body rests: slack on one side, and tugging on the other."""
+    """Return the force of a cable [N/m] as long as the distance to the resting body: slack on one side, else taut."""
     rest = data_at_rest(rig)
     slack = np.linalg.norm(ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
 
@@ -66,7 +66,7 @@ def cable_end(rig: Rig, data: mujoco.MjData, body: int) -> np.ndarray:
 
 
 def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A magnet under the table that pulls the body sideways [N] when it is near."""
+    """Return the force of a magnet under the table that pulls the body sideways [N] when it is near."""
     reach = 0.05
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -78,7 +78,7 @@ def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A place on the table where friction is other by a coefficient [-]."""
+    """Return the effect of a place on the table where the coefficient of friction differs [-]."""
     mu, radius = nominal_friction(rig), 0.05
 
     def coefficients(time: float, point: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def warming(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Friction of a cold drive [N m or N] that is gone after a few seconds."""
+    """Return the friction of a cold drive [N m or N], which vanishes within a few seconds."""
     levels: dict[str, Level] = {
         d.joint: lambda _m, s, _i, w=d.weight: magnitude * w * float(np.exp(-max(s.time, 0.0) / 2.0))
         for d in drives(rig)
@@ -99,7 +99,7 @@ def warming(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def dropout(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Drives that lose a share of their force [-] for 0.3 s, twice."""
+    """Return the effect of drives that lose a share of their force [-] for 0.3 s, twice."""
     found = drives(rig)
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -111,7 +111,7 @@ def dropout(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def slosh(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """A share of the body's mass [-] that swings in it on springs, at 3 Hz."""
+    """Return the effect of a share of the body's mass [-] that swings in it on springs, at 3 Hz."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         body = fixed_inertia(spec, rig.body)

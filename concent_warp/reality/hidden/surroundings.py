@@ -18,7 +18,7 @@ AIR = 1.2
 
 
 def gravity_tilt(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """The table's normal leans against the vertical: gravity turned about x [rad], and by -0.6 of it about y."""
+    """Return a tilt of the table against gravity: about x [rad], and by -0.6 of it about y."""
     turn = magnitude * np.array([1.0, -0.6, 0.0])
     down = np.array(rig.scene.model.opt.gravity)
     angle = float(np.linalg.norm(turn))
@@ -67,12 +67,12 @@ def shadow(model: mujoco.MjModel, body: int, direction: np.ndarray) -> tuple[flo
 
 
 def air_drag(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Still air of a density times drag factor [kg/m^3]."""
+    """Return the drag of still air of a density times drag factor [kg/m^3]."""
     return HiddenEffectOfRig("air_drag", air(magnitude, np.zeros(3), rig.body), {"density": magnitude}, (rig.body,))
 
 
 def wind(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
-    """Wind [m/s] along -x, and half as much along y; a drag factor of 1."""
+    """Return the drag of wind [m/s] along -x, and half as much along y; a drag factor of 1."""
     velocity = magnitude * np.array([-1.0, 0.5, 0.0])
     truth = dict(zip("xyz", map(float, velocity), strict=True))
     return HiddenEffectOfRig("wind", air(AIR, velocity, rig.body), truth, (rig.body,))

@@ -22,11 +22,11 @@ class FootageCfg:
     size: tuple[int, int] = (256, 256)
     """Height and width of a frame [px]."""
     rate: float = 10.0
-    """Frames a second."""
+    """Frame rate [Hz]."""
     objects: bool = True
     """Whether the objects are visible. Frames without them are for training the appearance of robot and background."""
     noise: float = 2.0
-    """Noise of the colours, in steps of 1/255."""
+    """Standard deviation of the colours' noise [1/255]."""
     white_balance: tuple[float, float, float] = (1.10, 1.0, 0.84)
     """Gains of red, green and blue [-]: warmer than the simulated camera."""
     gamma: float = 0.85

@@ -30,7 +30,7 @@ class PhotographsCfg:
     fill: float = 0.8
     """Share of the image's height that the object's bounding sphere takes."""
     rgb_std: float = 0.0
-    """Noise of the colours, in steps of 1/255."""
+    """Standard deviation of the colours' noise [1/255]."""
     lowest: float = -90.0
     """Least elevation of the camera [degrees]: -90 also sees the object from below, as where it is turned by hand."""
 

@@ -37,9 +37,9 @@ class SensingCfg:
     point_count: int = 96
     """Points tracked on each object."""
     camera_position: tuple[float, float, float] = (1.05, -0.45, 0.65)
-    """Place of the camera [m]; it looks at the workspace."""
+    """Position of the camera [m]."""
     camera_target: tuple[float, float, float] = (0.48, -0.02, 0.02)
-    """Point that the camera looks at [m]."""
+    """Point at which the camera is aimed [m]."""
     camera_fovy: float = 20.0
     """Vertical field of view of the camera [degrees]."""
     images: bool = False
@@ -51,7 +51,7 @@ class SensingCfg:
     image_samples: int = 2
     """Colour samples along each edge of a pixel [-]."""
     rgb_std: float = 2.0
-    """Noise of the colours, in steps of 1/255."""
+    """Standard deviation of the colours' noise [1/255]."""
     depth_noise: float = 1.425e-3
     """Depth noise per squared depth [1/m]: std = depth_noise * z^2, 1.3 mm at 0.95 m. The figure of a structured-light
     camera: Khoshelham and Oude Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12(2), 2012."""
@@ -64,7 +64,7 @@ class SensingCfg:
     tracking_std: float = 1e-4
     """Slow deviation of the joints from their commands that no encoder measures [rad]."""
     tracking_time: float = 0.3
-    """Correlation time of the wander [s]."""
+    """Correlation time of this deviation [s]."""
 
     def pinhole(self) -> Pinhole:
         """Return the camera as calibrated: upright, its principal point in the middle of the image."""
