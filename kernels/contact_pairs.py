@@ -31,9 +31,9 @@ wp.set_module_options({"enable_backward": False})
 
 MASK, POINT, DISPLACEMENT, DIRECTION, NORMAL = 0, 1, 4, 7, 10
 """First column of each feature within a slot."""
-SLOT = 13
+SLOT_SIZE = 13
 """Numbers a slot: mask 1, contact point, displacement, approach direction and target normal 3 each."""
-SLOTS = 8
+SLOT_COUNT = 8
 """Slots of the paper's observation: 8 x 13 = 104 of its 148 numbers."""
 COINCIDENT = wp.constant(1.0e-6)
 """Distance [m] below which the approach direction shrinks towards 0, so that it has no jump where points coincide."""
@@ -131,15 +131,17 @@ class ContactPairs:
         device, worlds = xpos.device, xpos.shape[0]
         used = table.used
         slots = used.shape[1]
-        self.features = wp.zeros((worlds, slots * SLOT), dtype=float, device=device) if features is None else features
+        self.features = (
+            wp.zeros((worlds, slots * SLOT_SIZE), dtype=float, device=device) if features is None else features
+        )
         check_poses("ContactPairs", xpos, xquat, stage)
         if not (
             self.features.dtype == wp.float32
-            and self.features.shape == (worlds, slots * SLOT)
+            and self.features.shape == (worlds, slots * SLOT_SIZE)
             and self.features.device == device
         ):
             raise ValueError(
-                f"ContactPairs: features must be float32 of shape {(worlds, slots * SLOT)} on {device}, found "
+                f"ContactPairs: features must be float32 of shape {(worlds, slots * SLOT_SIZE)} on {device}, found "
                 f"{self.features.dtype.__name__} of shape {self.features.shape} on {self.features.device}."
             )
         for name in ("body_a", "body_b"):
@@ -258,7 +260,7 @@ def slot_kernel(
             outward = n
         else:
             apart = wp.nan
-    first = i * SLOT
+    first = i * SLOT_SIZE
     features[world, first + MASK] = mask
     write_vector(features, world, first + POINT, contact)
     write_vector(features, world, first + DISPLACEMENT, delta)

@@ -22,15 +22,15 @@ import warp as wp
 PLANE, SPHERE, CAPSULE, CYLINDER, BOX = 0, 2, 3, 5, 6
 """Kinds of the other shape: numbers of `mujoco.mjtGeom`; a sphere is one of the fitted ones too."""
 KINDS = (PLANE, SPHERE, CAPSULE, CYLINDER, BOX)
-OWN, OTHER, LARGER = 0, 1, 2
+SPHERE_FRICTION, SHAPE_FRICTION, LARGER_FRICTION = 0, 1, 2
 """Whose friction counts: the sphere's, the other shape's, or the larger of both (MuJoCo's rule without priority)."""
 
 _PLANE = wp.constant(PLANE)
 _CAPSULE = wp.constant(CAPSULE)
 _CYLINDER = wp.constant(CYLINDER)
 _BOX = wp.constant(BOX)
-_OWN = wp.constant(OWN)
-_OTHER = wp.constant(OTHER)
+_OWN = wp.constant(SPHERE_FRICTION)
+_OTHER = wp.constant(SHAPE_FRICTION)
 _TINY = wp.constant(1.0e-9)
 
 

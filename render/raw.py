@@ -15,12 +15,12 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RenderError
-from concent_warp.scene.spheres.contact_geometry import GROUP
+from concent_warp.scene.spheres.contact_geometry import SPHERE_GEOM_GROUP
 
 if TYPE_CHECKING:
     import torch
 
-SHOWN, HIDDEN = 0, 5
+VISIBLE_GROUP, HIDDEN_GROUP = 0, 5
 """Groups that geoms are put in for a camera that shows or leaves out some."""
 
 
@@ -135,7 +135,7 @@ class RawCamera:
         with wp.ScopedDevice(stage.device):
             self._context = mjw.create_render_context(
                 shown, nworld=stage.worlds, cam_res=(width, height), cam_active=rows, render_rgb=True,
-                render_depth=True, render_seg=True, use_shadows=shadows, enabled_geom_groups=[SHOWN],
+                render_depth=True, render_seg=True, use_shadows=shadows, enabled_geom_groups=[VISIBLE_GROUP],
             )  # fmt: skip
             shape = (stage.worlds, len(rows), height, width)
             self._colour: Any = wp.zeros(shape, dtype=wp.vec3)
@@ -209,7 +209,7 @@ def _grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["
     Geoms in MuJoCo's groups 0 to 2 are seen as a rule; of bodies with contact spheres, the spheres where that is asked.
     """
     shown = copy.copy(model)
-    spheres = (model.geom_group == GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
+    spheres = (model.geom_group == SPHERE_GEOM_GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
     covered = np.isin(model.geom_bodyid, np.unique(model.geom_bodyid[spheres])) if objects == "spheres" else False
     seen = (model.geom_group < 3) & ~np.asarray(covered)
     if objects == "spheres":
@@ -217,7 +217,7 @@ def _grouped(model: mujoco.MjModel, leave_out: Sequence[str], objects: Literal["
         shown.geom_rgba[spheres, 3] = 1.0
     out = [body_id(model, name) for name in leave_out]
     seen &= ~np.isin(model.geom_bodyid, out)
-    shown.geom_group[:] = np.where(seen, SHOWN, HIDDEN)
+    shown.geom_group[:] = np.where(seen, VISIBLE_GROUP, HIDDEN_GROUP)
     return shown
 
 

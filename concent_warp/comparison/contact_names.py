@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from concent_warp.model import Model
     from concent_warp.simulate.engine import Rollout
 
-ORDER = {"object": 0, "robot": 1, "world": 2}
+ROLE_ORDER = {"object": 0, "robot": 1, "world": 2}
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class ContactPartners:
             if force[mask].sum() >= self.cfg.min_force_share * force.sum()
             or (role[name] == "object" and lasting[name] >= self.cfg.min_time_share * (end - start))
         ]
-        strong.sort(key=lambda name: (ORDER[role[name]], -force[found[name]].sum()))
+        strong.sort(key=lambda name: (ROLE_ORDER[role[name]], -force[found[name]].sum()))
         names = []
         for name in strong[: self.cfg.max_names]:
             mask = found[name]

@@ -20,9 +20,9 @@ BAR = {"robot": "#2a78b5", "object": "#d1592a", "world": "#a9b2bc"}
 """Colour of a bar, by whether the robot, an object or the surroundings touch the object."""
 BAND = ("#e3eef7", "#fbecdf", "#e4f1e4", "#f1e7f5", "#f6f1d8")
 """Colours of the stages, in turn."""
-THICK = 0.56
+BAR_HEIGHT = 0.56
 """Height of a bar, in rows."""
-LABEL = 26
+LABEL_HEIGHT = 26
 """Height of a stage's label [points]."""
 
 
@@ -65,7 +65,7 @@ def plot_schedule(sequence: ContactEventSequence, path: Path | None = None, titl
         fontsize=8.5,
     )
     name = title if title is not None else sequence.demonstration
-    axes.set_title(name, loc="left", color=INK, fontsize=12, pad=10 + LABEL * (1 + max(levels, default=-1)))
+    axes.set_title(name, loc="left", color=INK, fontsize=12, pad=10 + LABEL_HEIGHT * (1 + max(levels, default=-1)))
     axes.tick_params(length=0, labelsize=9.5, colors=INK)
     axes.grid(axis="x", color="white", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -111,13 +111,13 @@ def _draw_row(axes: Axes, sequence: ContactEventSequence, row: int, a: str, b: s
     role = {entity.body: entity.role for entity in sequence.entities}
     kind = "world" if role[b] == "world" else role[a]
     spans = [(c.start, c.end - c.start) for c in sequence.body_contacts if (c.a, c.b) == (a, b)]
-    axes.broken_barh(spans, (row - THICK / 2, THICK), facecolor=BAR[kind], alpha=0.35, linewidth=0, zorder=2)
+    axes.broken_barh(spans, (row - BAR_HEIGHT / 2, BAR_HEIGHT), facecolor=BAR[kind], alpha=0.35, linewidth=0, zorder=2)
     entity = sequence.entity
     parts = [c for c in sequence.contacts if (entity[c.a].body, entity[c.b].body) == (a, b)]
     time, count = contact_count(parts)
     if count.any():
-        low = np.full(len(time), row + THICK / 2)
-        top = low - THICK * count / count.max()
+        low = np.full(len(time), row + BAR_HEIGHT / 2)
+        top = low - BAR_HEIGHT * count / count.max()
         axes.fill_between(time, low, top, step="post", facecolor=BAR[kind], linewidth=0, zorder=2.1)
 
 
@@ -140,7 +140,7 @@ def _draw_stage(axes: Axes, stage: Stage, colour: str, level: int) -> None:
             text,
             (stage.start, 1),
             xycoords=("data", "axes fraction"),
-            xytext=(1, height + LABEL * level),
+            xytext=(1, height + LABEL_HEIGHT * level),
             textcoords="offset points",
             **style,
         )

@@ -13,7 +13,7 @@ from concent_warp.events.filter import debounce, steps_of
 from concent_warp.events.roles import Roles
 from concent_warp.simulate.engine import ContactLog, Rollout
 
-ORDER = {"robot": 0, "object": 1, "world": 2}
+ROLE_ORDER = {"robot": 0, "object": 1, "world": 2}
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class ReplayContacts:
                 found=int(geom.max()),
             )
         body = roles.geom_body[geom]
-        role = np.array([ORDER[r] for r in roles.body_role])[body]
+        role = np.array([ROLE_ORDER[r] for r in roles.body_role])[body]
         force = np.abs(np.einsum("ci,ci->c", np.asarray(log.force[kept], dtype=float), normal))
         step = np.asarray(log.step[kept], dtype=int)
         rank = _body_rank(roles, step, body, role)
@@ -104,7 +104,7 @@ class ReplayContacts:
             normal=np.where(swap[:, None], normal, -normal),
             force=force,
         )
-        return touches[(role != ORDER["robot"]).any(axis=1) & (body[:, 0] != body[:, 1])]
+        return touches[(role != ROLE_ORDER["robot"]).any(axis=1) & (body[:, 0] != body[:, 1])]
 
     def between(self, a: int, b: int) -> ReplayContacts:
         """Return the contacts of two bodies."""
@@ -133,10 +133,11 @@ def _body_rank(roles: Roles, step: np.ndarray, body: np.ndarray, role: np.ndarra
     """Return the rank of each body, (nbody,): robot, objects by time in contact with the robot, world; then name."""
     contact_steps = dict.fromkeys(roles.ids("object"), 0)
     for b in contact_steps:
-        by_robot = ((body == b) & (role[:, ::-1] == ORDER["robot"])).any(axis=1)
+        by_robot = ((body == b) & (role[:, ::-1] == ROLE_ORDER["robot"])).any(axis=1)
         contact_steps[b] = len(np.unique(step[by_robot]))
     order = sorted(
-        range(len(roles.bodies)), key=lambda i: (ORDER[roles.body_role[i]], -contact_steps.get(i, 0), roles.bodies[i])
+        range(len(roles.bodies)),
+        key=lambda i: (ROLE_ORDER[roles.body_role[i]], -contact_steps.get(i, 0), roles.bodies[i]),
     )
     rank = np.empty(len(order), dtype=int)
     rank[order] = np.arange(len(order))

@@ -10,7 +10,7 @@ import numpy as np
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
 from concent_warp.perception.rigid_motion import inverse, transformed
 
-OWN = 5
+BODY_GEOM_GROUP = 5
 """Geom group that the body's geoms are put into, so that rays meet no others."""
 
 
@@ -25,7 +25,7 @@ class BodyShape:
         mujoco.mj_forward(self.model, self.data)
         row = self.model.body(body).id
         own = self.model.geom_bodyid == row
-        self.model.geom_group[:] = np.where(own, OWN, 0)
+        self.model.geom_group[:] = np.where(own, BODY_GEOM_GROUP, 0)
         self.start = np.eye(4)
         """Pose of the body at the start, shape (4, 4)."""
         self.start[:3, :3] = self.data.xmat[row].reshape(3, 3)
@@ -53,7 +53,7 @@ class BodyShape:
         ray = camera.rays(pixels) @ (back[:3, :3] @ camera.pose[:3, :3]).T
         length = np.linalg.norm(ray, axis=1)
         group = np.zeros(6, dtype=np.uint8)
-        group[OWN] = 1
+        group[BODY_GEOM_GROUP] = 1
         hit = cast_rays(self.model, self.data, origin, ray / length[:, None], group)
         # Rays are scaled to a depth of 1, so depth is distance over length.
         result[window] = np.where(hit >= 0, hit / length, 0.0).reshape(result[window].shape)

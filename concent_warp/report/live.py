@@ -20,19 +20,19 @@ from concent_warp.errors import ConcentError
 from concent_warp.report.scene_data import SHAPES, VISIBLE_GROUPS, mesh_arrays
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
-KEPT, LEFT_OUT, TOUCHING = (20, 60, 150), (95, 100, 110), (185, 20, 0)
+COLLIDABLE_COLOUR, EXCLUDED_COLOUR, CONTACT_COLOUR = (20, 60, 150), (95, 100, 110), (185, 20, 0)
 """Colours of spheres: simulated, not simulated, and in contact."""
-TARGET, PAIR = (20, 150, 60), (240, 170, 0)
+TARGET_COLOUR, PAIR_COLOUR = (20, 150, 60), (240, 170, 0)
 """Colours of target points, and of the points to be moved there, each with its line."""
-GLASS = 0.35
+HULL_OPACITY = 0.35
 """Opacity of geoms that contain spheres."""
-POINT = 0.003
+TARGET_RADIUS = 0.003
 """Radius of target points [m]."""
-PLANE = 1.0
+PLANE_HALF_SIZE = 1.0
 """Half size at which an infinite plane is drawn [m]."""
 BRIGHTNESS = 0.25
 """Intensity of the environment light, relative to viser's default."""
-VIEW = 0.5
+FIELD_OF_VIEW = 0.5
 """Field of view [rad]."""
 SPEEDS = (0.1, 4.0)
 """Slowest and fastest replay, relative to simulated time."""
@@ -124,7 +124,7 @@ class LiveView:
         camera = self._server.initial_camera
         camera.look_at = np.asarray(point, dtype=float)
         camera.position = np.add(point, offset)
-        camera.fov = VIEW
+        camera.fov = FIELD_OF_VIEW
 
     def show(self, position: np.ndarray, quaternion: np.ndarray, touching: np.ndarray, pairs: np.ndarray) -> None:
         """Draw one state.
@@ -160,7 +160,7 @@ class LiveView:
             for g in visible:
                 vertices, faces = _surface(m, g)
                 rgba = _colour_of(m, g)
-                opacity = GLASS if name in glass else float(rgba[3])
+                opacity = HULL_OPACITY if name in glass else float(rgba[3])
                 handle = self._server.scene.add_mesh_simple(
                     f"/body{body}/geom{g}",
                     vertices.astype(np.float32),
@@ -181,7 +181,7 @@ class LiveView:
         import trimesh
 
         unit = trimesh.creation.icosphere(subdivisions=1)
-        self._colour[:] = np.where(self._kept[:, None], KEPT, LEFT_OUT)
+        self._colour[:] = np.where(self._kept[:, None], COLLIDABLE_COLOUR, EXCLUDED_COLOUR)
         for name in self._geometry.bodies:
             rows = self._geometry.of(name)
             self._spheres[name] = self._server.scene.add_batched_meshes_simple(
@@ -197,8 +197,8 @@ class LiveView:
 
     def _colour_spheres(self, touching: np.ndarray) -> None:
         """Update the colours of spheres whose contact has changed."""
-        colour = np.where(self._kept[:, None], KEPT, LEFT_OUT)
-        colour = np.where(np.asarray(touching)[:, None], TOUCHING, colour).astype(np.uint8)
+        colour = np.where(self._kept[:, None], COLLIDABLE_COLOUR, EXCLUDED_COLOUR)
+        colour = np.where(np.asarray(touching)[:, None], CONTACT_COLOUR, colour).astype(np.uint8)
         for name, handle in self._spheres.items():
             rows = self._geometry.of(name)
             if not np.array_equal(colour[rows], self._colour[rows]):
@@ -219,21 +219,21 @@ class LiveView:
             return
         import trimesh
 
-        unit = trimesh.creation.icosphere(subdivisions=1, radius=POINT)
+        unit = trimesh.creation.icosphere(subdivisions=1, radius=TARGET_RADIUS)
         dots = self._server.scene.add_batched_meshes_simple(
             "/targets/points",
             np.asarray(unit.vertices, dtype=np.float32),
             np.asarray(unit.faces, dtype=np.uint32),
             batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
             batched_positions=points,
-            batched_colors=np.tile(np.array([PAIR, TARGET], dtype=np.uint8), (len(pairs), 1)),
+            batched_colors=np.tile(np.array([PAIR_COLOUR, TARGET_COLOUR], dtype=np.uint8), (len(pairs), 1)),
             cast_shadow=False,
             visible=self._shows_targets.value,
         )
         lines = self._server.scene.add_line_segments(
             "/targets/lines",
             pairs.astype(np.float32),
-            np.tile(np.array([PAIR, TARGET], dtype=np.uint8), (len(pairs), 1, 1)),
+            np.tile(np.array([PAIR_COLOUR, TARGET_COLOUR], dtype=np.uint8), (len(pairs), 1, 1)),
             thickness=2.0,
             thickness_units="screen",
             visible=self._shows_targets.value,
@@ -309,7 +309,7 @@ def _surface(m: mujoco.MjModel, g: int) -> tuple[np.ndarray, np.ndarray]:
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         made = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=24)
     elif kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        half = np.where(size[:2] > 0, np.minimum(size[:2], PLANE), PLANE)
+        half = np.where(size[:2] > 0, np.minimum(size[:2], PLANE_HALF_SIZE), PLANE_HALF_SIZE)
         made = trimesh.creation.box(extents=[*(2 * half), 2e-3])
         made.apply_translation([0, 0, -1e-3])
     else:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MOST_SAMPLES = 3000
 """Samples of a line in a chart; longer series are thinned, each piece shown by its largest error."""
-BANDS = 5
+PHASE_COLOURS = 5
 """Colours of phases that the style sheet has."""
 
 
@@ -100,7 +100,7 @@ def _phase_bands(comparison: Comparison, demonstration: Demonstration) -> list[d
         start, end = max(phase.start, 0.0), min(phase.end, demonstration.duration + 1e-6)
         colour = comparison.phase_names.index(phase.name)
         found.append(
-            {"name": phase.name, "start": start, "end": end, "band": (colour - 1) % BANDS + 1 if colour else 0}
+            {"name": phase.name, "start": start, "end": end, "band": (colour - 1) % PHASE_COLOURS + 1 if colour else 0}
         )
     return found
 

@@ -29,7 +29,7 @@ MOST_FACES = 4000
 """A mesh with more faces is drawn as its convex hull, so that the page stays small."""
 PLANE_HALF_SIZE = 1.0
 """Half size at which an infinite plane is drawn [m]."""
-MOVED = 1e-4
+MOVED_DISTANCE = 1e-4
 """A sphere is called moved when it ends farther than this from where it started [m]."""
 
 
@@ -109,7 +109,7 @@ def geometry_data(
         return None
     moved = np.linalg.norm(last.position - first.position, axis=1)
     touched, gripped = _touched_spheres(events or {}, len(last))
-    state = np.select([moved > MOVED, gripped, touched], ["moved", "gripped", "touched"], "other")
+    state = np.select([moved > MOVED_DISTANCE, gripped, touched], ["moved", "gripped", "touched"], "other")
     data: dict[str, Any] = {
         "bodies": sorted(last.bodies, key=lambda name: -int((state[last.of(name)] == "moved").sum())),
         "state": state.tolist(),
@@ -140,7 +140,7 @@ def _touched_spheres(events: Mapping[str, ContactEventSequence], count: int) -> 
 def _facts(geometry: ContactGeometry, body: str, moved: np.ndarray, touched: np.ndarray, gripped: np.ndarray) -> str:
     """Return a line on the spheres of a body."""
     rows = geometry.of(body)
-    far = moved[rows][moved[rows] > MOVED] * 1e3
+    far = moved[rows][moved[rows] > MOVED_DISTANCE] * 1e3
     text = f"{len(rows)} spheres; {len(far)} moved"
     if len(far):
         text += f" by {far.mean():.1f} mm on average, {far.max():.1f} mm at most"

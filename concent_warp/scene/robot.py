@@ -35,7 +35,7 @@ DH = (
     (0.0, 0.0, np.pi / 2),
     (0.088, 0.0, np.pi / 2),
 )
-RANGE = (
+JOINT_RANGES = (
     (-2.8973, 2.8973),
     (-1.7628, 1.7628),
     (-2.8973, 2.8973),
@@ -53,7 +53,7 @@ DAMPING = (50.0, 50.0, 50.0, 50.0, 18.0, 11.0, 4.0)
 """Position control, velocity gain [N m s/rad]."""
 ARMATURE = 0.1
 """Rotor inertia seen at the joint [kg m^2]."""
-INERTIAL = (
+LINK_INERTIAS = (
     # mass [kg], centre of mass [m], inertia xx yy zz xy xz yz [kg m^2], link frame
     (4.970684, (3.875e-3, 2.081e-3, -0.04762), (0.70337, 0.70661, 9.117e-3, -1.39e-4, 6.772e-3, 0.019169)),
     (0.646926, (-3.141e-3, -0.02872, 3.495e-3), (7.962e-3, 0.02811, 0.025995, -3.925e-3, 0.010254, 7.04e-4)),
@@ -63,13 +63,13 @@ INERTIAL = (
     (1.666555, (0.060149, -0.014117, -0.010517), (1.964e-3, 4.354e-3, 5.433e-3, 1.09e-4, -1.158e-3, 3.41e-4)),
     (0.735522, (0.010517, -4.252e-3, 0.061597), (0.012516, 0.010027, 4.815e-3, -4.28e-4, -1.196e-3, -7.41e-4)),
 )
-FLANGE = 0.107
+FLANGE_OFFSET = 0.107
 """From the last joint frame to the flange, along z [m]."""
-TCP = 0.1034
+TCP_OFFSET = 0.1034
 """From the flange to the point between the fingertips, along z [m]."""
-HOME = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
+HOME_ANGLES = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
 """The ready pose of Franka's tutorials [rad]."""
-SHAPES = (
+LINK_CAPSULES = (
     # capsules around each link: from, to [m] in the link frame, radius [m]
     ((0, 0, -0.192, 0, 0, -0.02, 0.055),),
     ((0, -0.015, 0, 0, -0.17, 0, 0.055),),
@@ -85,7 +85,7 @@ GRIP_FORCE = 40.0
 """Force limit of the gripper, on each finger [N]; the Franka Hand holds 70 N continuously."""
 GRIP_STIFFNESS = 4000.0
 """Position control of the fingers [N/m]."""
-PAD = (0.0085, 0.004, 0.0095)
+PAD_HALF_SIZES = (0.0085, 0.004, 0.0095)
 """Half sizes of the finger pads, along x, along the closing direction, along z [m]."""
 
 
@@ -147,24 +147,24 @@ def panda() -> mujoco.MjSpec:
             quat=[np.cos(alpha / 2), np.sin(alpha / 2), 0, 0],
             gravcomp=1.0,
         )
-        mass, com, inertia = INERTIAL[i]
+        mass, com, inertia = LINK_INERTIAS[i]
         body.explicitinertial = True
         body.mass, body.ipos, body.fullinertia = mass, list(com), list(inertia)
         body.add_joint(
             name=f"joint{i + 1}",
             axis=[0, 0, 1],
-            range=list(RANGE[i]),
+            range=list(JOINT_RANGES[i]),
             limited=True,
             armature=ARMATURE,
             damping=[1, 0, 0],
         )
-        for k, (*ends, radius) in enumerate(SHAPES[i]):
+        for k, (*ends, radius) in enumerate(LINK_CAPSULES[i]):
             geom = body.add_geom(name=f"link{i + 1}_{k}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends)
             geom.size[0] = radius
             _paint(geom, white=i % 2 == 0)
         actuator = spec.add_actuator(name=f"joint{i + 1}", target=f"joint{i + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=STIFFNESS[i], kv=DAMPING[i])
-        actuator.ctrlrange, actuator.ctrllimited = list(RANGE[i]), True
+        actuator.ctrlrange, actuator.ctrllimited = list(JOINT_RANGES[i]), True
         actuator.forcerange, actuator.forcelimited = [-MAX_TORQUE[i], MAX_TORQUE[i]], True
         spec.add_sensor(
             name=f"joint{i + 1}_position",
@@ -183,12 +183,12 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
     """Add the parallel gripper to the last link: two fingers coupled by an equality, closed by one actuator."""
     turn = -np.pi / 4
     hand = flange.add_body(
-        name="hand", pos=[0, 0, FLANGE], quat=[np.cos(turn / 2), 0, 0, np.sin(turn / 2)], gravcomp=1.0
+        name="hand", pos=[0, 0, FLANGE_OFFSET], quat=[np.cos(turn / 2), 0, 0, np.sin(turn / 2)], gravcomp=1.0
     )
     hand.explicitinertial = True
     hand.mass, hand.ipos, hand.inertia = 0.73, [-0.01, 0, 0.03], [0.001, 0.0025, 0.0017]
     _paint(hand.add_geom(name="hand", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, 0, 0.033], size=[0.02, 0.1, 0.033]))
-    hand.add_site(name="tcp", pos=[0, 0, TCP], size=[0.004, 0.004, 0.004], group=4)
+    hand.add_site(name="tcp", pos=[0, 0, TCP_OFFSET], size=[0.004, 0.004, 0.004], group=4)
     for name, side in (("left_finger", 1.0), ("right_finger", -1.0)):
         finger = hand.add_body(name=name, pos=[0, 0, 0.0584], gravcomp=1.0)
         finger.explicitinertial = True
@@ -211,8 +211,8 @@ def _add_hand(spec: mujoco.MjSpec, flange: mujoco.MjsBody) -> None:
         pad = finger.add_geom(
             name=f"{name}_pad",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[0, side * PAD[1], TCP - 0.0584],
-            size=list(PAD),
+            pos=[0, side * PAD_HALF_SIZES[1], TCP_OFFSET - 0.0584],
+            size=list(PAD_HALF_SIZES),
             friction=[1.0, 0.01, 0.0001],
             condim=4,
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from concent_warp.scene.robot import HOME, RobotCfg
+from concent_warp.scene.robot import HOME_ANGLES, RobotCfg
 from concent_warp.scene.scene import OBJECTS_TEXT, Scene
 
 TABLE_FRICTION = 0.6
@@ -122,7 +122,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
 def home(model: mujoco.MjModel) -> np.ndarray:
     """Return the scene's initial qpos (nq,) with the embedded arm in its ready pose and the gripper open."""
     qpos = model.qpos0.copy()
-    for i, angle in enumerate(HOME):
+    for i, angle in enumerate(HOME_ANGLES):
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"joint{i + 1}")
         if joint >= 0:
             qpos[model.jnt_qposadr[joint]] = angle

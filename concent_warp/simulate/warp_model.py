@@ -41,7 +41,7 @@ SWITCHES = (
 SWITCHES = (*SWITCHES, "armature", "density", "viscosity", "wind")
 """Endings of field names whose physics MuJoCo-Warp compiles away where the model's values are all zero."""
 
-DRY = 1e-4
+NEGLIGIBLE_OFFSET = 1e-4
 """Lengths [m] that drag does not notice."""
 
 FOLDED = ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly")
@@ -184,9 +184,9 @@ def check_drag(compiled: mujoco.MjModel, fields: Mapping[str, Any]) -> None:
     """
     if max(compiled.opt.density, compiled.opt.viscosity) <= 0 and not {"opt.density", "opt.viscosity"} & set(fields):
         return
-    wet = np.flatnonzero((compiled.geom_fluid[:, 0] > 0) & (compiled.geom_rbound > DRY))
+    wet = np.flatnonzero((compiled.geom_fluid[:, 0] > 0) & (compiled.geom_rbound > NEGLIGIBLE_OFFSET))
     body = compiled.geom_bodyid[wet]
-    centred = np.abs(compiled.geom_pos[wet] - compiled.body_ipos[body]).max(axis=1, initial=0) < DRY
+    centred = np.abs(compiled.geom_pos[wet] - compiled.body_ipos[body]).max(axis=1, initial=0) < NEGLIGIBLE_OFFSET
     moving = compiled.body_weldid[body] != 0
     if (moving & (~centred | ("body_ipos" in fields))).any():
         names = sorted({compiled.body(b).name for b in body[moving]})

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = "v3.0"
-CHUNK = 1000
+FILES_PER_CHUNK = 1000
 """Files of a folder."""
 DATA_MB, VIDEO_MB = 100, 200
 """Sizes at which files are full [MB]."""
-SAMPLED = 128
+STATISTICS_PIXELS = 128
 """Rows and columns of an image that its statistics are taken from, about."""
-BYTES = 1_000_000
+MEGABYTE = 1_000_000
 """Of a megabyte."""
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 KEY = "source_index"
@@ -56,7 +56,7 @@ class LeRobotWriter:
         """
         self.folder, self.layout = Path(folder), layout
         self.codec: Codec = codec
-        self._full = video_mb * BYTES
+        self._full = video_mb * MEGABYTE
         self._staging = Staging(self.folder, {"format": VERSION, "codec": codec, **asdict(layout)})
         self._episodes = self._packed()
         done = {int(row[KEY]) for row in self._episodes}
@@ -95,9 +95,11 @@ class LeRobotWriter:
 
         keys = self._staging.numbers()
         notes = [json.loads((self._staging.path(key) / "episode.json").read_text()) for key in keys]
-        number = 1 + max((int(row["data/file_index"]) + CHUNK * int(row["data/chunk_index"]) for row in self._episodes),
-                         default=-1)  # fmt: skip
-        where = {"chunk_index": number // CHUNK, "file_index": number % CHUNK}
+        numbers = (
+            int(row["data/file_index"]) + FILES_PER_CHUNK * int(row["data/chunk_index"]) for row in self._episodes
+        )
+        number = 1 + max(numbers, default=-1)
+        where = {"chunk_index": number // FILES_PER_CHUNK, "file_index": number % FILES_PER_CHUNK}
         lengths = [note["length"] for note in notes]
         for camera in self.layout.cameras:
             out = self.folder / _video_path(camera, where)
@@ -220,7 +222,7 @@ class LeRobotWriter:
             "total_episodes": len(rows),
             "total_frames": int(rows[-1]["dataset_to_index"]) if rows else 0,
             "total_tasks": len(self.tasks()),
-            "chunks_size": CHUNK,
+            "chunks_size": FILES_PER_CHUNK,
             "data_files_size_in_mb": DATA_MB,
             "video_files_size_in_mb": VIDEO_MB,
             "fps": self.layout.rate,
@@ -244,7 +246,7 @@ class LeRobotEpisode:
             camera: VideoWriter(self._folder / f"{camera}.mp4", layout.rate, layout.size, writer.codec)
             for camera in layout.cameras
         }
-        every = max(1, min(layout.size) // SAMPLED)
+        every = max(1, min(layout.size) // STATISTICS_PIXELS)
         self._seen = {camera: ImageHistogram(every) for camera in layout.cameras}
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []

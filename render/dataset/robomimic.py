@@ -23,7 +23,7 @@ NAME = "dataset.hdf5"
 KEY = "source_index"
 """Attribute of an episode with the number that its source gave it."""
 EPISODE = "episode.hdf5"
-ENVIRONMENT = 4
+ENVIRONMENT_TYPE = 4
 """What robomimic takes an environment of another kind than its own for."""
 
 
@@ -66,7 +66,7 @@ class RobomimicWriter:
             data.attrs["env_args"] = json.dumps(
                 {
                     "env_name": self.layout.robot,
-                    "type": ENVIRONMENT,
+                    "type": ENVIRONMENT_TYPE,
                     "env_kwargs": {"state": self.layout.state, "action": self.layout.action, "rate": self.layout.rate},
                 }
             )

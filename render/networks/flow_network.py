@@ -14,9 +14,9 @@ from torch.nn import functional
 
 from concent_warp.render.networks.cfg import FlowNetworkCfg
 
-IMAGES = 3
+INPUT_IMAGES = 3
 """Images in: the noised one, the simulation's, and the previous real one; 9 channels."""
-POSE = 9
+POSE_SIZE = 9
 """Numbers of a pose: position [m] and the first two columns of the rotation (Zhou et al. 2019)."""
 
 
@@ -49,9 +49,11 @@ class FlowNetwork(nn.Module):
         self.cfg = cfg
         self.time = nn.Sequential(nn.Linear(cfg.width, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
         self.pose = (
-            nn.Sequential(nn.Linear(POSE, embedding), nn.SiLU(), nn.Linear(embedding, embedding)) if cfg.posed else None
+            nn.Sequential(nn.Linear(POSE_SIZE, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
+            if cfg.posed
+            else None
         )
-        self.entry = nn.Conv2d(3 * IMAGES, cfg.width, 3, padding=1)
+        self.entry = nn.Conv2d(3 * INPUT_IMAGES, cfg.width, 3, padding=1)
         # Static parts of the image depend on their position, of which convolutions are independent.
         self.place = nn.Parameter(torch.zeros(1, cfg.width, cfg.size, cfg.size))
         self.down, self.up, self.smaller, self.larger = (nn.ModuleList() for _ in range(4))

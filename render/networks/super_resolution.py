@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from concent_warp.render.networks.cfg import SuperResolutionCfg
 
-FACTOR = 4
+SCALE_FACTOR = 4
 """Enlargement of an edge."""
 
 
@@ -38,7 +38,7 @@ class SuperResolution(nn.Module):
         self.body = nn.Sequential(
             *(ResidualBlock(cfg.width, cfg.scale) for _ in range(cfg.blocks)), _convolution(cfg.width, cfg.width)
         )
-        self.exit = nn.Sequential(_convolution(cfg.width, 3 * FACTOR**2), nn.PixelShuffle(FACTOR))
+        self.exit = nn.Sequential(_convolution(cfg.width, 3 * SCALE_FACTOR**2), nn.PixelShuffle(SCALE_FACTOR))
         for parameter in self.exit.parameters():
             nn.init.zeros_(parameter)
 
@@ -55,7 +55,7 @@ def _convolution(into: int, out: int) -> nn.Conv2d:
 
 def _enlarged(image: torch.Tensor) -> torch.Tensor:
     """Return images (N, 3, 4 H, 4 W) by bicubic interpolation."""
-    return functional.interpolate(image, scale_factor=FACTOR, mode="bicubic", align_corners=False)
+    return functional.interpolate(image, scale_factor=SCALE_FACTOR, mode="bicubic", align_corners=False)
 
 
 def downsampled(image: torch.Tensor, size: int) -> torch.Tensor:

@@ -22,7 +22,7 @@ from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, Re
 from concent_warp.render.networks.flow import flow_loss
 from concent_warp.render.networks.flow_network import FlowNetwork
 from concent_warp.render.networks.pairs import ImagePairs, to_signed
-from concent_warp.render.networks.super_resolution import FACTOR, SuperResolution, downsampled
+from concent_warp.render.networks.super_resolution import SCALE_FACTOR, SuperResolution, downsampled
 
 CHECKPOINT = "checkpoint.pt"
 """File of the state of a training."""
@@ -92,11 +92,11 @@ class RenderTraining:
         """
         size = cfg.network.size
         for one in pairs:
-            if tuple(one.real.shape[2:]) != (FACTOR * size, FACTOR * size):
+            if tuple(one.real.shape[2:]) != (SCALE_FACTOR * size, SCALE_FACTOR * size):
                 raise RenderError(
                     "the camera's images have another size than the networks paint",
                     where=one.camera.name,
-                    expected=f"{FACTOR * size} x {FACTOR * size}",
+                    expected=f"{SCALE_FACTOR * size} x {SCALE_FACTOR * size}",
                     found=" x ".join(map(str, one.real.shape[2:])),
                     fix="crop and resize the images, or choose another size",
                 )
@@ -180,7 +180,7 @@ class RenderTraining:
             row, room = row % len(one), self.cfg.network.size - crop + 1
             v, u = v % room, u % room
             small.append(less.real[row, :, v : v + crop, u : u + crop])
-            v, u, edge = FACTOR * v, FACTOR * u, FACTOR * crop
+            v, u, edge = SCALE_FACTOR * v, SCALE_FACTOR * u, SCALE_FACTOR * crop
             large.append(one.real[row, :, v : v + edge, u : u + edge])
         given = to_signed(torch.stack(small))
         # Images of the flow are noisier than downscaled ones.

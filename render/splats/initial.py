@@ -12,11 +12,11 @@ from concent_warp.errors import RenderError
 from concent_warp.render.splats.cfg import SplatFitCfg
 from concent_warp.render.splats.splats import COEFFICIENTS, Splats
 from concent_warp.render.splats.views import SplatViews
-from concent_warp.scene.shapes.objects import MESHES, read_mesh, read_points
+from concent_warp.scene.shapes.objects import MESH_SUFFIXES, read_mesh, read_points
 from concent_warp.scene.shapes.ply import read_header
-from concent_warp.scene.shapes.splat import HARMONIC
+from concent_warp.scene.shapes.splat import CONSTANT_HARMONIC
 
-FLIP = np.diag([1.0, -1.0, -1.0])
+CAMERA_AXES = np.diag([1.0, -1.0, -1.0])
 """Turns a camera that looks along -z with y up into one that looks along z with y down."""
 
 
@@ -26,7 +26,7 @@ def read_start(path: Path, count: int, scale: float, rng: np.random.Generator) -
     Raises:
         SceneError: the file is missing, broken, or of another kind.
     """
-    if path.suffix.lower() in MESHES or (path.suffix.lower() == ".ply" and read_header(path).count("face")):
+    if path.suffix.lower() in MESH_SUFFIXES or (path.suffix.lower() == ".ply" and read_header(path).count("face")):
         import trimesh
 
         points = trimesh.sample.sample_surface(read_mesh(path), count, seed=int(rng.integers(2**31)))[0]
@@ -43,7 +43,7 @@ def _thinned(points: np.ndarray, count: int, rng: np.random.Generator) -> np.nda
 def _project(views: SplatViews, v: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (column, row), shape (n, 2), int, and the depths [m], shape (n,), of points in a view."""
     pose, matrix = views.poses[v], views.intrinsics[v]
-    seen = (points - pose[:3, 3]) @ pose[:3, :3] @ FLIP
+    seen = (points - pose[:3, 3]) @ pose[:3, :3] @ CAMERA_AXES
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = np.nan_to_num(seen[:, :2] / seen[:, 2:] * matrix[[0, 1], [0, 1]] + matrix[:2, 2], posinf=-9, neginf=-9)
     return np.round(np.clip(pixels, -9, 1e6)).astype(int), seen[:, 2]
@@ -107,7 +107,7 @@ def _enclosing_cube(views: SplatViews, alpha: int) -> tuple[np.ndarray, float]:
         matrix, pose = views.intrinsics[v], views.poses[v]
         box = np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]])
         across = (box.mean(axis=0) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-        ray = pose[:3, :3] @ FLIP @ np.append(across, 1)
+        ray = pose[:3, :3] @ CAMERA_AXES @ np.append(across, 1)
         origins.append(pose[:3, 3])
         rays.append(ray / np.linalg.norm(ray))
         spans.append(np.linalg.norm((np.diff(box, axis=0)[0] + 1) / matrix[[0, 1], [0, 1]]) / 2)
@@ -136,7 +136,7 @@ def first_splats(views: SplatViews, points: np.ndarray, cfg: SplatFitCfg, device
         total[seen] += rgba[:, :3] * rgba[:, 3:]
         weight[seen] += rgba[:, 3:]
     harmonics = np.zeros((len(points), COEFFICIENTS[cfg.degree], 3))
-    harmonics[:, 0] = (total / weight - 0.5) / HARMONIC
+    harmonics[:, 0] = (total / weight - 0.5) / CONSTANT_HARMONIC
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32, device=device)

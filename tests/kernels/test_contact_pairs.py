@@ -8,13 +8,13 @@ import warp as wp
 from rigid_poses import Poses, on_each_device, outputs, turn
 
 from concent_warp.kernels import contact_pairs
-from concent_warp.kernels.contact_pairs import SLOT, SLOTS, ContactPairs, PairTable
+from concent_warp.kernels.contact_pairs import SLOT_COUNT, SLOT_SIZE, ContactPairs, PairTable
 
 AMPLITUDE, SIGMA = (1.0, 2.0), (0.05, 0.008)
 NAMES = ("features", "distance", "worst", "worst_distance", "reach", "finite")
 
 
-def random_table(stages=4, slots=SLOTS, bodies=6, seed=1):
+def random_table(stages=4, slots=SLOT_COUNT, bodies=6, seed=1):
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(stages, slots, 3))
     active = rng.random((stages, slots)) < 0.6
@@ -91,8 +91,8 @@ def test_features_and_reward_match_float64(device):
 
 
 def test_slots_are_the_104_numbers_of_the_observation_table():
-    assert SLOT * SLOTS == 104
-    assert 14 + 7 + 1 + 1 + 3 + 9 + 9 + SLOT * SLOTS == 148
+    assert SLOT_SIZE * SLOT_COUNT == 104
+    assert 14 + 7 + 1 + 1 + 3 + 9 + 9 + SLOT_SIZE * SLOT_COUNT == 148
 
 
 @on_each_device

@@ -9,11 +9,11 @@ from concent_warp.kernels.newton_contacts import (
     BOX,
     CAPSULE,
     CYLINDER,
-    LARGER,
-    OTHER,
-    OWN,
+    LARGER_FRICTION,
     PLANE,
+    SHAPE_FRICTION,
     SPHERE,
+    SPHERE_FRICTION,
     gather_contacts,
     write_contacts,
 )
@@ -163,7 +163,7 @@ def test_two_fitted_spheres_meet_and_both_carry_gradients():
     np.testing.assert_allclose(position.grad.numpy()[0, 1], [0, 64, -48], rtol=1e-4)  # (1 - n n^T) e_y / |c - p|
 
 
-@pytest.mark.parametrize(("rule", "expected"), [(OWN, 0.4), (OTHER, 0.9), (LARGER, 0.9)])
+@pytest.mark.parametrize(("rule", "expected"), [(SPHERE_FRICTION, 0.4), (SHAPE_FRICTION, 0.9), (LARGER_FRICTION, 0.9)])
 def test_friction_and_stiffness_follow_the_rule_and_the_scales(rule, expected):
     def array(values, dtype=float):
         return wp.array(values, dtype=dtype, device="cpu")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from concent_warp.kernels.contact_pairs import SLOT
+from concent_warp.kernels.contact_pairs import SLOT_SIZE
 from concent_warp.train.environment.physics import Physics
 from concent_warp.train.environment.quaternions import rotation_columns
 from concent_warp.train.task.task import Task
@@ -31,7 +31,7 @@ class ObservationLayout:
             parts += [("gripper opening", 1), ("gripper command", 1)]
         parts.append(("end effector", 3))
         parts += [(f"object {i + 1}", 9) for i in range(len(task.objects))]
-        parts += [(f"slot {i}", SLOT) for i in range(task.table.used.shape[1])]
+        parts += [(f"slot {i}", SLOT_SIZE) for i in range(task.table.used.shape[1])]
         return ObservationLayout(tuple(parts))
 
     @property

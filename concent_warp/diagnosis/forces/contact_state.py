@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.comparison.phases import FREE, GRASPED, IMPACT, REST, SLIDE, STICK, MotionPhaseCfg
 from concent_warp.diagnosis.forces.cfg import ContactStateCfg
-from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
+from concent_warp.diagnosis.forces.window_forces import INSTANT_WEIGHTS, INSTANTS
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.window_forces import Windows
@@ -75,8 +75,8 @@ def body_windows(motion: StateEstimator, windows: Windows, body: MeasuredBody, c
     touches: list[dict[str, Touch]] = [{} for _ in range(count)]
     free = np.tile(np.eye(6), (count, 1, 1))
     sliding, heading = np.zeros((count, 3)), np.zeros((count, 3))
-    instants = windows.start[:, None] + windows.length * SHARES
-    passing = motion.states(instants.ravel()).qvel.reshape(count, len(SHARES), -1)
+    instants = windows.start[:, None] + windows.length * INSTANTS
+    passing = motion.states(instants.ravel()).qvel.reshape(count, len(INSTANTS), -1)
     for k in range(count):
         rows = np.flatnonzero((log.variant == k) & (first ^ second))
         if not len(rows):
@@ -112,7 +112,7 @@ def body_windows(motion: StateEstimator, windows: Windows, body: MeasuredBody, c
         )
         along -= np.outer(along @ up, up)
         blur = cfg.direction_standard_errors * float(speed_std[k])
-        heading[k] = share * WEIGHTS @ (along / np.hypot(np.linalg.norm(along, axis=1), blur)[:, None])
+        heading[k] = share * INSTANT_WEIGHTS @ (along / np.hypot(np.linalg.norm(along, axis=1), blur)[:, None])
         if share < cfg.lasting_share:
             phase[k] = IMPACT
         elif movers:

@@ -11,7 +11,7 @@ import numpy as np
 from concent_warp.comparison.phases import GRASPED
 from concent_warp.diagnosis.forces.cfg import FeatureCfg
 from concent_warp.diagnosis.forces.contact_state import PUSHED
-from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS
+from concent_warp.diagnosis.forces.window_forces import INSTANT_WEIGHTS, INSTANTS
 
 if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.contact_state import BodyWindows
@@ -36,7 +36,7 @@ def joint_features(windows: Windows, motion: StateEstimator, cfg: FeatureCfg) ->
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     d = mujoco.MjData(m)
     count = len(windows.start)
-    time = (windows.start[:, None] + windows.length * SHARES).ravel()
+    time = (windows.start[:, None] + windows.length * INSTANTS).ravel()
     states = motion.states(time)
     qpos, qvel, qacc = states.qpos, states.qvel, states.qacc
     dt = m.opt.timestep
@@ -59,7 +59,7 @@ def joint_features(windows: Windows, motion: StateEstimator, cfg: FeatureCfg) ->
     found = {}
     for joint in motion.joints:
         v = qvel[:, joint.dof]
-        std = np.sqrt(joint.position.covariance(windows.time)[:, 1, 1]).repeat(len(SHARES))
+        std = np.sqrt(joint.position.covariance(windows.time)[:, 1, 1]).repeat(len(INSTANTS))
         direction = v / np.sqrt(v**2 + (cfg.direction_standard_errors * std) ** 2)
         force, scale = drive[:, joint.dof], float(np.percentile(np.abs(v), cfg.slow_percentile))
         raw = {
@@ -75,7 +75,7 @@ def joint_features(windows: Windows, motion: StateEstimator, cfg: FeatureCfg) ->
             POSITION: qpos[:, joint.qpos] - qpos[:, joint.qpos].mean(),
             CONSTANT: np.ones(len(time)),
         }
-        mean = {name: value.reshape(count, -1) @ WEIGHTS for name, value in raw.items()}
+        mean = {name: value.reshape(count, -1) @ INSTANT_WEIGHTS for name, value in raw.items()}
         mean[CONTACT] = touching[:, joint.dof]
         found[joint.name] = {name: value[:, None] for name, value in mean.items() if _varies(name, value)}
     return found

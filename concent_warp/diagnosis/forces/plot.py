@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.result import UnexplainedForces
     from concent_warp.model import Model
 
-ARROW = 0.7
+ARROW_LENGTH = 0.7
 """Length of the largest arrow over the size of its object."""
-MOST_JOINTS = 4
+MAX_JOINTS = 4
 """Joints shown, those farthest beyond noise."""
-FORCE, SHAPE, NOISE = "#d62728", "#8fa8c4", "#b8c4d0"
+FORCE_COLOUR, SHAPE_COLOUR, NOISE_COLOUR = "#d62728", "#8fa8c4", "#b8c4d0"
 
 
 def plot_location(location: UnexplainedForces, model: Model, path: Path) -> None:
@@ -37,7 +37,7 @@ def plot_location(location: UnexplainedForces, model: Model, path: Path) -> None
     m = model.compile()
     arrows = location.arrows()
     bodies = list(dict.fromkeys(arrow["body"] for arrow in arrows)) or [body.body for body in location.bodies[:1]]
-    joints = location.joints[:MOST_JOINTS]
+    joints = location.joints[:MAX_JOINTS]
     columns = max(len(bodies), 1)
     heights = [3.6] * bool(bodies) + [1.5] * len(joints)
     figure = plt.figure(figsize=(4.6 * columns if bodies else 7.5, sum(heights) or 1.0), layout="constrained")
@@ -63,7 +63,7 @@ def _draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, A
             continue
         triangles = 1e3 * np.asarray(mesh.triangles)
         corners.append(triangles.reshape(-1, 3))
-        axes.add_collection3d(Poly3DCollection(triangles, facecolor=SHAPE, edgecolor="none", alpha=0.25))
+        axes.add_collection3d(Poly3DCollection(triangles, facecolor=SHAPE_COLOUR, edgecolor="none", alpha=0.25))
         edges = 1e3 * np.asarray(mesh.vertices)[mesh.face_adjacency_edges[mesh.face_adjacency_angles > 0.5]]
         for edge in edges:
             axes.plot(*edge.T, color="#41576e", linewidth=0.7)
@@ -73,11 +73,11 @@ def _draw_body(axes: Any, m: mujoco.MjModel, name: str, arrows: list[dict[str, A
     tails = [points.min(axis=0), points.max(axis=0)]
     for arrow in arrows:
         tip = 1e3 * np.array(arrow["point"])
-        vector = ARROW * size * np.array(arrow["vector"]) / most
+        vector = ARROW_LENGTH * size * np.array(arrow["vector"]) / most
         tails.append(tip - vector)
-        axes.quiver(*(tip - vector), *vector, color=FORCE, linewidth=2, arrow_length_ratio=0.25)
-        axes.scatter(*tip, color=FORCE, s=14)
-        axes.text(*(tip - vector), f" {arrow['label']}", color=FORCE, fontsize=8)
+        axes.quiver(*(tip - vector), *vector, color=FORCE_COLOUR, linewidth=2, arrow_length_ratio=0.25)
+        axes.scatter(*tip, color=FORCE_COLOUR, s=14)
+        axes.text(*(tip - vector), f" {arrow['label']}", color=FORCE_COLOUR, fontsize=8)
     low, high = np.min(tails, axis=0), np.max(tails, axis=0)
     half = 0.55 * float((high - low).max())
     middle = (low + high) / 2
@@ -100,8 +100,8 @@ def _draw_joint(axes: Any, joint: JointForce, *, last: bool) -> None:
     offset = 0.0
     for series in joint.series:
         time = series.time + offset
-        axes.fill_between(time, -2 * series.std, 2 * series.std, color=NOISE, alpha=0.5, linewidth=0)
-        axes.plot(time, series.force, color=FORCE if joint.significant else "#41576e", linewidth=0.9)
+        axes.fill_between(time, -2 * series.std, 2 * series.std, color=NOISE_COLOUR, alpha=0.5, linewidth=0)
+        axes.plot(time, series.force, color=FORCE_COLOUR if joint.significant else "#41576e", linewidth=0.9)
         offset += float(series.time[-1] - series.time[0]) + 0.5
     axes.axhline(0, color="#41576e", linewidth=0.5)
     patterns = joint.dependences.patterns

@@ -26,9 +26,9 @@ from concent_warp.simulate.engine import ContactLog, Engine, Variants
 if TYPE_CHECKING:
     from concent_warp.estimation.state_estimator import StateEstimator
 
-SHARES = (np.arange(5) + 0.5) / 5
+INSTANTS = (np.arange(5) + 0.5) / 5
 """Instants within a window, as shares of its length, at which what forces depend on is taken."""
-WEIGHTS = 30 * SHARES**2 * (1 - SHARES) ** 2 / np.sum(30 * SHARES**2 * (1 - SHARES) ** 2)
+INSTANT_WEIGHTS = 30 * INSTANTS**2 * (1 - INSTANTS) ** 2 / np.sum(30 * INSTANTS**2 * (1 - INSTANTS) ** 2)
 """Their weights: those with which forces are averaged, shape (5,)."""
 
 

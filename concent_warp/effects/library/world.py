@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import element_name, free_bodies
-from concent_warp.scene.spheres.contact_geometry import GROUP as SPHERES
+from concent_warp.scene.spheres.contact_geometry import SPHERE_GEOM_GROUP as SPHERES
 
 AIR_DENSITY = 1.2
 """Density of air at 20 degrees [kg/m^3]."""

@@ -23,7 +23,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
-NORMAL = 1.96
+NORMAL_QUANTILE = 1.96
 """Half width of a 95 % interval of the normal distribution, in standard deviations [-]."""
 
 
@@ -242,12 +242,12 @@ def _fitted_parameters(
             force_model[part] = discretisation_errors(
                 solver.p.parameters[part], fit.values[part], cfg.discretisation_error
             )
-    reaches = NORMAL * np.hypot(std * solver.scale, force_model)
+    reaches = NORMAL_QUANTILE * np.hypot(std * solver.scale, force_model)
     found = []
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)
         low, high = max(value - float(reach), q.low), min(value + float(reach), q.high)
-        undetermined = high - low > 2 * NORMAL * cfg.undetermined_share * cfg.least_squares.prior * q.scale
+        undetermined = high - low > 2 * NORMAL_QUANTILE * cfg.undetermined_share * cfg.least_squares.prior * q.scale
         if np.isinf(q.null) and (high >= q.high or undetermined):  # a limit that is never reached counts as absent
             high = q.null
         at_bound = value in (q.low, q.high) and q.null not in (value, high)
@@ -267,8 +267,9 @@ def _remarks(
         if q.at_bound:
             found.append(f"{q.name} ended on its bound, {q.value:g} {q.unit}: what is missing may be something else.")
         width = q.high - q.low
-        if width > 2 * NORMAL * cfg.undetermined_share * cfg.least_squares.prior * prior.scale or width >= 0.99 * (
-            prior.high - prior.low
+        if (
+            width > 2 * NORMAL_QUANTILE * cfg.undetermined_share * cfg.least_squares.prior * prior.scale
+            or width >= 0.99 * (prior.high - prior.low)
         ):
             unknown.add(k)
             found.append(f"The recording hardly determines {q.name}.")

@@ -18,7 +18,7 @@ import numpy as np
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 Noise = Literal["gaussian_process", "centroid", "independent"]
-JITTER = 1e-6
+DIAGONAL_JITTER = 1e-6
 """Added to the diagonal of the kernel, so that its Cholesky factor exists [-]."""
 
 
@@ -78,7 +78,7 @@ class Perturbation:
 
 def _root(points: np.ndarray, length: float) -> np.ndarray:
     """Return the Cholesky factor of the RBF kernel over points (n, 3), shape (n, n)."""
-    return np.linalg.cholesky(rbf(points, points, length) + JITTER * np.eye(len(points)))
+    return np.linalg.cholesky(rbf(points, points, length) + DIAGONAL_JITTER * np.eye(len(points)))
 
 
 def rbf(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:

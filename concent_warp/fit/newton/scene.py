@@ -176,7 +176,7 @@ def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: floa
         states: States in which pairs are searched for, shape (T, nq).
         reach: Distance between surfaces [m].
     """
-    from concent_warp.kernels.newton_contacts import KINDS, LARGER, OTHER, OWN, SPHERE
+    from concent_warp.kernels.newton_contacts import KINDS, LARGER_FRICTION, SHAPE_FRICTION, SPHERE, SPHERE_FRICTION
 
     assert model.geometry is not None
     names = model.geometry.names()
@@ -224,7 +224,7 @@ def _near_pairs(model: Model, moving: list[int], states: np.ndarray, reach: floa
         frame=np.where(sphere[second, None] >= 0, still, frame),
         size=m.geom_size[second],
         friction=m.geom_friction[second, 0],
-        rule=np.choose(priority + 1, [OWN, LARGER, OTHER]),
+        rule=np.choose(priority + 1, [SPHERE_FRICTION, LARGER_FRICTION, SHAPE_FRICTION]),
     )
 
 

@@ -13,13 +13,13 @@ from concent_warp.reality.appearance.speckle import dress
 
 TABLE = "table"
 """Name of the geom that gets a wooden texture."""
-ROOM = 1.6
+ROOM_HALF_WIDTH = 1.6
 """Half width of the room [m]."""
-FLOOR = -0.75
+FLOOR_HEIGHT = -0.75
 """Height of the floor below the table's top [m]."""
 TEXELS = 256
 """Pixels along an edge of a texture."""
-PAINT = np.array([1.0, 0.93, 0.82])
+ROBOT_TINT = np.array([1.0, 0.93, 0.82])
 """Factor on the colours of the robot: a yellowish tint."""
 SUN = {"pos": [0.15, 0.75, 1.7], "dir": [0.12, -0.38, -1.0], "diffuse": [0.85, 0.78, 0.66], "castshadow": True}
 LAMP = {"pos": [1.3, -0.9, 1.2], "dir": [-0.7, 0.6, -0.8], "diffuse": [0.22, 0.25, 0.32], "castshadow": False}
@@ -43,7 +43,7 @@ def furnish(world: mujoco.MjSpec, bodies: tuple[str, ...], *, there: bool = True
     for geom in spec.geoms:
         if geom.parent.name in (*bodies, "world"):
             continue
-        geom.rgba[:3] = np.array(geom.rgba[:3]) * PAINT
+        geom.rgba[:3] = np.array(geom.rgba[:3]) * ROBOT_TINT
     table = spec.geom(TABLE)
     if table is not None:
         _cover(spec, table, "wood", _wood(rng), (3, 3))
@@ -64,10 +64,21 @@ def light(spec: mujoco.MjSpec) -> None:
 def _add_room(spec: mujoco.MjSpec, rng: np.random.Generator) -> None:
     """Add a floor and two walls that nothing touches."""
     height, thin = 1.2, 0.01
+    half, floor = ROOM_HALF_WIDTH, FLOOR_HEIGHT
     plates = {
-        "floor": ([0, 0, FLOOR], [2 * ROOM, 2 * ROOM, thin], _tiles(rng), (6, 6)),
-        "back": ([-0.55 * ROOM, 0, FLOOR + height], [thin, 2 * ROOM, height], _plaster(rng), (1, 1)),
-        "side": ([0, 0.6 * ROOM, FLOOR + height], [2 * ROOM, thin, height], _plaster(rng), (2, 1)),
+        "floor": ([0, 0, floor], [2 * half, 2 * half, thin], _tiles(rng), (6, 6)),
+        "back": (
+            [-0.55 * ROOM_HALF_WIDTH, 0, FLOOR_HEIGHT + height],
+            [thin, 2 * ROOM_HALF_WIDTH, height],
+            _plaster(rng),
+            (1, 1),
+        ),
+        "side": (
+            [0, 0.6 * ROOM_HALF_WIDTH, FLOOR_HEIGHT + height],
+            [2 * ROOM_HALF_WIDTH, thin, height],
+            _plaster(rng),
+            (2, 1),
+        ),
     }
     for name, (position, size, texture, repeat) in plates.items():
         geom = spec.worldbody.add_geom(

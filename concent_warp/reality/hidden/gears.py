@@ -25,7 +25,7 @@ from concent_warp.reality.hidden.hidden_effect import (
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
-FINE = 20
+ROTOR_SUBSTEPS = 20
 """Parts of a step in which a rotor crosses its play."""
 
 
@@ -85,16 +85,16 @@ class BacklashRotor(Rotor):
 
     def turn(self, command: float, q: float, rate: float, dt: float) -> float:
         """See `Rotor.turn`."""
-        d, part = self.drive, dt / FINE
+        d, part = self.drive, dt / ROTOR_SUBSTEPS
         keep, through = np.exp(-d.kp * part / d.kv), 0.0
         link = q
-        for _ in range(FINE):
+        for _ in range(ROTOR_SUBSTEPS):
             alone = command + (link + self.after - command) * keep - (link + rate * part)
             link += rate * part
             self.after = min(max(alone, -self.half), self.half)
             torque = d.kp * (command - q - self.after) - d.kv * rate
             if abs(alone) > self.half and torque * self.after > 0:
-                through += torque / FINE
+                through += torque / ROTOR_SUBSTEPS
         return through
 
 

@@ -17,7 +17,7 @@ from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
-GIVE = {"hinge": 1e-4, "slide": 1e-5}
+BRISTLE_DEFLECTION = {"hinge": 1e-4, "slide": 1e-5}
 """How far bristles give before they slip [rad], [m]."""
 Level = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 """Given model, data and degree of freedom, returns the friction at steady sliding [N m or N]."""
@@ -37,7 +37,7 @@ class Bristles(PerTrialState):
             self.bend = 0.0
         joint = model.joint(self.joint)
         dof = int(joint.dofadr[0])
-        give = GIVE["slide" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"]
+        give = BRISTLE_DEFLECTION["slide" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"]
         speed, dt = float(data.qvel[dof]), model.opt.timestep
         level = max(self.level(model, data, dof), 1e-9)
         before = self.bend

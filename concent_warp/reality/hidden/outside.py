@@ -11,19 +11,19 @@ from concent_warp.reality.hidden.joints import Level, friction
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
-POLES = 14
+COGGING_RIPPLES = 14
 """Ripples of cogging a turn."""
-PITCH = 0.04
+COGGING_PITCH = 0.04
 """Ripples of a linear motor, one in this length [m]."""
-ANCHOR = np.array([-0.3, 0.4, 0.0])
+CABLE_ANCHOR = np.array([-0.3, 0.4, 0.0])
 """Where the cable is fixed [m]."""
-SPOT = np.array([0.03, 0.02])
+PATCH_POSITION = np.array([0.03, 0.02])
 """Place of the magnet and of the rough patch on the table [m]."""
 
 
 def cogging(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Return a torque that ripples with the angle, as magnets pass teeth [N m or N]."""
-    pitch = 2 * np.pi / PITCH if rig.slides else POLES
+    pitch = 2 * np.pi / COGGING_PITCH if rig.slides else COGGING_RIPPLES
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         for d in drives(rig):
@@ -37,12 +37,12 @@ def cogging(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 def cable(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Return the force of a cable [N/m] as long as the distance to the resting body: slack on one side, else taut."""
     rest = data_at_rest(rig)
-    slack = np.linalg.norm(ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
+    slack = np.linalg.norm(CABLE_ANCHOR - cable_end(rig, rest, rest.model.body(rig.body).id))
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(rig.body).id
         end = cable_end(rig, data, b)
-        way = ANCHOR - end
+        way = CABLE_ANCHOR - end
         length = np.linalg.norm(way)
         if length > slack:
             pull = magnitude * (length - slack) * way / length
@@ -71,7 +71,7 @@ def magnet(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
     def force(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         b = model.body(rig.body).id
-        way = SPOT - data.xipos[b, :2]
+        way = PATCH_POSITION - data.xipos[b, :2]
         data.xfrc_applied[b, :2] += magnitude * way / reach * np.exp(0.5 - 0.5 * (way @ way) / reach**2)
 
     return HiddenEffectOfRig("magnet", HiddenEffect("magnet", force=force))
@@ -83,7 +83,7 @@ def patch(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
     def coefficients(time: float, point: np.ndarray) -> np.ndarray:
         del time
-        rough = float(np.linalg.norm(point[:2] - SPOT) < radius)
+        rough = float(np.linalg.norm(point[:2] - PATCH_POSITION) < radius)
         return np.full(2, mu + magnitude * rough)
 
     return HiddenEffectOfRig("patch", with_friction(rig, "patch", coefficients))

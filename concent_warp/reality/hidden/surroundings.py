@@ -13,7 +13,7 @@ from concent_warp.reality.hidden.hidden_effect import Builder, HiddenEffectOfRig
 from concent_warp.reality.rigs.rig import Rig
 from concent_warp.reality.world import HiddenEffect
 
-AIR = 1.2
+AIR_DENSITY = 1.2
 """Density of air times a drag factor of 1 [kg/m^3]."""
 
 
@@ -75,7 +75,7 @@ def wind(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
     """Return the drag of wind [m/s] along -x, and half as much along y; a drag factor of 1."""
     velocity = magnitude * np.array([-1.0, 0.5, 0.0])
     truth = dict(zip("xyz", map(float, velocity), strict=True))
-    return HiddenEffectOfRig("wind", air(AIR, velocity, rig.body), truth, (rig.body,))
+    return HiddenEffectOfRig("wind", air(AIR_DENSITY, velocity, rig.body), truth, (rig.body,))
 
 
 WORLD: dict[str, Builder] = {f.__name__: f for f in (gravity_tilt, air_drag, wind)}

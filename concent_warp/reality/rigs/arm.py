@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, chirp, hold, minimum_jerk_profile
-from concent_warp.scene.robot import FINGER_TRAVEL, HOME, panda
+from concent_warp.reality.rigs.signals import COMMAND_RATE, chirp, hold, minimum_jerk_profile
+from concent_warp.scene.robot import FINGER_TRAVEL, HOME_ANGLES, panda
 from concent_warp.scene.scene import Scene
 
 DURATION = 10.0
@@ -32,7 +32,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Sweep every joint there and back at its own speed, swing all with rising frequency, hold in between."""
     del k
     action = {}
-    for joint, home in enumerate(HOME):
+    for joint, home in enumerate(HOME_ANGLES):
         reach = SWING[joint] * rng.uniform(0.7, 1.0) * rng.choice([-1, 1])
         there, back = rng.uniform(1.0, 1.6), rng.uniform(1.0, 1.8)
         a, b = home + reach, home - 0.6 * reach
@@ -46,11 +46,11 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
         parts += [minimum_jerk_profile(b, home, 0.8)]
         parts += [chirp(home, 0.12 * rng.uniform(0.6, 1.0), 0.3, rng.uniform(1.5, 3.0), 2.5), hold(home, 0.2)]
         parts += [minimum_jerk_profile(home, home - 0.3 * reach, 0.7), hold(home - 0.3 * reach, 3.0)]
-        value = np.concatenate(parts)[: round(DURATION * RATE)]
-        action[f"joint{joint + 1}"] = (np.arange(len(value)) / RATE, value)
-    time = np.arange(round(DURATION * RATE)) / RATE
+        value = np.concatenate(parts)[: round(DURATION * COMMAND_RATE)]
+        action[f"joint{joint + 1}"] = (np.arange(len(value)) / COMMAND_RATE, value)
+    time = np.arange(round(DURATION * COMMAND_RATE)) / COMMAND_RATE
     action["gripper"] = (time, np.full(len(time), FINGER_TRAVEL / 2))
-    qpos = {f"joint{joint + 1}": [angle] for joint, angle in enumerate(HOME)}
+    qpos = {f"joint{joint + 1}": [angle] for joint, angle in enumerate(HOME_ANGLES)}
     qpos |= {f"{side}_finger_joint": [FINGER_TRAVEL / 2] for side in ("left", "right")}
     return RigTrial(DURATION, action, qpos=qpos, settling_time=0.5)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, chirp, hold, minimum_jerk_profile
+from concent_warp.reality.rigs.signals import COMMAND_RATE, chirp, hold, minimum_jerk_profile
 from concent_warp.scene.scene import Scene
 
-HALF = 0.02
+HALF_SIZE = 0.02
 """Half size of the block [m]."""
-OPEN = 0.035
+OPEN_WIDTH = 0.035
 """Commanded opening of each finger before the grasp [m]."""
-CLOSED = 0.011
+CLOSED_WIDTH = 0.011
 """And in it: less than the block's half size, so that stiffness times the difference holds it."""
 XML = f"""
 <mujoco model="grasp">
@@ -44,9 +44,9 @@ XML = f"""
         </body>
       </body>
     </body>
-    <body name="block" pos="0 0 {HALF}">
+    <body name="block" pos="0 0 {HALF_SIZE}">
       <freejoint name="block_joint"/>
-      <geom name="block" type="box" size="{HALF} {HALF} {HALF}" mass="0.25" friction="0.5 0.005 0.0001"/>
+      <geom name="block" type="box" size="{HALF_SIZE} {HALF_SIZE} {HALF_SIZE}" mass="0.25" friction="0.5 0.005 0.0001"/>
     </body>
   </worldbody>
   <tendon>
@@ -72,7 +72,7 @@ XML = f"""
   </sensor>
 </mujoco>
 """
-LOW = -0.008
+GRASP_HEIGHT = -0.008
 """Height of the hand in the grasp, relative to the nominal one [m]."""
 
 
@@ -80,29 +80,39 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Close slowly, lift, shake along x and along z with rising frequency, hold, set down gently, open."""
     del k
     lift = rng.uniform(0.07, 0.1)
-    high = LOW + lift
+    high = GRASP_HEIGHT + lift
     x = [hold(0.0, 0.3), hold(0.0, 0.7), hold(0.0, 0.3), hold(0.0, 0.7), hold(0.0, 0.2)]
-    z = [hold(LOW, 0.3), hold(LOW, 0.7), hold(LOW, 0.3), minimum_jerk_profile(LOW, high, 0.7), hold(high, 0.2)]
+    z = [
+        hold(GRASP_HEIGHT, 0.3),
+        hold(GRASP_HEIGHT, 0.7),
+        hold(GRASP_HEIGHT, 0.3),
+        minimum_jerk_profile(GRASP_HEIGHT, high, 0.7),
+        hold(high, 0.2),
+    ]
     x += [chirp(0.0, rng.uniform(0.018, 0.024), 0.6, 2.6, 2.2), hold(0.0, 0.2), hold(0.0, 2.2), hold(0.0, 0.2)]
     z += [hold(high, 2.4), chirp(high, rng.uniform(0.012, 0.016), 0.6, 2.6, 2.2), hold(high, 0.2)]
     x += [minimum_jerk_profile(0.0, 0.03, 0.5), hold(0.03, 2.0)]
-    z += [hold(high, 0.5), minimum_jerk_profile(high, LOW + 0.0005, 1.0), hold(LOW + 0.0005, 1.0)]
+    z += [hold(high, 0.5), minimum_jerk_profile(high, GRASP_HEIGHT + 0.0005, 1.0), hold(GRASP_HEIGHT + 0.0005, 1.0)]
     command = {"drive_x": np.concatenate(x), "drive_z": np.concatenate(z)}
     count = len(command["drive_x"])
-    grip = [hold(OPEN, 0.3), minimum_jerk_profile(OPEN, CLOSED, 0.7)]
-    closed = count - sum(map(len, grip)) - round(0.7 * RATE)
-    grip += [hold(CLOSED, closed / RATE), minimum_jerk_profile(CLOSED, OPEN, 0.4), hold(OPEN, 0.3)]
+    grip = [hold(OPEN_WIDTH, 0.3), minimum_jerk_profile(OPEN_WIDTH, CLOSED_WIDTH, 0.7)]
+    closed = count - sum(map(len, grip)) - round(0.7 * COMMAND_RATE)
+    grip += [
+        hold(CLOSED_WIDTH, closed / COMMAND_RATE),
+        minimum_jerk_profile(CLOSED_WIDTH, OPEN_WIDTH, 0.4),
+        hold(OPEN_WIDTH, 0.3),
+    ]
     command["gripper"] = np.concatenate(grip)
-    time = np.arange(count) / RATE
+    time = np.arange(count) / COMMAND_RATE
     place = rng.uniform(-0.003, 0.003, 2)
     return RigTrial(
-        count / RATE,
+        count / COMMAND_RATE,
         {name: (time, value) for name, value in command.items()},
         qpos={
-            "block_joint": [*place, HALF - 1e-5, 1, 0, 0, 0],
-            "left_finger_joint": [OPEN],
-            "right_finger_joint": [OPEN],
-            "slide_z": [LOW],
+            "block_joint": [*place, HALF_SIZE - 1e-5, 1, 0, 0, 0],
+            "left_finger_joint": [OPEN_WIDTH],
+            "right_finger_joint": [OPEN_WIDTH],
+            "slide_z": [GRASP_HEIGHT],
         },
         settling_time=0.3,
     )

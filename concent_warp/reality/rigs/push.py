@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from concent_warp.reality.rigs.rig import Rig, RigTrial, of_coarser_step
-from concent_warp.reality.rigs.signals import RATE, hold, minimum_jerk_profile
+from concent_warp.reality.rigs.signals import COMMAND_RATE, hold, minimum_jerk_profile
 from concent_warp.scene.scene import Scene
 
-HALF = 0.04
+HALF_SIZE = 0.04
 """Half size of the block [m]."""
-REACH = HALF + 0.01
+CONTACT_DISTANCE = HALF_SIZE + 0.01
 """Middle of the pusher to the middle of the block in contact [m]."""
 XML = f"""
 <mujoco model="push">
@@ -31,9 +31,9 @@ XML = f"""
         <geom name="bar" type="box" size="0.01 0.03 0.02" mass="0.1"/>
       </body>
     </body>
-    <body name="block" pos="0 0 {HALF}">
+    <body name="block" pos="0 0 {HALF_SIZE}">
       <freejoint name="block_joint"/>
-      <geom name="block" type="box" size="{HALF} {HALF} {HALF}" mass="0.5"/>
+      <geom name="block" type="box" size="{HALF_SIZE} {HALF_SIZE} {HALF_SIZE}" mass="0.5"/>
     </body>
   </worldbody>
   <actuator>
@@ -61,7 +61,7 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
         x.append(minimum_jerk_profile(x[-1][-1], dx, duration))
         y.append(minimum_jerk_profile(y[-1][-1], dy, duration))
 
-    touch = 0.15 - REACH + place[0]
+    touch = 0.15 - CONTACT_DISTANCE + place[0]
     first, second = rng.uniform(0.09, 0.11), rng.uniform(0.05, 0.06)
     go(touch - 0.003, off, 0.6)
     go(touch + first, off, 1.0)
@@ -73,16 +73,16 @@ def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     far = touch + 2 * first + second
     go(far - 0.06, off, 0.4)
     go(far - 0.06, 0.13, 0.5)
-    go(far + 2 * REACH + 0.05, 0.13, 0.7)
-    go(far + 2 * REACH + 0.05, off, 0.5)
-    go(far + 2 * REACH - 0.08, off, 1.0)
-    go(far + 2 * REACH - 0.08, off, 0.4)
+    go(far + 2 * CONTACT_DISTANCE + 0.05, 0.13, 0.7)
+    go(far + 2 * CONTACT_DISTANCE + 0.05, off, 0.5)
+    go(far + 2 * CONTACT_DISTANCE - 0.08, off, 1.0)
+    go(far + 2 * CONTACT_DISTANCE - 0.08, off, 0.4)
     column = {"drive_x": np.concatenate(x), "drive_y": np.concatenate(y)}
-    time = np.arange(len(column["drive_x"])) / RATE
+    time = np.arange(len(column["drive_x"])) / COMMAND_RATE
     return RigTrial(
-        len(time) / RATE,
+        len(time) / COMMAND_RATE,
         {name: (time, value) for name, value in column.items()},
-        qpos={"block_joint": [*place, HALF - 3e-5, 1, 0, 0, 0]},
+        qpos={"block_joint": [*place, HALF_SIZE - 3e-5, 1, 0, 0, 0]},
         settling_time=0.3,
     )
 

@@ -10,12 +10,12 @@ from concent_warp.reality.sliding_friction import apply_sliding_friction, fricti
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import yaw_quaternion
 
-HALF = (0.08, 0.06, 0.01)
+HALF_SIZES = (0.08, 0.06, 0.01)
 """Half sizes of the block [m]."""
 FRICTION = 0.3
 SPEEDS = (1.0, 0.7, 0.9, 0.6, 0.8, 0.5)
 """Of the six throws [m/s]."""
-TURNS = (0.0, 0.0, np.pi / 2, np.pi / 2, np.pi, np.pi)
+START_YAWS = (0.0, 0.0, np.pi / 2, np.pi / 2, np.pi, np.pi)
 """Of the block before each throw [rad]."""
 XML = f"""
 <mujoco model="slide">
@@ -24,10 +24,10 @@ XML = f"""
   <worldbody>
     <light pos="0 -0.4 1.5"/>
     <geom name="table" type="plane" size="2 2 0.1" friction="{FRICTION} 0.005 0.0001" solref="0.006 1" priority="1"/>
-    <body name="block" pos="0 0 {HALF[2]}">
+    <body name="block" pos="0 0 {HALF_SIZES[2]}">
       <freejoint name="block_joint"/>
-      <geom name="block" type="box" size="{HALF[0]} {HALF[1]} {HALF[2]}" mass="0.4" friction="{FRICTION} 0.005 0.0001"
-            solref="0.006 1"/>
+      <geom name="block" type="box" size="{" ".join(map(str, HALF_SIZES))}" mass="0.4"
+            friction="{FRICTION} 0.005 0.0001" solref="0.006 1"/>
     </body>
   </worldbody>
   <sensor>
@@ -41,11 +41,11 @@ XML = f"""
 def _plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Launch the block in some direction; every second throw with a turn about the vertical."""
     speed = SPEEDS[k % 6] * rng.uniform(0.9, 1.1)
-    yaw = TURNS[k % 6] + rng.normal(0, 0.05)
+    yaw = START_YAWS[k % 6] + rng.normal(0, 0.05)
     # Along the table's x, its y and between, so that a table with a grain tells.
     heading = (k % 3) * np.pi / 4 + rng.normal(0, 0.1)
     turning = 0.0 if k % 2 == 0 else rng.choice([-1, 1]) * rng.uniform(1.0, 2.5)
-    start = [-0.5 * speed * np.cos(heading) / 3, -0.5 * speed * np.sin(heading) / 3, HALF[2] - 1e-5]
+    start = [-0.5 * speed * np.cos(heading) / 3, -0.5 * speed * np.sin(heading) / 3, HALF_SIZES[2] - 1e-5]
     return RigTrial(
         speed / (FRICTION * 9.81) + 0.35,
         qpos={"block_joint": [*start, *yaw_quaternion(yaw)]},

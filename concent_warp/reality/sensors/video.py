@@ -13,13 +13,13 @@ from concent_warp.files import new_file
 from concent_warp.reality.sensors.camera import record_depth_images
 from concent_warp.reality.sensors.sensing import SensingCfg
 
-SIZE = (240, 320)
+FRAME_SIZE = (240, 320)
 """Height and width of a frame [pixels]."""
-ASIDE = (0.57, -0.43, 0.63)
+CAMERA_OFFSET = (0.57, -0.43, 0.63)
 """Position of the camera relative to its target [m]."""
-FOVY = 22.0
+CAMERA_FOVY = 22.0
 """Vertical field of view [degrees]."""
-LAMP = (0.2, -0.4, 1.5)
+LAMP_POSITION = (0.2, -0.4, 1.5)
 """Where a light is put in a world that has none [m]."""
 CODECS = ("vp09", "mp4v")
 """Codecs of the MP4, by preference: browsers play the first; the second is there wherever OpenCV is."""
@@ -36,19 +36,19 @@ def render_video(world: mujoco.MjSpec, bodies: tuple[str, ...], qpos: np.ndarray
     """
     world = world.copy()
     if not world.lights:
-        world.worldbody.add_light(pos=list(LAMP), dir=[0, 0, -1], castshadow=True)
+        world.worldbody.add_light(pos=list(LAMP_POSITION), dir=[0, 0, -1], castshadow=True)
     model = world.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = qpos[0]
     mujoco.mj_kinematics(model, data)
     middle = np.mean([data.body(name).xpos for name in bodies], axis=0)
-    place = middle + ASIDE
+    place = middle + CAMERA_OFFSET
     camera = replace(
         SensingCfg(),
         camera_position=(float(place[0]), float(place[1]), float(place[2])),
         camera_target=(float(middle[0]), float(middle[1]), float(middle[2])),
-        camera_fovy=FOVY,
-        image_size=SIZE,
+        camera_fovy=CAMERA_FOVY,
+        image_size=FRAME_SIZE,
         rgb_std=0.0,
     )
     return record_depth_images(camera, world, bodies, period * np.arange(len(qpos)), qpos, np.random.default_rng(0)).rgb

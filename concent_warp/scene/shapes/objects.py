@@ -20,14 +20,14 @@ from concent_warp.scene.shapes.surface import Surface
 if TYPE_CHECKING:
     import trimesh
 
-LARGEST = 10.0
+MAX_EXTENT = 10.0
 """Extent [m] above which an object is taken to be given in another unit."""
-SMALLEST = 1e-4
+MIN_EXTENT = 1e-4
 """Extent [m] below which an object is taken to be given in another unit."""
-MOST_BYTES = 1_000_000_000
+MAX_FILE_BYTES = 1_000_000_000
 """Larger files are refused."""
-MESHES = (".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
-CLOUDS = (".xyz", ".txt", ".npy")
+MESH_SUFFIXES = (".stl", ".obj", ".off", ".glb", ".gltf", ".3mf")
+POINT_CLOUD_SUFFIXES = (".xyz", ".txt", ".npy")
 
 
 @dataclass(frozen=True)
@@ -124,16 +124,18 @@ def load_object(
     path = Path(path)
     if not path.is_file():
         raise SceneError("no such file for an object", where=path, fix="check the path")
-    if path.stat().st_size > MOST_BYTES:
-        raise SceneError("the file is too large for an object", where=path, expected=f"at most {MOST_BYTES:,} bytes")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise SceneError(
+            "the file is too large for an object", where=path, expected=f"at most {MAX_FILE_BYTES:,} bytes"
+        )
     suffix = path.suffix.lower()
     points: np.ndarray | None = None
-    if suffix in MESHES or (suffix == ".ply" and read_header(path).count("face")):
+    if suffix in MESH_SUFFIXES or (suffix == ".ply" and read_header(path).count("face")):
         mesh = read_mesh(path)
         _check_size(mesh.bounds * scale, path, scale)
         mesh.apply_scale(scale)
         mesh = closed_mesh(mesh, str(path))
-    elif suffix == ".ply" or suffix in CLOUDS:
+    elif suffix == ".ply" or suffix in POINT_CLOUD_SUFFIXES:
         points = read_points(path, opacity) * scale
         if len(points) < 4:
             raise SceneError("too few points for an object", where=path, expected="at least 4", found=len(points))
@@ -141,9 +143,11 @@ def load_object(
         mesh = convex_hull(points, str(path))
     else:
         raise SceneError(
-            "an object cannot be read from this kind of file", where=path, expected=[*MESHES, ".ply", *CLOUDS],
+            "an object cannot be read from this kind of file",
+            where=path,
+            expected=[*MESH_SUFFIXES, ".ply", *POINT_CLOUD_SUFFIXES],
             found=suffix,
-        )  # fmt: skip
+        )
     if not mesh.volume > 0:
         raise SceneError("the object has no volume", where=path, expected="> 0 m^3", found=mesh.volume)
     mesh.density = density if mass is None else mass / mesh.volume
@@ -202,13 +206,13 @@ def read_points(path: Path, opacity: float = 0.5) -> np.ndarray:
 def _check_size(bounds: np.ndarray, path: Path, scale: float) -> None:
     """Refuse an object whose size speaks of another unit; `bounds` [m] has shape (2, 3)."""
     extent = float(np.ptp(bounds, axis=0).max())
-    if extent > LARGEST:
+    if extent > MAX_EXTENT:
         fix = f"looks like millimetres, pass scale={0.001 * scale:g}"
-    elif extent < SMALLEST:
+    elif extent < MIN_EXTENT:
         fix = f"looks like another unit, pass a scale above {scale:g}"
     else:
         return
     raise SceneError(
-        "the object's size is not one that a robot handles", where=path, expected=f"{SMALLEST:g} to {LARGEST:g} m",
+        "the object's size is not one that a robot handles", where=path, expected=f"{MIN_EXTENT:g} to {MAX_EXTENT:g} m",
         found=f"{extent:.3g} m", fix=fix,
     )  # fmt: skip

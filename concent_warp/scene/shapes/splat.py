@@ -17,13 +17,13 @@ from concent_warp.files import write_bytes
 from concent_warp.scene.shapes.cloud import without_outliers
 from concent_warp.scene.shapes.ply import PlyHeader, read_vertices
 
-HARMONIC = 0.28209479177387814
+CONSTANT_HARMONIC = 0.28209479177387814
 """Value of the constant spherical harmonic, ``1 / (2 sqrt(pi))``."""
-NEEDED = ("x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)))
+REQUIRED_PROPERTIES = ("x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)))
 """Properties without which a file holds no splats."""
 DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
 """Degree of the harmonics by the number of ``f_rest`` properties."""
-OPAQUE = 1e-6
+OPACITY_MARGIN = 1e-6
 """Opacities are written as if they kept this distance from 0 and 1, whose logits are not finite."""
 
 
@@ -46,7 +46,7 @@ class GaussianSplats:
     @property
     def rgb(self) -> np.ndarray:
         """Colour without view dependence [0 to 1, not clipped], shape (N, 3)."""
-        return HARMONIC * self.harmonics[:, 0] + 0.5
+        return CONSTANT_HARMONIC * self.harmonics[:, 0] + 0.5
 
     def __len__(self) -> int:
         return len(self.opacity)
@@ -66,7 +66,7 @@ class GaussianSplats:
 
 def is_splats(header: PlyHeader) -> bool:
     """Tell whether a PLY file holds splats, by its vertex properties."""
-    return set(NEEDED) <= header.properties("vertex")
+    return set(REQUIRED_PROPERTIES) <= header.properties("vertex")
 
 
 def read_splats(path: Path) -> GaussianSplats:
@@ -75,8 +75,10 @@ def read_splats(path: Path) -> GaussianSplats:
     Raises `SceneError` where the file is broken or holds no splats.
     """
     values = read_vertices(path)
-    if missing := [name for name in NEEDED if name not in values]:
-        raise SceneError("the PLY file holds no Gaussian splats", where=path, expected=NEEDED, found=f"no {missing}")
+    if missing := [name for name in REQUIRED_PROPERTIES if name not in values]:
+        raise SceneError(
+            "the PLY file holds no Gaussian splats", where=path, expected=REQUIRED_PROPERTIES, found=f"no {missing}"
+        )
 
     def columns(*names: str) -> np.ndarray:
         return np.stack([values[name] for name in names], axis=1)
@@ -124,7 +126,7 @@ def _read_harmonics(values: dict[str, np.ndarray], path: Path) -> np.ndarray:
 def write_splats(splats: GaussianSplats, path: Path) -> None:
     """Write a binary 3DGS ``.ply`` in one piece or not at all; values are rounded to float32."""
     size, count = len(splats), 3 * (splats.harmonics.shape[1] - 1)
-    opacity = np.clip(splats.opacity, OPAQUE, 1 - OPAQUE)
+    opacity = np.clip(splats.opacity, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     columns = {
         **{name: splats.mean[:, k] for k, name in enumerate("xyz")},
         **{f"n{name}": np.zeros(size) for name in "xyz"},

@@ -16,7 +16,7 @@ import numpy as np
 from concent_warp.array_file import read_arrays, write_arrays
 from concent_warp.errors import ModelError
 
-GROUP = 3
+SPHERE_GEOM_GROUP = 3
 """MuJoCo geom group of the spheres (3: collision geoms, by convention hidden in the viewer)."""
 
 
@@ -184,7 +184,7 @@ class ContactGeometry:
                 pos=self.position[i],
                 mass=0,
                 friction=[self.friction[i], 0.005, 0.0001],
-                group=GROUP,
+                group=SPHERE_GEOM_GROUP,
                 condim=condim,
                 solref=list(solref),
                 solimp=[*solimp, 0.5, 2.0],

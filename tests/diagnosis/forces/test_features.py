@@ -47,7 +47,7 @@ from concent_warp.diagnosis.forces.locate import (
     _joint_force,
     _root_mean_square,
 )
-from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS, Windows
+from concent_warp.diagnosis.forces.window_forces import INSTANT_WEIGHTS, INSTANTS, Windows
 from concent_warp.simulate.engine import ContactLog
 
 CFG = LocateForcesCfg()
@@ -334,7 +334,7 @@ def test_features_of_joints_are_weighted_means_over_each_window():
     motion: Any = SimpleNamespace(compiled=m, states=state, ctrl=ctrl, joints=joints)
     found = joint_features(windows(count), motion, cfg)
     d = mujoco.MjData(m)
-    instants = (0.05 * np.arange(count)[:, None] + 0.1 * SHARES).ravel()
+    instants = (0.05 * np.arange(count)[:, None] + 0.1 * INSTANTS).ravel()
     qpos, qvel = path(instants)
     drive, rate, load = (np.zeros((len(instants), 2)) for _ in range(3))
     for k, t in enumerate(instants):
@@ -349,7 +349,7 @@ def test_features_of_joints_are_weighted_means_over_each_window():
         load[k] = d.qfrc_bias - d.qfrc_gravcomp
 
     def mean(values):
-        return values.reshape(count, 5) @ WEIGHTS
+        return values.reshape(count, 5) @ INSTANT_WEIGHTS
 
     for i, name in enumerate("ab"):
         v = qvel[:, i]

@@ -16,7 +16,7 @@ from concent_warp.diagnosis.forces.cfg import ContactStateCfg, LocateForcesCfg
 from concent_warp.diagnosis.forces.contact_state import BETWEEN, PUSHED, BodyWindows, body_windows
 from concent_warp.diagnosis.forces.plot import _draw_body, _draw_joint, _geom_mesh, plot_location
 from concent_warp.diagnosis.forces.result import UnexplainedForces
-from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS, Windows
+from concent_warp.diagnosis.forces.window_forces import INSTANT_WEIGHTS, INSTANTS, Windows
 from concent_warp.diagnosis.forces.wrench import steady_force, wrenches
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -63,7 +63,7 @@ def observed(
         log,
         path,
     )
-    rows = np.repeat(qvel, len(SHARES), axis=0)
+    rows = np.repeat(qvel, len(INSTANTS), axis=0)
     motion: Any = SimpleNamespace(compiled=m, states=lambda _time: SimpleNamespace(qvel=rows))
     position = SimpleNamespace(covariance=lambda t: np.tile(np.diag([9.0, std**2, 9.0]), (len(t), 1, 1)))
     measured: Any = SimpleNamespace(body=m.body("block").id, qpos=2, dof=2, position=position)
@@ -145,7 +145,7 @@ def test_touches_are_weighted_by_force_in_the_frame_of_the_block():
     np.testing.assert_allclose(spinning.velocity[0], [0.5, 0, 0.2])
     blur = np.hypot(np.linalg.norm(slip * [1, 1, 0]), 2e-3)
     share = 1.0 - 0.8  # gaps of eight steps are longer than two
-    np.testing.assert_allclose(spinning.heading[0], share * WEIGHTS.sum() * slip * [1, 1, 0] / blur, atol=1e-9)
+    np.testing.assert_allclose(spinning.heading[0], share * INSTANT_WEIGHTS.sum() * slip * [1, 1, 0] / blur, atol=1e-9)
     np.testing.assert_allclose(spinning.rotation[0], turn.as_matrix()[0])
     assert (spinning.free[0] == np.eye(6)).all()
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg, WindowSolverCfg
-from concent_warp.diagnosis.forces.window_forces import SHARES, WEIGHTS, window_forces, window_length
+from concent_warp.diagnosis.forces.window_forces import INSTANT_WEIGHTS, INSTANTS, window_forces, window_length
 from concent_warp.diagnosis.forces.window_solver import (
     Readings,
     Simulated,
@@ -29,9 +29,9 @@ ANY: Any = None
 
 
 def test_weights_are_those_of_the_average_in_a_window():
-    np.testing.assert_allclose(SHARES, [0.1, 0.3, 0.5, 0.7, 0.9])
+    np.testing.assert_allclose(INSTANTS, [0.1, 0.3, 0.5, 0.7, 0.9])
     raw = np.array([0.1 * 0.9, 0.3 * 0.7, 0.5 * 0.5, 0.3 * 0.7, 0.1 * 0.9]) ** 2
-    np.testing.assert_allclose(WEIGHTS, raw / raw.sum())
+    np.testing.assert_allclose(INSTANT_WEIGHTS, raw / raw.sum())
 
 
 def test_response_is_the_solution_of_its_differential_equation():

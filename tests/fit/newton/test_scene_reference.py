@@ -229,16 +229,16 @@ def test_pairs_are_of_spheres_and_what_comes_near_them(model):
             np.testing.assert_array_equal(pairs.size[c], geom.size)
             assert pairs.friction[c] == geom.friction[0]
             assert pairs.round[c] == (geom.size[0] if kind in ("CAPSULE", "SPHERE") else 0.0)
-    from concent_warp.kernels.newton_contacts import LARGER, OTHER, OWN
+    from concent_warp.kernels.newton_contacts import LARGER_FRICTION, SHAPE_FRICTION, SPHERE_FRICTION
 
     higher = m.geom(spheres[0]).priority[0] - m.geom("floor").priority[0]
     assert {int(pairs.rule[c]) for c in rows[("first", "world", "PLANE", False)]} == {
-        {0: LARGER, 1: OWN, -1: OTHER}[int(np.sign(higher))]
+        {0: LARGER_FRICTION, 1: SPHERE_FRICTION, -1: SHAPE_FRICTION}[int(np.sign(higher))]
     }
-    assert {int(pairs.rule[c]) for c in rows[("first", "second", "SPHERE", True)]} == {LARGER}
+    assert {int(pairs.rule[c]) for c in rows[("first", "second", "SPHERE", True)]} == {LARGER_FRICTION}
     against = m.geom(spheres[0]).priority[0] - m.geom("ball").priority[0]
     assert {int(pairs.rule[c]) for c in rows[("first", "world", "SPHERE", False)]} == {
-        {0: LARGER, 1: OWN, -1: OTHER}[int(np.sign(against))]
+        {0: LARGER_FRICTION, 1: SPHERE_FRICTION, -1: SHAPE_FRICTION}[int(np.sign(against))]
     }
 
 
