@@ -1,7 +1,7 @@
 """The hybrid image: robot and background as painted by the networks, objects as splats, their shadows, in one picture.
 
 Paper, section 3.2.3 and appendix E. What hides what is decided by the simulation's depth: splats behind a finger are
-not seen, shadows fall on what is there.
+not seen, shadows fall on the visible surfaces.
 """
 
 from __future__ import annotations

@@ -199,7 +199,7 @@ def _point_residual(rollout: Rollout, body: str, track: PointTrack, anchor_frame
     """Return the residual of a point track: each material point against where the model's body carries it.
 
     Where a point sits on the body is the mean of its first `anchor_frames` observations, brought into the body frame by
-    the model's own pose at these times; points not seen then take no part. What these observations scatter tells the
+    the model's own pose at these times; points not seen then take no part. Their scatter gives the
     noise.
     """
     row = rollout.bodies.index(body)

@@ -1,4 +1,4 @@
-"""What a comparison of models with measurements holds, and the figures drawn from it."""
+"""The result of a comparison of models with measurements, and figures derived from it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
 
 CARRIED = (FREE, "pick")
-"""Phases in which an object stands still or is carried: what it does then says little of its contact geometry."""
+"""Phases in which an object stands still or is carried: its motion then depends little on its contact geometry."""
 
 
 @dataclass(frozen=True)

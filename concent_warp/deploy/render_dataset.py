@@ -158,7 +158,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     act = policy.act_in(environment)
     rate = round(1 / environment.control_step)
     if abs(rate * environment.control_step - 1) > 1e-6:
-        raise RenderError("a video wants a whole number of frames a second", found=1 / environment.control_step)
+        raise RenderError("a video needs a whole number of frames per second", found=1 / environment.control_step)
     camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
     joints, layout = _addressed(model, camera, rate)
     writer = _dataset_writer(to, layout)

@@ -70,7 +70,7 @@ class SearchCfg:
     max_rounds: int = 3
     """Rounds in which the best candidate and those close to it are refitted. Empirical."""
     min_cost_fall: float = 0.01
-    """Relative fall of a cost that makes another round, or another refit, worth its time [-]. Empirical."""
+    """Relative fall of a cost above which another round, or another refit, follows [-]. Empirical."""
     shooting_window: float = 0.4
     """Length of the windows of the multiple-shooting initialisation [s]. Empirical: impacts need 0.1-0.3 s, free motion
     allows more."""

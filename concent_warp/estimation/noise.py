@@ -58,7 +58,7 @@ class Noise:
 
     std: float
     """Per component, in the channel's unit; of an orientation per component of the rotation vector [rad], twice that of
-    a component of the quaternion. NaN where the readings do not tell."""
+    a component of the quaternion. NaN where the readings do not determine it."""
     source: Source
     """Where it is from."""
 

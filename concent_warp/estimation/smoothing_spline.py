@@ -331,7 +331,7 @@ def _rows(knots: np.ndarray, time: np.ndarray, order: int) -> csr_array:
 
 
 def _upper_bands(matrix: csr_array) -> np.ndarray:
-    """Return the upper bands of a symmetric banded matrix as `scipy.linalg` wants them, shape (6, n)."""
+    """Return the upper bands of a symmetric banded matrix as `scipy.linalg` takes them, shape (6, n)."""
     count = int(matrix.diagonal().size)
     bands = np.zeros((DEGREE + 1, count))
     for offset in range(min(DEGREE + 1, count)):

@@ -1,6 +1,6 @@
 """Object on object: the first contact, and the move of this contact onto a new region, inside the other object.
 
-Surfaces of spheres are bumpy, and so are their normals: a single normal does not distinguish a rim from a wall. The
+Contact normals vary over a surface of spheres: a single normal does not distinguish a rim from a wall. The
 kinds of contact are therefore distinguished by position, and by forces summed over windows:
 
 - The *first contact* has a plane. Its normal is the reverse of the motion that the contact stopped (the approach, or

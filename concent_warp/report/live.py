@@ -120,7 +120,7 @@ class LiveView:
             self._server.stop()
 
     def look_at(self, point: Sequence[float], offset: Sequence[float]) -> None:
-        """Set the initial view: the point looked at [m], and the camera's offset from it [m]."""
+        """Set the initial view: the target point [m], and the camera's offset from it [m]."""
         camera = self._server.initial_camera
         camera.look_at = np.asarray(point, dtype=float)
         camera.position = np.add(point, offset)

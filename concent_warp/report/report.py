@@ -235,7 +235,7 @@ def _page_file(name: str) -> str:
 
 
 def _filled(template: str, parts: Mapping[str, str]) -> str:
-    """Return a template with every ``[[name]]`` replaced, in one pass: what is put in is not looked at again."""
+    """Return a template with every ``[[name]]`` replaced, in one pass: inserted text is not searched."""
     return re.sub(r"\[\[(\w+)\]\]", lambda found: parts[found[1]], template)
 
 

@@ -29,7 +29,7 @@ class ProcessPoolCfg:
     """Fewest steps of all simulations together for which processes are started [-]: about one second in one thread."""
 
     def suits(self, processes: int, steps: int) -> bool:
-        """Return whether processes are worth starting for a number of steps of all simulations together."""
+        """Return whether processes are started for a number of steps of all simulations together."""
         return processes >= self.min_processes and steps >= self.min_steps
 
 

@@ -15,7 +15,7 @@ def test_slopes_of_settling_are_those_of_central_differences(script):
     assert benchmark.check("settle", 0, 5.0, "cpu") is None
 
 
-def test_curves_begin_with_the_gradients_and_cost_what_they_cost(script):
+def test_curves_begin_with_the_simulations_of_the_gradients(script):
     benchmark = script("benchmarks.fit.es_vs_gradient")
     fit = FitCfg(EvolutionCfg(population=4), generations=2, gradient=GradientCfg(starts=2, iterations=3))
     row = benchmark.run(benchmark.Args(fit=fit), "settle", 0, "gradient+es")

@@ -47,7 +47,7 @@ def test_the_hidden_effect_is_named_first_with_its_value(data, name, effects):
     assert found.ratio[-1] < 1.05
 
 
-def test_nothing_is_named_where_nothing_is_hidden(data):
+def test_no_effect_is_named_where_none_is_hidden(data):
     truth, found = diagnosed(data, named(data, "drop-null-0"))
     assert truth == ()
     assert found.verdict == "none_needed"

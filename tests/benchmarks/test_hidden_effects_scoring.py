@@ -83,7 +83,7 @@ def test_two_effects_are_found_where_each_is_in_a_group_of_its_own(report, group
         ("group", True, False),
     ],
 )
-def test_verdicts_on_data_that_hide_nothing_or_what_no_library_has(report, verdict, alarm, none):
+def test_verdicts_on_data_without_effect_or_with_an_unknown_one(report, verdict, alarm, none):
     assert report.alarm(row("null", {}, verdict=verdict)) is alarm
     assert report.none_of_these(row("outside", {"magnet": 1.0}, verdict=verdict)) is none
 

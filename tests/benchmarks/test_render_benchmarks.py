@@ -131,7 +131,7 @@ def test_training_stops_when_its_time_is_over(script):
     assert direct.learn(training, "base", 0.0)["steps"] == 1
 
 
-def test_rasteriser_benchmark_says_why_gsplat_is_not_there(script, monkeypatch):
+def test_rasteriser_benchmark_reports_why_gsplat_is_missing(script, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "gsplat", None)
     rasteriser = script("benchmarks.render.rasteriser")
     poses, matrix = rasteriser.cameras(1), rasteriser.intrinsics_of(15.0, 16, 16)

@@ -119,7 +119,7 @@ def test_episodes_are_counted_on_the_page(page):
     assert page.messages == []
 
 
-def test_policy_is_shown_in_the_stand_in_world_for_so_many_episodes(capsys):
+def test_policy_is_shown_in_reality_for_a_number_of_episodes(capsys):
     command = ["play", "--pretrained", "--world", "reality", "--hide", "mass=1.5", "--states", "1", "--episodes", "1"]
     assert main([*command, "--setpoint-lead-scale", "0.5", "--speed", "4", "--port", "8766"]) == 0
     said = capsys.readouterr().out

@@ -140,7 +140,7 @@ def test_json_is_valid_and_has_every_channel_phase_and_model(comparison):
     assert document["phases"]["demo_0"][0] == {"name": "free", "start": None, "end": 0.5}
 
 
-def test_a_model_that_diverges_is_named_and_never_looks_good():
+def test_a_model_that_diverges_is_named_and_has_no_finite_error():
     recording = recorded(model(2))
     found = compare_replays({"good": model(2), "wild": model(-600)}, recording, "mujoco")
     assert 0 < found.diverged["wild", "demo_0"] < 2
@@ -264,7 +264,7 @@ def stale(recording):
 @pytest.mark.parametrize(
     ("effect", "value", "changed"), [(ActuatorDelay("drive"), 0.06, delayed), (Latency("rail"), 0.05, stale)]
 )
-def test_effects_of_a_model_act_in_its_replay_and_in_what_it_reads(effect, value, changed):
+def test_effects_of_a_model_act_in_its_replay_and_in_predicted_readings(effect, value, changed):
     found = compare_replays(
         {"without": model(2), "with": model(2).add(effect, [value])}, changed(recorded(model(2))), "mujoco"
     )

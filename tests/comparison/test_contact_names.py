@@ -58,7 +58,7 @@ def test_spheres_of_a_contact_geometry_are_identified_by_their_body():
     assert partners(spheres=True).of("block", 0.1, 0.3).names[0].startswith("box (")
 
 
-def test_what_falls_free_touches_nothing_and_a_brush_is_not_reported():
+def test_a_free_fall_has_no_contact_and_a_short_contact_is_not_reported():
     falling = partners(height=0.5)
     assert falling.of("block", 0.0, 0.2) is None
     assert falling.of("block", 0.0, 0.3) is None

@@ -137,7 +137,7 @@ def test_stages_describe_a_task_where_a_robot_opens_one_of_several():
     assert not has_task({})
 
 
-def test_two_objects_have_phases_of_their_own_and_the_livelier_one_tells_those_of_the_demonstration():
+def test_two_objects_have_separate_phases_and_the_faster_one_gives_those_of_the_demonstration():
     other = '<body name="other" pos="1 0 .03"><freejoint/><geom type="box" size=".03 .03 .03"/></body></worldbody>'
     model = Model(Scene(thing(height=0.23).replace("</worldbody>", other)))
     engine = MujocoEngine(model)

@@ -182,7 +182,7 @@ def test_the_worst_place_names_body_phase_partner_and_direction(pushed):
     assert place.sentence(demonstration=True).startswith("demo_")
 
 
-def test_joints_name_what_the_body_that_they_move_touches(pushed):
+def test_joints_name_the_contacts_of_the_body_that_they_move(pushed):
     place = next(p for p in pushed.worst_spans if p.channels[0] == "rail")
     assert place.against[0].startswith("block (-x")
     assert place.direction == "measured above the model"

@@ -49,5 +49,5 @@ def test_clean_data_are_not_remarked_on():
         (alone, "demo_0, angle: only 1 sample, which carries no information."),
     ],
 )
-def test_what_looks_wrong_is_reported_with_where_it_is(change, words):
+def test_doubtful_data_are_reported_with_their_place(change, words):
     assert check_data(spoiled(change)) == [words]

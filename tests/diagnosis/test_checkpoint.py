@@ -99,7 +99,7 @@ def test_pieces_of_another_diagnosis_are_not_taken(other, recording, done, monke
     assert len(list(folder.glob("*.npz"))) == before + len(tasks)
 
 
-def test_what_is_kept_comes_back_as_it_was(recording, tmp_path):
+def test_saved_results_are_restored_unchanged(recording, tmp_path):
     effect = effect_class("joint_damping")("hinge")
     kept = ScreenedCandidate(effect, 0.5, float("-inf"), np.array([1.0, np.inf]), (), measured=True)
     _save(tmp_path / "a.npz", kept)

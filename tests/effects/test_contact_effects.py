@@ -38,7 +38,7 @@ def test_grain_holds_less_along_y_where_its_ratio_is_below_one():
     assert block.qpos[-1, 1] == pytest.approx(0.8**2 / (2 * 0.5 * 0.3 * G), rel=0.02)
 
 
-def test_grain_of_a_contact_without_friction_does_nothing():
+def test_anisotropy_of_a_contact_without_friction_has_no_effect():
     slippery = BLOCK.replace('friction="0.3"', 'friction="0.3" condim="1"')
     block = move(world(slippery, AnisotropicFriction("thing"), 2.0), 0.3, qvel=[0, 0.8, 0, 0, 0, 0])
     assert block.qvel[-1, 1] == pytest.approx(0.8, abs=1e-6)
@@ -64,7 +64,7 @@ def test_rolling_ball_slows_down_at_the_rate_that_rolling_friction_gives(mu):
 
 
 @pytest.mark.parametrize("effect", [TorsionalFriction, RollingFriction])
-def test_friction_of_more_dimensions_leaves_sliding_as_it_was(effect):
+def test_friction_of_more_dimensions_does_not_change_sliding(effect):
     plain = move(world(BLOCK), 0.4, qvel=[0.8, 0.3, 0, 0, 0, 0])
     null = move(world(BLOCK).add(effect("thing")), 0.4, qvel=[0.8, 0.3, 0, 0, 0, 0])
     np.testing.assert_allclose(null.qpos, plain.qpos, atol=1e-4)
@@ -147,7 +147,7 @@ def test_adhesion_reaches_over_a_gap_of_a_millimetre_and_no_farther(floor, heigh
     np.testing.assert_allclose(block.qvel[-1], [0, 0, expected, 0, 0, 0], atol=1e-9)
 
 
-def test_without_a_force_adhesion_leaves_falls_and_rebounds_as_they_were():
+def test_adhesion_without_force_changes_no_motion():
     start = {"qpos": [0, 0, 0.1, 0.9, 0.3, 0.2, 0.1], "qvel": [0.5, 0, -1, 3, 2, 1]}
     plain, null = move(world(BLOCK), 0.5, **start), move(world(BLOCK).add(Adhesion("thing")), 0.5, **start)
     np.testing.assert_allclose(null.qpos, plain.qpos, atol=1e-6)

@@ -125,7 +125,7 @@ def test_mass_and_inertia_stay(geometry):
         np.testing.assert_allclose(getattr(off, name), getattr(plain.compile(), name), atol=1e-9)
 
 
-def test_it_acts_on_free_bodies_with_shapes_of_known_size_only():
+def test_contact_geometry_acts_only_on_free_bodies_with_shapes_of_known_size():
     mesh = '<geom type="mesh" mesh="wedge"/>'
     xml = f"""<mujoco><asset><mesh name="wedge" vertex="-1 -1 -1 1 -1 -1 0 1 -1 0 0 1" scale=".02 .02 .02"/></asset>
     <worldbody><body name="wedge"><freejoint/>{mesh}</body><body name="ghost"><freejoint/>

@@ -41,7 +41,7 @@ def test_saturation_keeps_a_limit_that_the_model_has():
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.0154])
-def test_delayed_drive_does_later_what_it_was_told(delay):
+def test_a_delayed_drive_follows_its_commands_later(delay):
     ramp = np.minimum(np.arange(400) * 0.002, 0.3)[:, None] ** 2
     late = move(world(SERVO, ActuatorDelay("drive"), delay), 0.4, ctrl=ramp)
     plain = move(world(SERVO), 0.4, ctrl=ramp)

@@ -49,7 +49,7 @@ def grain(m: mujoco.MjModel, d: mujoco.MjData, body: int, ratio: float) -> np.nd
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize("seed", range(3))
-def test_grain_is_the_formula_at_each_contact_with_what_stands_still(cone, seed):
+def test_anisotropic_friction_is_the_formula_at_each_contact_with_fixed_geoms(cone, seed):
     m = mujoco.MjModel.from_xml_string(SLIDING.format(cone=cone))
     d, rng = mujoco.MjData(m), np.random.default_rng(seed)
     mujoco.mj_step(m, d, nstep=60)
@@ -67,7 +67,7 @@ def test_grain_is_the_formula_at_each_contact_with_what_stands_still(cone, seed)
     assert (d.xfrc_applied[[0, m.body("other").id]] == 0).all()
 
 
-def test_grain_of_one_adds_nothing_and_acts_on_the_body_on_either_side_of_a_contact():
+def test_anisotropy_of_one_adds_no_force_and_acts_on_either_side_of_a_contact():
     m = mujoco.MjModel.from_xml_string(SLIDING.format(cone="elliptic"))
     d = mujoco.MjData(m)
     d.qvel[:] = 0.3

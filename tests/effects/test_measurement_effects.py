@@ -38,7 +38,7 @@ def test_late_reading_shows_what_was_before():
     )
 
 
-def test_ruler_scales_positions_and_leaves_what_it_does_not_measure():
+def test_length_scale_scales_positions_and_no_other_readings():
     np.testing.assert_allclose(
         reading(BLOCK, LengthScale("position"), [0.1], "position"), 1.1 * truth("position", TIME)
     )

@@ -29,7 +29,7 @@ class Arguments:
     as_pretrained: bool = False
     """Write a folder as they are for --pretrained."""
     overwrite: bool = False
-    """Replace what is there."""
+    """Replace existing files."""
 
 
 def run(arguments: Arguments) -> dict[str, Any]:

@@ -24,7 +24,7 @@ class Arguments:
     out: OutPath = Path("demo.h5")
     """Recording file to write."""
     seeds: tuple[int, ...] = (0,)
-    """One demonstration for each seed: it places the block and draws the expert's offsets."""
+    """One demonstration for each seed: it determines the place of the block and the expert's offsets."""
     robot: Annotated[Path | None, tyro.conf.arg(name="robot")] = None
     """MJCF of another robot than the embedded arm."""
     tcp_site: Annotated[str, tyro.conf.arg(name="robot.tcp-site")] = RobotCfg.tcp_site

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Arguments:
     """Train networks that turn the simulation's image into what the real camera would see of robot and background.
 
-    Wants a recording with images of the robot at work without objects, which are rendered by other means. Writes the
+    Needs a recording with images of the robot at work without objects, which are rendered by other means. Writes the
     networks and their state to a run folder, for concent render. Ctrl-C loses nothing.
     """
 

@@ -123,7 +123,7 @@ class LocateForcesCfg:
     and up to 0.3 s where readings are rare. Errors of forces fall with its square; changes within it are averaged, and
     a body that starts or stops within it is left out."""
     extra_starts: int = 4
-    """Further initial states of each window, drawn from the error of the smoothed one."""
+    """Further initial states of each window, sampled from the error of the smoothed one."""
     seed: int = 0
     """Seed of all random numbers."""
     min_phase_windows: int = 3

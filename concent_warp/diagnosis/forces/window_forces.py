@@ -7,8 +7,8 @@ generalised force: the momentum that the model lacks, over the window. This hold
 inverse dynamics at the measured state would depend on penetrations smaller than the noise. The force is an average over
 the window with the weight 30 u^2 (1 - u)^2, u = 0..1 from start to end.
 
-The window is also simulated from further states, drawn from the error of the smoothed one; the scatter of a among them
-(an impact inside the window or outside) adds to its error, and so does a misfit beyond the noise.
+The window is also simulated from further states, sampled from the error of the smoothed one; the scatter of a among
+them (an impact inside the window or outside) adds to its error, and so does a misfit beyond the noise.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def fit_effects(
 ) -> FittedEffects:
     """Fit all parameters of a model's effects together with the initial states.
 
-    Parameters that stand at their null value and name values worth a trial start from the best of these.
+    Parameters at their null value that have values to scan (`Parameter.scan`) start from the best of these.
 
     Args:
         model: The model with effects, at the values to start from.

@@ -29,8 +29,8 @@ class InitialStateCfg:
     """Most computations of the derivatives with respect to the initial states [-]."""
     min_fall: float = 3e-3
     """Relative fall of a window's cost below which its initial state counts as found [-]."""
-    prospect: float = 3.0
-    """A window whose cost must fall below a bound is given up if this many times its last fall is not enough [-]."""
+    max_expected_falls: float = 3.0
+    """Multiple of a window's last fall of the cost that must suffice to reach its bound, or its fit ends [-]."""
     dampings: tuple[float, ...] = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
     """Levenberg-Marquardt dampings that are tried in each iteration, relative to the curvature [-]."""
     first_step: float = 0.3
@@ -138,8 +138,8 @@ class InitialStateSearch:
             offsets: Errors of the initial states of all windows, in units of their spread.
             windows: Whose initial states are fitted.
             iterations: Most computations of the derivatives with respect to the initial states.
-            upper_bounds: Costs by window that are to be undercut; a window is given up where the falls of its cost do
-                not suffice for it, see `InitialStateCfg.prospect`.
+            upper_bounds: Costs by window to fall below; the fit of a window ends where the falls of its cost do not
+                suffice for it, see `InitialStateCfg.max_expected_falls`.
         """
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
@@ -230,7 +230,7 @@ class InitialStateSearch:
                 if costs[best] > (1 - cfg.min_fall) * cost:
                     aim[w] += 1 if np.mean(residuals[w] ** 2) > outlying**2 else len(cfg.target_changes)
                 short = min(costs[best], cost) - upper_bounds.get(w, np.inf)
-                if aim[w] < len(cfg.target_changes) and short <= cfg.prospect * max(cost - costs[best], 0.0):
+                if aim[w] < len(cfg.target_changes) and short <= cfg.max_expected_falls * max(cost - costs[best], 0.0):
                     moving.append(w)
                     change = np.sqrt(np.mean(difference.columns**2, axis=0))
                     self.steps[w] = np.clip(

@@ -27,7 +27,7 @@ class EvolutionCfg:
     sigma_share: float = 1 / 6
     """That share of the Chamfer distance [-]. Empirical."""
     max_sigma: float = 3e-3
-    """Largest standard deviation that is chosen by itself [m]."""
+    """Largest standard deviation that is chosen automatically [m]."""
     sigma_decay: float = 0.975
     """Factor on sigma from one generation to the next."""
     length: float = 0.03

@@ -40,7 +40,7 @@ class GradientCfg:
     """Length of the first step of the sphere that moves farthest [m]. None takes a third of the starting distance, at
     most `largest_step`."""
     largest_step: float = 1.5e-3
-    """Longest first step that is chosen by itself [m]."""
+    """Longest first step that is chosen automatically [m]."""
     step_increase: float = 1.2
     """Factor by which a step grows after one that lowers the loss [-]. Empirical."""
     step_decrease: float = 0.5

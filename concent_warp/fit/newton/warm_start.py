@@ -1,6 +1,6 @@
 """A start for the evolution strategy by gradients, and the rule by which gradients count as no help.
 
-Gradients help where the best iterate, scored again in MuJoCo over all frames, lies below the start by a given share.
+Gradients help where the best iterate, evaluated again in MuJoCo over all frames, lies below the start by a given share.
 Elsewhere, and where Newton cannot simulate the scene stably, the evolution strategy begins as if there had been none.
 """
 

@@ -1,6 +1,6 @@
-"""The scripted expert: pick the block, press it beside the hole, slide until it drops in, push it home, let go.
+"""The scripted expert: pick the block, press it beside the hole, slide until it drops in, press it in, release it.
 
-It touches the rim on purpose, presses on the box while it slides, and keeps pressing until the far wall of the hole
+It touches the rim, presses on the box while it slides, and keeps pressing until the far wall of the hole
 stops the block, so that contacts guide the block and not the arm alone. Forces are exerted through the stiffness of the
 position control: the command lies beyond the surface.
 """

@@ -125,9 +125,9 @@ def actuator_saturation(rig: Rig, magnitude: float) -> HiddenEffectOfRig:
 
 
 def peak_drive_force(rig: Rig, demonstrations: int, seed: int) -> float:
-    """Return the force [N m or N] that the hardest-working drive exceeds for a hundredth of the time, nothing hidden.
+    """Return the force [N m or N] that the most loaded drive exceeds 1 % of the time, without hidden effects.
 
-    Motions and seeds differ in what they ask of a drive; a limit that shows on all of them goes with this.
+    Loads differ between motions and seeds; a limit that is observable on all of them is proportional to this.
     """
     model, seen = rig.world().compile(), []
     columns = [model.joint(d.joint).dofadr[0] for d in drives(rig)]

@@ -1,10 +1,10 @@
 """A cloud of surface points as a solid: normals by local planes, signed distance by the planes of the nearest points.
 
-What it can tell is limited by the cloud: the distance is right near a surface that the points cover densely, and to a
+The accuracy depends on the cloud: the distance is exact near a surface that the points cover densely, and to a
 few point spacings at edges. Inside it is the distance to the plane of the nearest surface, which near a concave edge is
 less than the true depth. The outward side is that from which a point is visible, as in a scan: a part never
 recorded has no inside, and where a wall is thinner than a few spacings some points (about 1 in 20) come out reversed. A
-box of 70 mm with a hole and a floor of 5 mm wants about 5,000 points.
+box of 70 mm with a hole and a floor of 5 mm needs about 5,000 points.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class PointCloud(Solid):
         return np.sum(weight * height, axis=1), normalised(gradient, np.linalg.norm(gradient, axis=1))
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """See `Solid.sample`; draws from the points, the sparser the place the more often."""
+        """See `Solid.sample`; samples the points with weights inverse to their density."""
         row = rng.choice(len(self.points), size=count, p=self.patch / self.patch.sum())
         return self.points[row].copy(), self.normals[row].copy()
 
@@ -186,7 +186,7 @@ def _thinned(points: np.ndarray, most: int) -> np.ndarray:
 
 
 def without_outliers(points: np.ndarray, *, neighbours: int = 12, spread: float = 4.0) -> np.ndarray:
-    """Tell which points lie near others, shape (n, 3) -> (n,) bool.
+    """Return which points are near others, shape (n, 3) -> (n,) bool.
 
     A point is an outlier if the mean distance to its nearest neighbours exceeds the median over all points by more than
     `spread` times the median deviation from that median.

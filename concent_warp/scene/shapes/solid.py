@@ -1,4 +1,4 @@
-"""Solids in the body frame: signed distance with its gradient, and points drawn uniformly from the surface.
+"""Solids in the body frame: signed distance with its gradient, and points sampled uniformly from the surface.
 
 Box, sphere, capsule, cylinder and ellipsoid are exact, inside and outside. Signed distances are negative inside.
 """
@@ -15,7 +15,7 @@ Distances = tuple[np.ndarray, np.ndarray]
 
 
 class Solid(ABC):
-    """A closed body that can tell how deep a point lies in it."""
+    """A closed body with signed distances."""
 
     @property
     @abstractmethod
@@ -28,7 +28,7 @@ class Solid(ABC):
 
     @abstractmethod
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw points [m] uniformly from the surface, with outward normals, each of shape (count, 3)."""
+        """Return points [m] sampled uniformly from the surface, with outward normals, each of shape (count, 3)."""
 
 
 @dataclass(frozen=True)
@@ -250,12 +250,12 @@ def normalised(
 
 
 def _directions(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw unit vectors uniformly from the sphere, shape (count, 3)."""
+    """Return unit vectors sampled uniformly from the sphere, shape (count, 3)."""
     vectors = rng.standard_normal((count, 3))
     return normalised(vectors, np.linalg.norm(vectors, axis=1))
 
 
 def _circle(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw unit vectors uniformly from the circle in the xy plane, shape (count, 3)."""
+    """Return unit vectors sampled uniformly from the circle in the xy plane, shape (count, 3)."""
     angle = rng.uniform(0, 2 * np.pi, count)
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)

@@ -65,7 +65,7 @@ class GaussianSplats:
 
 
 def is_splats(header: PlyHeader) -> bool:
-    """Tell whether a PLY file holds splats, by its vertex properties."""
+    """Return whether a PLY file holds splats, by its vertex properties."""
     return set(REQUIRED_PROPERTIES) <= header.properties("vertex")
 
 

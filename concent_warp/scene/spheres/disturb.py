@@ -90,7 +90,7 @@ def offset_normal(
 def toward_axis(
     point: Sequence[float] = (0.0, 0.0, 0.0), direction: Sequence[float] = (0.0, 0.0, 1.0), *, cosine: float = 0.5
 ) -> SelectFaces:
-    """Select the faces that look at an axis, such as the walls of a hole.
+    """Select the faces whose normals point at an axis, such as the walls of a hole.
 
     Args:
         point: a point of the axis, body frame [m], shape (3,).

@@ -74,7 +74,7 @@ def thrown(known: RecordedRange) -> ThrowableBody:
     return ThrowableBody(known, known.m.body("block").id, "mujoco")
 
 
-def test_a_block_knows_where_it_is_and_how_fast_it_was():
+def test_a_throwable_body_has_its_last_pose_and_its_speed():
     known = bench()
     toy = thrown(known)
     assert (toy.name, toy.at, toy.dof) == ("block", 9, 8)
@@ -113,7 +113,7 @@ def test_poses_are_shifted_and_turned_in_the_world():
     np.testing.assert_array_equal(motion.action["reach"].value, [-0.05])
 
 
-def test_a_block_rests_where_it_comes_to_rest():
+def test_the_rest_pose_of_a_block_is_its_simulated_one():
     resting = thrown(bench())
     assert resting.rest is not None
     assert resting.rest[11] == pytest.approx(0.02, abs=1e-3)

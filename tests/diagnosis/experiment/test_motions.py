@@ -86,7 +86,7 @@ def test_lighter_grip_closes_less():
 
 
 @pytest.mark.parametrize("tilted", [False, True])
-def test_table_is_turned_only_where_it_may_slope(tilted):
+def test_the_slope_is_varied_only_where_it_is_adjustable(tilted):
     made = [*drive_motions(bench(), tilted), *body_motions(bench(), "mujoco", tilted)]
     assert any(m.change is slope_turned for m in made) == tilted
 

@@ -54,7 +54,7 @@ def test_a_flying_block_is_free():
     assert part.state.free == pytest.approx(np.tile(np.eye(6), (len(part.state.free), 1, 1)))
 
 
-def test_contacts_hide_motions_that_they_see():
+def test_motions_along_a_contact_normal_are_not_free():
     push = np.array([[0, 0, 1.0, 0, 0, 0]])
     assert np.diag(_free_motions(push, 1, 0.05)) == pytest.approx([1, 1, 0, 1, 1, 1])
 

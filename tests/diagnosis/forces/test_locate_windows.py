@@ -73,7 +73,7 @@ def test_angular_velocity_follows_from_the_quaternion_and_its_rate():
     assert angular_velocity(start.as_quat(scalar_first=True), rate) == pytest.approx(omega, abs=1e-6)
 
 
-def test_departures_of_a_spring_swing_and_settle_about_its_sag():
+def test_deviations_of_a_spring_oscillate_about_its_static_deflection():
     omega, length = 30.0, 0.1
     response = _response(np.array([[-(omega**2)]]), np.zeros((1, 1)), length, 40)
     s = np.linspace(0, length, len(response))
@@ -82,7 +82,7 @@ def test_departures_of_a_spring_swing_and_settle_about_its_sag():
     assert response[:, 0, 2] == pytest.approx((1 - np.cos(omega * s)) / omega**2, abs=1e-9)
 
 
-def test_variance_grows_only_where_misfit_is_no_chance():
+def test_variance_grows_only_where_the_misfit_is_significant():
     assert _misfit(30.0, 30, 3.0) == 1
     assert _misfit(40.0, 30, 3.0) == 1
     assert _misfit(90.0, 30, 3.0) == 3

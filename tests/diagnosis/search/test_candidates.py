@@ -22,7 +22,7 @@ def test_every_effect_that_may_act_on_a_model_is_a_candidate():
     assert "rolling_friction" not in expected
 
 
-def test_instruments_that_recorded_nothing_lack_nothing():
+def test_instruments_without_readings_have_no_residual():
     found = candidates(swing(), {"angle"})
     sensors = [e.target for e in found if e.kind == "sensor"]
     assert sensors

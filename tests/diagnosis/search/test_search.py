@@ -45,7 +45,7 @@ def complete():
     return base_of(swung(damping=0.0))
 
 
-def test_a_model_that_lacks_nothing_leaves_noise_alone(lacking, complete):
+def test_the_residual_of_a_complete_model_is_noise(lacking, complete):
     assert complete.ratio == pytest.approx(1.0, abs=0.1)
     assert lacking.ratio > 2.5
 
@@ -79,7 +79,7 @@ def test_a_fit_of_the_missing_effect_leaves_noise_alone_and_gains_in_every_fold(
     assert add_candidate(lacking, found).ratio == pytest.approx(found.ratio)
 
 
-def test_a_fit_that_was_taken_up_again_in_vain_is_left_as_it_is(lacking):
+def test_a_fit_continued_without_improvement_stays(lacking):
     found = fit_candidate(lacking, screen(lacking, effect("joint_friction")))
     for _ in range(20):
         if found.polished:
@@ -90,12 +90,12 @@ def test_a_fit_that_was_taken_up_again_in_vain_is_left_as_it_is(lacking):
     assert polish_candidate(lacking, found, thorough=True) is not found
 
 
-def test_a_fit_that_others_initial_states_do_not_better_is_left_as_it_is(lacking):
+def test_a_fit_that_other_initial_states_do_not_improve_stays(lacking):
     right, wrong = (fit_candidate(lacking, screen(lacking, effect(name))) for name in ("joint_damping", "armature"))
     assert restart_candidate(lacking, right, wrong.fit) is right
 
 
-def test_a_fit_with_wrong_initial_states_finds_back_from_the_leaders(lacking):
+def test_a_fit_with_wrong_initial_states_recovers_from_those_of_the_best_fit(lacking):
     right = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
     solver = Solver(Prediction(lacking.model, (right.effect,), lacking.windows))
     astray = tuple(o + 3.0 for o in right.fit.offsets)

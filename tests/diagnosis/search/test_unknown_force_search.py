@@ -125,18 +125,18 @@ def test_a_second_effect_that_is_there_is_not_beaten():
     assert unknown_force(nodes, CFG, one_by_one) is None
 
 
-def test_nothing_is_seen_where_nothing_is_hidden():
+def test_no_force_is_found_where_no_effect_is_hidden():
     for seed in range(4):
         assert unknown_force(nodes_of(ridden(seed=seed)), CFG, one_by_one) is None
 
 
-def test_nothing_is_seen_where_the_right_effect_was_added():
+def test_no_force_is_found_where_the_right_effect_was_added():
     nodes = nodes_of(ridden(friction=FRICTION), "joint_friction")
     assert nodes[0].ratio > 2
     assert unknown_force(nodes, CFG, one_by_one) is None
 
 
-def test_a_model_that_explains_nothing_needs_no_such_test():
+def test_the_unknown_force_is_not_tested_where_the_residual_is_noise():
     def never(work, tasks):
         raise AssertionError(work, tasks)
 
@@ -159,5 +159,5 @@ def test_bumps_lie_where_the_joint_was():
     assert not position.moving
 
 
-def test_users_do_not_see_it_among_the_effects():
+def test_the_unknown_force_is_not_listed_among_the_effects():
     assert not any(e.name == "unknown_force" for e in candidates(Model(Scene(rail())), {"place"}))
