@@ -357,6 +357,26 @@ def test_forces_and_torques_are_perturbed_each_by_itself(deviations):
     assert wrench[:, 3:].any().item() == (deviations[1] > 0)
 
 
+def test_an_action_is_perturbed_where_a_uniform_number_is_below_the_share(monkeypatch):
+    task = make_task(PERTURBED)
+    environment, physics = make_environment(task, replace(PERTURBED, worlds=3), made_up_states(task))
+    environment._perturbing.fill_(1)
+    environment.stage[:] = 1
+    share = torch.tensor(0.4)
+    monkeypatch.setattr(torch, "rand", lambda *_, **__: torch.stack([share, share - 1e-6, share + 1e-6]))
+    environment._apply_action()
+    assert physics.wrench[:, task.objects[0]].any(dim=1).tolist() == [False, True, False]
+
+
+def test_any_flag_of_dropped_contacts_is_an_overflow():
+    environment, physics = at_places(exact_task(), [(0.0, 0.0, 0.0)] * 4)
+    physics.dropping = -(2**31) + 2
+    physics.flags = torch.tensor([-(2**31), 2, 1, 0], dtype=torch.int32)
+    environment.step(still(environment))
+    assert environment.read_log()["overflow"] == 0.5
+    assert not physics.overflow.any()
+
+
 def test_noise_is_of_its_deviation_on_object_positions_alone():
     task, rng = make_task(SETTINGS), np.random.default_rng(0)
     plain, noisy = (

@@ -74,13 +74,13 @@ def test_opening_is_the_mean_length_of_the_grippers_actuators():
         '<position name="one" joint="a"/><position name="two" joint="b"/><position name="both" tendon="fingers"/>'
         '<position name="rope" tendon="rope"/>'
     )
-    a, b = (m.joint(name).qposadr[0] for name in "ab")
+    a, b = (int(m.joint(name).qposadr[0]) for name in "ab")
 
     def weights(*gripper: int) -> tuple[float, float]:
         found = _opening(m, list(gripper))
         assert found.shape == (m.nq,)
         assert np.abs(found).sum() == pytest.approx(abs(found[a]) + abs(found[b]))
-        return found[a], found[b]
+        return float(found[a]), float(found[b])
 
     assert weights(0) == (1.0, 0.0)
     assert weights(0, 1) == (0.5, 0.5)
