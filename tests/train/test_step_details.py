@@ -97,8 +97,9 @@ def test_success_is_a_deviation_below_the_tolerance_on_every_axis():
 def test_a_target_is_met_below_the_tolerance():
     task = replace(exact_task(), robot_slots=np.zeros((3, 3), bool))
     environment, _ = at_places(task, [(x, 0.0, 0.0) for x in (0.25, 0.2499, 0.0, 0.3)])
+    environment._steps_within[2] = 5
     environment.step(still(environment))
-    assert environment._steps_within.tolist() == [0, 1, 1, 0]
+    assert environment._steps_within.tolist() == [0, 1, 6, 0]
     assert environment.reached.tolist() == [2, 3, 3, 2]
     assert environment.stage.tolist() == [2, 2, 2, 2]
 
@@ -351,6 +352,7 @@ def test_forces_and_torques_are_perturbed_each_by_itself(deviations):
     environment, physics = make_environment(task, cfg, made_up_states(task))
     environment._perturbing.fill_(1)
     environment.stage[:] = 1
+    environment._frames[1, 0] = 1  # as if the tool were on the first body
     environment._apply_action()
     wrench = physics.wrench[:, task.objects[0]]
     assert wrench[:, :3].any().item() == (deviations[0] > 0)
