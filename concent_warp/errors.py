@@ -137,7 +137,7 @@ class RenderError(ConcentError):
         ...     cw.render(cw.load_policy("shape_sorter"), "dataset", cw.RenderCfg(episodes=0))
         ... except cw.RenderError as error:
         ...     print(error)
-        episodes, worlds, rate and flow steps are to be at least 1.
+        episodes is out of bounds; expected at least 1 and at most 1e+07, found 0.
     """
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from concent_warp.checks import PositiveDuration, check_settings
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.no_contact import without_object_contact
 from concent_warp.comparison.result import Comparison
@@ -52,7 +53,7 @@ class GroundCfg:
     """Demonstrations to fit; all where empty. The comparison is about all in any case."""
     method: Method = "es"
     """How the fit searches: evolution strategy, gradients through Newton, or the latter as a start for the former."""
-    overlap_frame: float = 0.01
+    overlap_frame: PositiveDuration = 0.01
     """Length of the frames in which contact is compared with the truth [s]: shorter than contacts that count, see
     `StagingCfg.min_contact_duration`."""
 
@@ -123,6 +124,7 @@ def ground(
         'after'
     """
     cfg, folder = cfg or GroundCfg(), Path(out)
+    check_settings(cfg)
     fitted = tuple(d.name for d in recording.only(cfg.demonstrations).demonstrations)
     fit = fit_geometry(
         Model.from_recording(recording) if start is None else start,

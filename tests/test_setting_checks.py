@@ -29,13 +29,13 @@ def test_seeds_of_functions_are_checked():
     policy = cw.load_policy("shape_sorter")
     with pytest.raises(ConcentError, match="the seed"):
         record(RealityCfg(), [0, -1])
-    with pytest.raises(ConcentError, match="the seed"):
+    with pytest.raises(ConcentError, match="seed is out of bounds"):
         cw.TrainCfg(seed=-1)
     with pytest.raises(ConcentError, match="the seed"):
         cw.evaluate(policy, episodes=1, seed=-1)
     with pytest.raises(ConcentError, match="the seed"):
         cw.play(policy, seed=-1)
-    with pytest.raises(ConcentError, match="the seed"):
+    with pytest.raises(ConcentError, match="seed is out of bounds"):
         cw.render(policy, "nowhere", cw.RenderCfg(seed=-1))
     assert not Path("nowhere").exists()
 
@@ -69,14 +69,14 @@ def test_devices_that_are_not_there_are_refused(monkeypatch, name, count, said):
         ("render --pretrained --device cuda:0", "there is no device cuda:0"),
         ("splat-fit images --device cuda:0", "there is no device cuda:0"),
         ("render-train demo.h5 --device cuda:0", "there is no device cuda:0"),
-        ("demo --seeds -1", "the seed is out of bounds"),
-        ("demo --unseen-seeds 0 -5", "the seed is out of bounds"),
-        ("record --seeds -1", "the seed is out of bounds"),
-        ("evaluate --pretrained --seed -1", "the seed is out of bounds"),
-        ("fit demo.h5 --fit.seed -1", "the seed is out of bounds"),
-        ("diagnose demo.h5 --seed -1", "the seed is out of bounds"),
-        ("splat-fit images --fit.seed -1", "the seed is out of bounds"),
-        ("record --reality.place-spread nan", "reality.place_spread is not a number"),
+        ("demo --seeds -1", "--seeds is out of bounds; expected 0 to 4294967295"),
+        ("demo --unseen-seeds 0 -5", "--unseen-seeds is out of bounds; expected 0 to 4294967295"),
+        ("record --seeds -1", "--seeds is out of bounds; expected 0 to 4294967295"),
+        ("evaluate --pretrained --seed -1", "--seed is out of bounds; expected 0 to 4294967295"),
+        ("fit demo.h5 --fit.seed -1", "--fit.seed is out of bounds; expected 0 to 4294967295"),
+        ("diagnose demo.h5 --seed -1", "--seed is out of bounds; expected 0 to 4294967295"),
+        ("splat-fit images --fit.seed -1", "--fit.seed is out of bounds; expected 0 to 4294967295"),
+        ("record --reality.place-spread nan", "--reality.place-spread is not a number"),
     ],
 )
 def test_commands_refuse_them_at_once(monkeypatch, tmp_path, capsys, command, said):

@@ -4,8 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+from concent_warp.checks import (
+    Bounds,
+    Count,
+    Duration,
+    Interval,
+    Positive,
+    PositiveDuration,
+    PositiveInterval,
+    Share,
+    Signed,
+    Worlds,
+)
 from concent_warp.documents import read_toml
 from concent_warp.errors import ConcentError, TrainError
 from concent_warp.events.decode import decode
@@ -26,15 +38,15 @@ SETTINGS = TRAIN_SETTINGS
 class ActionCfg:
     """Mapping from an action to commands: each number in -1..1 is a share of the largest step."""
 
-    turn: float = 0.02
+    turn: Positive = 0.02
     """Largest step of a hinge joint's command [rad]."""
-    slide: float = 0.004
+    slide: Positive = 0.004
     """Largest step of a slide joint's command [m]."""
-    gripper: float = 0.003
+    gripper: Positive = 0.003
     """Largest step of the gripper's command [m]: so small that exploration does not drop a grasped object at once."""
-    turn_lead: float = 0.03
+    turn_lead: Positive = 0.03
     """Largest difference of command and position of a hinge joint [rad]; times the stiffness it bounds the torque."""
-    slide_lead: float = 0.015
+    slide_lead: Positive = 0.015
     """Largest difference of command and position of a slide joint [m]; times the stiffness it bounds the force."""
     gripper_actuators: tuple[str, ...] = ("gripper",)
     """Actuators that open and close the gripper with one number; names that the scene lacks are ignored."""
@@ -46,7 +58,7 @@ class ActionCfg:
 class ObservationCfg:
     """Observation of the policy (paper, table of appendix C)."""
 
-    slots: int = 8
+    slots: Annotated[int, Bounds(1, 10_000)] = 8
     """Contact slots; of a stage with more demonstrated pairs, those with the widest spread are kept."""
     noise: float = 0.0
     """Standard deviation of Gaussian noise on object positions [m]."""
@@ -56,9 +68,9 @@ class ObservationCfg:
 class EngineeredCfg:
     """The engineered insertion reward, a baseline (paper, appendix G)."""
 
-    hole: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hole: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
     """Centre of the hole in the frame of object 2 [m]."""
-    seat: float = 0.0235
+    seat: Signed = 0.0235
     """Height of object 1 above object 2's origin at which it is fully seated [m]."""
     far: Range = (1.0, 0.1)
     """Amplitude and length scale [m] of the wide term, of alignment and depth alike."""
@@ -133,12 +145,12 @@ class CollisionCfg:
     what the physics leaves out."""
     band: float = 0.01
     """Penalty of a sphere in touch, falling to 0 at the margin."""
-    points: int = 512
+    points: Annotated[int, Bounds(0, 1_000_000)] = 512
     """Surface points of each object that must stay outside the other objects too: spheres round off edges, and a policy
     trained with these points also succeeds where edges are sharp."""
-    candidates: int = 20_000
+    candidates: Annotated[int, Bounds(1, 10_000_000)] = 20_000
     """Random surface points of which farthest point sampling selects `points`."""
-    threads: int = 128
+    threads: Annotated[int, Bounds(1, 1024)] = 128
     """GPU threads per world."""
 
 
@@ -146,7 +158,7 @@ class CollisionCfg:
 class PostureSolverCfg:
     """Inverse kinematics of one state by damped least squares from the demonstrated posture."""
 
-    iterations: int = 20
+    iterations: Count = 20
     """Largest number of iterations."""
     damping: float = 1e-4
     """Damping added to the diagonal of J J^T, with lengths in m and angles in rad."""
@@ -160,9 +172,9 @@ class PostureSolverCfg:
 class NewtonSolverCfg:
     """Inverse kinematics of all states at once by Newton's Levenberg-Marquardt solver."""
 
-    iterations: int = 40
+    iterations: Count = 40
     """Number of iterations."""
-    seeds: int = 4
+    seeds: Annotated[int, Bounds(1, 10_000)] = 4
     """Initial postures per state, of which the best solution is kept."""
     noise: float = 0.1
     """Standard deviation of the further initial postures around the demonstrated one [rad or m]."""
@@ -178,9 +190,9 @@ class NewtonSolverCfg:
 class ResetCfg:
     """Initial states along the demonstration that keep the contact chain (paper, appendix D)."""
 
-    states: int = 2048
+    states: Count = 2048
     """States sampled before training; each episode starts from one of them."""
-    demonstrated: float = 0.2
+    demonstrated: Share = 0.2
     """Share of states as demonstrated, without displacement."""
     position: float = 0.012
     """Half width of the horizontal displacement [m]."""
@@ -193,7 +205,7 @@ class ResetCfg:
     that contact with an edge causes."""
     joints: float = 0.05
     """Half width of the displacement of the arm's joints where no object is grasped [rad or m]."""
-    free: float = 0.3
+    free: Share = 0.3
     """In chains of stages, share of initial states of the whole task: the robot as at the start of the demonstration,
     the objects anywhere. The others are shared equally among the stages."""
     place: tuple[float, float] = (0.05, 0.03)
@@ -203,15 +215,15 @@ class ResetCfg:
     approach: float = 3.0
     """In chains, factor minus 1 by which the displacement of the hand is larger at the start of the approach to object
     1 than at its end."""
-    before: float = 0.3
+    before: Duration = 0.3
     """Time before the preceding stage from which states are sampled [s]."""
-    settling_time: float = 0.1
+    settling_time: Annotated[float, Bounds(0, 3600)] = 0.1
     """Time for which a state is simulated with constant commands before it is accepted [s]."""
     slip: float = 0.003
     """Largest accepted motion of a grasped object in the hand during that time [m]."""
     overlap: float = 0.0015
     """Penetration of spheres of different objects above which a displaced state is discarded [m]."""
-    passes: int = 20
+    passes: Count = 20
     """Largest number of passes, of `states` candidates each, after which sampling fails."""
     solver: Literal["auto", "newton", "posture"] = "auto"
     """Inverse kinematics: "newton" solves all states at once, "posture" one by one; "auto" takes "newton" on a GPU (its
@@ -226,11 +238,11 @@ class ResetCfg:
 class ChainCfg:
     """When a world moves to the next stage, and when its episode ends."""
 
-    tolerance: float = 0.004
+    tolerance: Positive = 0.004
     """Largest distance of all contact pairs at which a target event is met [m]."""
-    hold: int = 2
+    hold: Count = 2
     """Consecutive control steps for which they must be within it."""
-    rest: float = 0.5
+    rest: Duration = 0.5
     """Time for which object 1 must be in place before an episode of a chain ends [s]."""
 
 
@@ -238,26 +250,26 @@ class ChainCfg:
 class RandomisationCfg:
     """Domain randomisation; values are sampled once for each world."""
 
-    friction: Range = (1.0, 1.0)
+    friction: PositiveInterval = (1.0, 1.0)
     """Factor on the sliding friction of all geoms except the robot's."""
-    grip: Range = (1.0, 1.0)
+    grip: PositiveInterval = (1.0, 1.0)
     """Factor on the sliding friction of the robot's geoms; a grasp has the larger friction of object and finger."""
-    stiffness: Range = (1.0, 1.0)
+    stiffness: PositiveInterval = (1.0, 1.0)
     """Factor on the stiffness of the position control."""
-    damping: Range = (1.0, 1.0)
+    damping: PositiveInterval = (1.0, 1.0)
     """Factor on the damping of the joints."""
-    mass: Range = (1.0, 1.0)
+    mass: PositiveInterval = (1.0, 1.0)
     """Factor on mass and inertia of the objects."""
-    joint_friction: Range = (0.0, 0.0)
+    joint_friction: Interval = (0.0, 0.0)
     """Dry friction of the joint with the strongest drive [N m or N]; of others in proportion to their torque limits."""
-    delay: Range = (0.0, 0.0)
+    delay: Interval = (0.0, 0.0)
     """Delay of the arm's commands [s]."""
-    lag: Range = (0.0, 0.0)
+    lag: Interval = (0.0, 0.0)
     """Time constant of a first-order lag of the arm's set points [s]."""
     perturbation: tuple[float, float] = (0.0, 0.0)
     """Random force perturbations: standard deviations of a force [N] and a torque [N m] per axis that act on object 1
     for one action while the stage grasps it; none in evaluations. `TrainCfg.with_perturbations` has values."""
-    perturbation_share: float = 0.2
+    perturbation_share: Share = 0.2
     """Share of actions with random force perturbations."""
 
 
@@ -273,46 +285,46 @@ class EnvironmentCfg:
 
     stage: str = "insert"
     """Stage of the contact event sequence whose target event is trained; "all" chains all stages."""
-    worlds: int = 4096
+    worlds: Worlds = 4096
     """Number of environments simulated in parallel, on each rank."""
-    episode: float | None = None
+    episode: PositiveDuration | None = None
     """Duration of an episode [s]; by default 3 s for one stage and 12 s for a chain."""
-    success: float = 0.003
+    success: Positive = 0.003
     """Largest deviation per axis of object 1 from its demonstrated position in object 2 that counts as success [m]."""
     collision: Literal["vcp", "full"] = "vcp"
     """Spheres in the physics: "vcp" those of the contact event sequence, with the virtual collision penalty on the
     others; "full" all."""
     engine: Literal["auto", "warp", "mujoco"] = "auto"
     """MuJoCo-Warp or C MuJoCo; "auto" takes MuJoCo-Warp on a GPU and C MuJoCo on a CPU."""
-    decimation: int = 10
+    decimation: Annotated[int, Bounds(1, 100_000)] = 10
     """Time steps of the model per action."""
-    stride: int = 1
+    stride: Annotated[int, Bounds(1, 100_000)] = 1
     """Time steps of the model per simulation step: coarser physics in less time. Contacts need steps of at most half
     their time constant."""
     cone: Literal["auto", "elliptic", "pyramidal"] = "auto"
     """Friction cones; "auto" keeps the model's. Pyramidal cones are faster; their friction is weaker between the axes
     than along them, and grasped objects slip more."""
-    dropped: float = 0.02
+    dropped: Positive = 0.02
     """Distance of a contact pair with the robot at which a grasped object counts as dropped [m]."""
-    lost: float = 1.0
+    lost: Positive = 1.0
     """Distance between objects 1 and 2 at which an episode fails [m]."""
-    max_position: float = 1e4
+    max_position: Positive = 1e4
     """Generalised position above which a world counts as diverged [rad or m]."""
-    max_velocity: float = 1e4
+    max_velocity: Positive = 1e4
     """Generalised velocity above which a world counts as diverged [rad/s or m/s]."""
     randomise_effects: bool = True
     """Sample the parameters of the model's effects for each world from their fitted 95 % intervals."""
-    nconmax: int | None = None
+    nconmax: Count | None = None
     """Contact capacity per world; by default measured on the demonstration."""
-    njmax: int | None = None
+    njmax: Count | None = None
     """Constraint capacity per world; by default measured on the demonstration."""
-    buffer_factor: float = 2.0
+    buffer_factor: Positive = 2.0
     """Default capacities relative to the largest number in the demonstration: exploration makes more contacts."""
     buffer_spare: int = 16
     """Contacts added to the default capacity; four times as many constraints."""
-    solver_iterations: int | None = None
+    solver_iterations: Count | None = None
     """Largest number of solver iterations per simulation step; by default the model's."""
-    ls_iterations: int | None = None
+    ls_iterations: Count | None = None
     """Largest number of line-search iterations; by default the model's."""
     jacobian: Literal["auto", "dense", "sparse"] = "auto"
     """Storage of the constraint Jacobian: same results, different speed; "auto" decides as MuJoCo does."""
@@ -358,44 +370,44 @@ class PpoCfg:
         200
     """
 
-    iterations: int = 300
+    iterations: Count = 300
     """Iterations of collecting steps and updating the policy."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Bounds(0, 1, above_low=True)] = 1e-3
     """Initial learning rate [-]."""
-    steps: int = 24
+    steps: Annotated[int, Bounds(1, 100_000)] = 24
     """Steps of each environment per iteration."""
     entropy: float = 0.002
     """Weight of the entropy [-]."""
-    discount: float = 0.98
+    discount: Share = 0.98
     """Discount factor of a step [-]."""
-    epochs: int = 5
+    epochs: Annotated[int, Bounds(1, 10_000)] = 5
     """Passes over the collected steps per iteration."""
-    batches: int = 4
+    batches: Annotated[int, Bounds(1, 1_000_000)] = 4
     """Mini-batches per pass."""
-    hidden: tuple[int, ...] = (256, 256, 256)
+    hidden: tuple[Annotated[int, Bounds(1, 100_000)], ...] = (256, 256, 256)
     """Sizes of the hidden layers of policy and value function."""
     activation: str = "swish"
     """Activation function of both networks."""
-    std: float = 0.6
+    std: Positive = 0.6
     """Initial standard deviation of the Gaussian before squashing [-]."""
-    max_mean: float = 4.0
+    max_mean: Positive = 4.0
     """Largest magnitude of the mean before squashing: tanh(4) is 0.9993. Outputs for observations far from those seen
     before can be in the hundreds, where single precision does not represent the change of density by an update."""
     normalise: bool = True
     """Normalise observations by their running mean and standard deviation."""
-    max_observation: float = 10.0
+    max_observation: Positive = 10.0
     """Largest magnitude of a normalised observation [standard deviations]; it bounds networks' outputs and losses."""
-    lam: float = 0.95
+    lam: Share = 0.95
     """Lambda of the generalised advantage estimate [-]."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Clipping of the probability ratio."""
     value: float = 1.0
     """Weight of the value loss [-]."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """Whether the learning rate adapts to the Kullback-Leibler divergence of an update."""
-    divergence: float = 0.01
+    divergence: Positive = 0.01
     """Target Kullback-Leibler divergence of the adaptive learning rate [-]."""
-    gradient: float = 1.0
+    gradient: Positive = 1.0
     """Largest norm of the gradient [-]."""
     tf32: bool = True
     """Multiply matrices in TF32 (10 bits of mantissa) on a GPU, which is faster."""
@@ -414,9 +426,9 @@ class TrainCfg:
 
     seed: int = 0
     """Seed of all random numbers."""
-    target: float | None = None
+    target: Share | None = None
     """Success rate within an iteration at which training stops early."""
-    checkpoint: int = 50
+    checkpoint: Count = 50
     """Iterations between checkpoints; one is also written at the end and on interruption."""
     environment: EnvironmentCfg = field(default_factory=EnvironmentCfg)
     """The environment."""

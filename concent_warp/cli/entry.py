@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import io
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
 from threading import Timer
 
 from concent_warp.cli.boundary import DONE, ERROR, complain, exit_code
 from concent_warp.cli.terminal import HAS_PRINTED
+from concent_warp.errors import ConcentError
 from concent_warp.run_folder import processes
 from concent_warp.version import __version__
 
@@ -122,24 +124,76 @@ def _run(command: str, arguments: Sequence[str]) -> None:
     """
     import tyro
 
-    from concent_warp.checks import check_settings
+    from concent_warp.checks import check_settings, named_as
+    from concent_warp.cli.option_names import option_namer
     from concent_warp.files import claimed_files
     from concent_warp.run_folder import INVOCATION
 
     INVOCATION.set((command, *arguments))
     with _loading(command, help_only=bool({"-h", "--help"} & set(arguments))):
         module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
-        settings = tyro.cli(
-            module.Arguments,
-            args=arguments,
-            prog=f"concent {command}",
-            description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
-            config=(tyro.conf.HelptextFromCommentsOff,),
-            console_outputs=processes()[0] == 0,
-        )
-        check_settings(settings)
-        with claimed_files():
-            module.run(settings)
+        with named_as(option_namer(module.Arguments)):
+            with _one_sentence(command):
+                settings = tyro.cli(
+                    module.Arguments,
+                    args=arguments,
+                    prog=f"concent {command}",
+                    description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
+                    config=(tyro.conf.HelptextFromCommentsOff,),
+                )
+            check_settings(settings)
+            with claimed_files():
+                module.run(settings)
+
+
+@contextmanager
+def _one_sentence(command: str) -> Iterator[None]:
+    """Raise an error of one sentence in place of the box that tyro writes where options are wrong.
+
+    Raises:
+        ConcentError: Options are unknown, missing or not of their type.
+    """
+    box = io.StringIO()
+    try:
+        with redirect_stderr(box):
+            yield
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise _found_in_settings(end) or ConcentError(
+            parser_sentence(box.getvalue()), fix=f"see concent {command} --help"
+        ) from None
+    else:
+        print(box.getvalue(), end="", file=sys.stderr)
+
+
+def _found_in_settings(error: BaseException | None) -> ConcentError | None:
+    """Return the error of a setting that led to another one, None if there is none."""
+    while error is not None and not isinstance(error, ConcentError):
+        error = error.__context__
+    return error
+
+
+def parser_sentence(box: str) -> str:
+    """Return what is wrong with options, from the box of text that tyro writes about it.
+
+    Args:
+        box: A title, what is wrong, a ruler, and perhaps similar options; indented lines are options, those indented
+            more their help.
+    """
+    parts: list[list[str]] = [[]]
+    for line in box.splitlines()[1:]:
+        inner = line.strip("│╭╰╮╯").removeprefix(" ").removeprefix(" " * (line[:1] == " ")).rstrip()
+        if inner and not inner.strip("─-"):
+            parts.append([])
+        elif inner and not inner.startswith(8 * " "):
+            parts[-1].append(inner)
+    parts = [part for part in parts if part] or [[]]
+    words = (" ".join(line.split()) + "," * line.startswith(" ") for line in parts[0])
+    said = " ".join(words).rstrip(",") or "the options are not right"
+    said = f"{said[0].lower()}{said[1:]}".rstrip(".")
+    meant = [line.split()[0].rstrip(",") for part in parts[1:2] if "meant" in part[0] for line in part[1:]]
+    return f"{said}; perhaps {' or '.join(meant[:3])} is meant" if meant else said
 
 
 def _summary(arguments: type) -> str:
@@ -151,9 +205,8 @@ def _summary(arguments: type) -> str:
 @contextmanager
 def _loading(command: str, *, help_only: bool) -> Iterator[None]:
     """Print on standard error that a command is loading, unless it has printed something or ended before."""
-    timer = Timer(
-        LOADING_AFTER, lambda: HAS_PRINTED.is_set() or print(f"concent {command}: loading ...", file=sys.stderr)
-    )
+    stderr = sys.stderr
+    timer = Timer(LOADING_AFTER, lambda: HAS_PRINTED.is_set() or print(f"concent {command}: loading ...", file=stderr))
     timer.daemon = True
     HAS_PRINTED.clear()
     if processes()[0] == 0 and not help_only:

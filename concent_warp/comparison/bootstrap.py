@@ -15,19 +15,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.checks import Count, OpenShare
+
 
 @dataclass(frozen=True)
 class BootstrapCfg:
     """Settings of the intervals of mean errors."""
 
-    min_demonstrations: int = 8
+    min_demonstrations: Count = 8
     """Number of demonstrations from which on whole ones are resampled instead of blocks of time [-]: fewer have too few
     different samples for a 95 % interval."""
-    min_samples: int = 8
+    min_samples: Count = 8
     """Samples below which there is no interval [-]: a block would be shorter than two samples."""
-    replicates: int = 2000
+    replicates: Count = 2000
     """Bootstrap replicates [-]: 50 of them lie beyond each end of a 95 % interval."""
-    level: float = 0.95
+    level: OpenShare = 0.95
     """Share of the replicates within the interval [-]."""
 
     @property

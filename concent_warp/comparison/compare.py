@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from concent_warp.checks import check_settings
 from concent_warp.comparison.bootstrap import BootstrapCfg
 from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, has_task, phases_by_body, stage_phases
@@ -94,6 +95,7 @@ def compare(
         'fallen'
     """
     cfg = cfg or CompareCfg()
+    check_settings(cfg)
     named = {"model": models} if isinstance(models, Model) else dict(models)
     for model in named.values():
         model.check_recording(recording)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Share
 from concent_warp.events.roles import Roles
 from concent_warp.events.touches import BodyPoses, ReplayContacts
 
@@ -24,12 +25,12 @@ class ContactNameCfg:
 
     max_names: int = 2
     """Most partners named at a time."""
-    min_force_share: float = 0.1
+    min_force_share: Share = 0.1
     """Share of the forces on a body below which a partner is not named, unless it is another object [-]: a gripper
     presses harder than what the object is brought against."""
-    min_time_share: float = 0.15
+    min_time_share: Share = 0.15
     """Share of a span below which a contact is not named [-]."""
-    side_share: float = 0.85
+    side_share: Share = 0.85
     """Share of the half extent of a body beyond which a point lies on its side [-]."""
 
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from concent_warp.checks import PositiveDuration, Share
 from concent_warp.events.filter import drop_short_contacts, steps_of, true_runs, window_sums
 from concent_warp.events.grasp import forces_cancel
 from concent_warp.events.roles import Roles
@@ -57,15 +58,15 @@ class MotionPhaseCfg:
     impact_acceleration: float = 25.0
     """Mean acceleration over `impact_window` of the fastest point of a body in contact that is an impact [m/s^2]; more
     than drives reach."""
-    impact_window: float = 0.01
+    impact_window: PositiveDuration = 0.01
     """Length of the windows over which that acceleration is averaged [s]."""
     impact_extension: float = 0.02
     """Time by which an impact lasts longer than the acceleration [s], so that measurements fall within it."""
-    majority_window: float = 0.03
+    majority_window: PositiveDuration = 0.03
     """Length of the windows whose most frequent phase each instant takes, impacts excepted [s]."""
-    grasp_window: float = 0.1
+    grasp_window: PositiveDuration = 0.1
     """Length of the windows over which forces of the robot on an object are added [s]."""
-    grasp_share: float = 0.5
+    grasp_share: Share = 0.5
     """Forces of the robot that add up to less than this share of their magnitudes grasp an object [-]."""
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Count
 from concent_warp.comparison.noise_ratio import rms_noise
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import Noise, Source, channel_noise, pooled_noise
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 class ResidualCfg:
     """How residuals are computed."""
 
-    anchor_frames: int = 5
+    anchor_frames: Count = 5
     """First frames of a point track from which the points' positions on the body are estimated [-]: few, because the
     model's own motion carries them; several, so that their scatter gives the noise."""
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from concent_warp.checks import Count, Share
 from concent_warp.comparison.contact_names import ContactPartners
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import Phase
@@ -34,7 +35,7 @@ class WorstSpanCfg:
 
     smoothing: float = 0.05
     """Length of the windows over which errors are averaged [s]."""
-    min_samples: int = 3
+    min_samples: Count = 3
     """Samples of a window and of a span, at least."""
     min_ratio: float = 3.0
     """Smoothed error over noise above which there is a span [-]."""
@@ -48,9 +49,9 @@ class WorstSpanCfg:
     """Most spans shown with a comparison in a notebook."""
     assumed_noise: float = 0.01
     """Noise of a channel whose noise is not known, as a share of the extent of its readings [-]."""
-    axis_share: float = 0.85
+    axis_share: Share = 0.85
     """Share of a direction above which it is named by one axis alone [-]."""
-    steady_share: float = 0.5
+    steady_share: Share = 0.5
     """Mean residual over its root mean square above which it points in one direction [-]."""
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from concent_warp.checks import check_seed
+from concent_warp.checks import Bounds, Count, PositiveShare, Signed, Worlds, check_seed, check_settings
 from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.reality.world import WorldCfg
@@ -41,10 +41,10 @@ class EvaluateCfg(RealityWorldCfg):
         (1,)
     """
 
-    action_scale: float = 1.0
+    action_scale: PositiveShare = 1.0
     """Size of command steps relative to training, above 0 and at most 1: below 1 the robot moves more slowly; episodes
     last as long."""
-    setpoint_lead_scale: float = 1.0
+    setpoint_lead_scale: PositiveShare = 1.0
     """Largest difference of command and joint position relative to training, above 0 and at most 1: with the stiffness
     of the drives it bounds the force that the robot exerts."""
     videos: int = 0
@@ -61,23 +61,23 @@ class PlayCfg(RealityWorldCfg):
         8090
     """
 
-    action_scale: float = 1.0
+    action_scale: PositiveShare = 1.0
     """Size of command steps relative to training, above 0 and at most 1."""
-    setpoint_lead_scale: float = 1.0
+    setpoint_lead_scale: PositiveShare = 1.0
     """Largest difference of command and joint position relative to training, above 0 and at most 1."""
-    port: int = 8080
+    port: Annotated[int, Bounds(0, 65535)] = 8080
     """Port of the page; if it is in use, the next free one."""
     host: str = "127.0.0.1"
     """Address of the server; 0.0.0.0 lets anyone in the network open the page and use its controls."""
-    speed: float = 1.0
+    speed: Annotated[float, Bounds(0.1, 4)] = 1.0
     """Initial speed relative to simulated time."""
-    states: int = 32
+    states: Annotated[int, Bounds(1, 10_000)] = 32
     """Number of initial states, from which episodes start in turn."""
-    pause: float = 1.0
+    pause: Annotated[float, Bounds(0, 3600)] = 1.0
     """Time for which the last state of an episode is shown, at normal speed [s]."""
-    poll: float = 0.2
+    poll: Annotated[float, Bounds(0.001, 60)] = 0.2
     """Period of polling the controls while the policy is paused [s]."""
-    eye: tuple[float, float, float] = (0.3, -0.42, 0.36)
+    eye: tuple[Signed, Signed, Signed] = (0.3, -0.42, 0.36)
     """Position of the camera relative to the objects [m]."""
     touch_gap: float = 5e-4
     """Gap below which a sphere is shown as touching a body [m], the depth of typical contacts."""
@@ -93,7 +93,7 @@ class RenderCfg:
         64
     """
 
-    episodes: int = 20
+    episodes: Count = 20
     """Number of initial states of the policy; one episode starts from each."""
     keep: Literal["successes", "all"] = "successes"
     """Which episodes of a policy go into the data set."""
@@ -107,15 +107,15 @@ class RenderCfg:
     """Whether objects with splats cast shadows, under lights sampled for each episode."""
     cameras: tuple[str, ...] = ()
     """Cameras to render; by default those of the networks, without networks "base" and "wrist", added if absent."""
-    size: int = 256
+    size: Annotated[int, Bounds(1, 4096)] = 256
     """Height and width of the images [px]."""
     show: Literal["visual", "spheres"] = "visual"
     """Geometry of the objects in the raw image: visual shapes or contact spheres."""
-    rate: int = 10
+    rate: Annotated[int, Bounds(1, 1000)] = 10
     """Frame rate of a rendered recording [Hz]; a policy's episodes have its control rate."""
-    worlds: int = 8
+    worlds: Worlds = 8
     """Number of episodes rendered in parallel."""
-    flow_steps: int = 4
+    flow_steps: Annotated[int, Bounds(1, 10_000)] = 4
     """Steps of the flow from noise to image; fewer are faster."""
     half: bool = False
     """Evaluate the networks in bfloat16, which is faster on a GPU."""
@@ -137,6 +137,7 @@ def check_evaluation(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: in
     Raises:
         TrainError: One is out of bounds, or concerns Reality while the policy runs in simulation.
     """
+    check_settings(cfg, TrainError)
     check_seed(seed, TrainError)
     if episodes < 1:
         raise TrainError("the number of episodes is out of bounds", expected="at least 1", found=episodes)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import mujoco
 import torch
 
-from concent_warp.checks import check_device, check_seed
+from concent_warp.checks import check_device, check_seed, check_settings
 from concent_warp.deploy.cfg import PlayCfg, WorldName
 from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import TrainError
@@ -59,6 +59,7 @@ def play(
     check_seed(seed, TrainError)
     check_device(device)
     cfg = cfg or PlayCfg()
+    check_settings(cfg, TrainError)
     player, shown = _make_player(policy, cfg, world=world, seed=seed, device=device)
     task = player.environment.task
     assert task.model.geometry is not None
@@ -84,8 +85,6 @@ def _make_player(
     Raises:
         TrainError: A setting is out of bounds.
     """
-    if cfg.states < 1:
-        raise TrainError("the number of states is out of bounds", expected="at least 1", found=cfg.states)
     if parse_effects(cfg.hide) and world == "simulation":
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from concent_warp.checks import check_device, check_seed
+from concent_warp.checks import check_device, check_settings
 from concent_warp.deploy.cfg import Format, RenderCfg
 from concent_warp.errors import RenderError
 from concent_warp.run_folder import (
@@ -96,9 +96,7 @@ def render(
         1
     """
     cfg, out = cfg or RenderCfg(), Path(out)
-    if min(cfg.episodes, cfg.worlds, cfg.rate, cfg.flow_steps) < 1:
-        raise RenderError("episodes, worlds, rate and flow steps are to be at least 1")
-    check_seed(cfg.seed, RenderError)
+    check_settings(cfg, RenderError)
     check_device(device)
     if cfg.figure is not None:
         claim_file(cfg.figure, overwrite=overwrite)

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from concent_warp.checks import Bounds, Count, OpenShare, Positive, PositiveDuration, PositiveShare, Share
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -18,13 +20,13 @@ class CheckDataCfg:
 
     gap_ratio: float = 10.0
     """Pause between two samples, over the median sampling interval, from which on it is a gap [-]. Empirical."""
-    max_missing_share: float = 0.2
+    max_missing_share: Share = 0.2
     """Share of missing samples above which it is reported [-]. Empirical."""
     white_noise_ratio: float = 0.8
     """Mean squared step between samples over twice the variance, above which a channel looks like white noise [-]: 1
     for white noise, near 0 for motion (von Neumann, "Distribution of the ratio of the mean square successive difference
     to the variance", Ann. Math. Stat. 12, 1941)."""
-    min_samples: int = 30
+    min_samples: Count = 30
     """Samples below which that ratio is not computed: its standard deviation is then about 0.2 under white noise."""
     max_scatter_ratio: float = 3.0
     """Standard deviation of a channel over its stated noise up to which it may stand still [-]: 3 sigma."""
@@ -38,7 +40,7 @@ class SearchCfg:
     over the noise standard deviation [-].
     """
 
-    quiet_quantile: float = 0.25
+    quiet_quantile: Share = 0.25
     """Quantile of the blocks' RMS residuals that bounds an estimated noise from below [-]. Empirical."""
     quiet_state_iterations: int = 3
     """Iterations of the initial states in the fit from which that quantile is taken. Empirical."""
@@ -48,7 +50,7 @@ class SearchCfg:
     min_expected_gain: float = 0.5
     """Expected gain over the critical one, above which a screened candidate is fitted [-]: linear extrapolation is
     taken to be right to a factor of 2."""
-    batch_size: int = 3
+    batch_size: Count = 3
     """Candidates fitted before the search decides whether others are worth a fit. The truth is among the first three in
     most scenes. Empirical."""
     explained_ratio: float = 1.1
@@ -71,7 +73,7 @@ class SearchCfg:
     """Rounds in which the best candidate and those close to it are refitted. Empirical."""
     min_cost_fall: float = 0.01
     """Relative fall of a cost above which another round, or another refit, follows [-]. Empirical."""
-    shooting_window: float = 0.4
+    shooting_window: PositiveDuration = 0.4
     """Length of the windows of the multiple-shooting initialisation [s]. Empirical: impacts need 0.1-0.3 s, free motion
     allows more."""
     shooting_min_gain: float = 0.5
@@ -84,13 +86,13 @@ class SearchCfg:
     those alone [-]. Empirical."""
     rivals: int = 3
     """Rivals whose initial states are tried on the baseline. Empirical."""
-    min_fold_share: float = 0.8
+    min_fold_share: Share = 0.8
     """Share of the folds in which an accepted effect must gain [-]: 4 of 5."""
     equal_error: float = 0.02
     """Relative difference of held-out errors below which candidates count as equal [-]. Empirical."""
     equal_standard_errors: float = 2.0
     """Standard errors of that difference below which candidates count as equal: 95 % of a normal distribution."""
-    near_equal_factor: float = 1.25
+    near_equal_factor: Annotated[float, Bounds(1)] = 1.25
     """Factor on both bounds within which candidates are compared by profile likelihood before they are separated [-].
     Empirical."""
     profiled: int = 3
@@ -104,9 +106,9 @@ class ProfileLikelihoodCfg:
     Costs are half sums of squares in units of the noise; distances are in standard deviations of the linear fit.
     """
 
-    first_step: float = 2.0
+    first_step: Positive = 2.0
     """Distance of the first points on each side [standard deviations]: the ends of a 95 % interval."""
-    step_growth: float = 3.0
+    step_growth: Annotated[float, Bounds(1, above_low=True)] = 3.0
     """Factor from one distance to the next [-]. Empirical."""
     max_extensions: int = 3
     """Most further distances; the last is then 54 standard deviations away. Empirical."""
@@ -122,7 +124,7 @@ class ProfileLikelihoodCfg:
     """Rise of the cost over its roughness, from which on a parabola can be fitted through it [-]. Empirical."""
     min_rise: float = 1.0
     """Rise of the cost that this takes at least [cost]: log likelihood ratio 1."""
-    max_widening: float = 100.0
+    max_widening: Annotated[float, Bounds(1)] = 100.0
     """Largest factor on the linear standard deviation, also where the cost rises nowhere [-]."""
     roughness_variance: float = 0.5
     """Variance added for roughness, over the squared distance at which the parabola rises by as much [-]. Empirical."""
@@ -132,29 +134,29 @@ class ProfileLikelihoodCfg:
 class UnknownForceCfg:
     """Settings of the test for a force of no known form: radial basis functions over positions or velocities."""
 
-    basis_functions: int = 8
+    basis_functions: Count = 8
     """Over the range of a joint's position or velocity. Empirical."""
-    basis_functions_many: int = 5
+    basis_functions_many: Count = 5
     """The same for more than `few_joints` joints, and over the range of a body's speed. Empirical."""
     few_joints: int = 3
     """Joints up to which `basis_functions` apply. Empirical."""
-    basis_points: int = 12
+    basis_points: Count = 12
     """Most centres over the positions that a free body visits. Empirical."""
     min_gain: float = 0.03
     """Share of the held-out error that the force must remove [-]; it stays near 0.01 on data without one. Empirical."""
     min_share: float = 0.01
     """Share of the discrepancy of the first model that the force must explain [-]: the formula of an effect is right to
     about a tenth, a hundredth in squares."""
-    expected_shares: tuple[float, ...] = (0.02, 0.1, 0.5)
+    expected_shares: tuple[PositiveShare, ...] = (0.02, 0.1, 0.5)
     """Shares of the error that the prior of the force expects, tried in turn [-]. Empirical."""
-    force_scale: float = 0.1
+    force_scale: Positive = 0.1
     """Typical force on a free body over its weight [-]. Empirical."""
-    fade_speed: float = 2e-3
+    fade_speed: Positive = 2e-3
     """Speed [m/s], or rate [rad/s] over ten, below which a force against the motion fades out: far below the speeds of
     motions that are measured."""
-    lever: float = 0.05
+    lever: Positive = 0.05
     """Lever of the typical torque on a free body [m]: half the size of a hand-held object."""
-    percentile: float = 0.5
+    percentile: Annotated[float, Bounds(0, 50, below_high=True)] = 0.5
     """Percentile of the visited positions or velocities left out at each end [%]: excursions of single samples."""
 
 
@@ -182,25 +184,25 @@ class DiagnoseCfg:
         1
     """
 
-    significance_level: float = 0.05
+    significance_level: OpenShare = 0.05
     """Probability of naming an effect where nothing is missing [-]."""
     min_gain: float = 0.05
     """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""
-    max_fits: int = 8
+    max_fits: Count = 8
     """Most screened candidates that are fitted. Empirical: the truth is among the first eight in nearly all scenes."""
-    max_additions: int = 3
+    max_additions: Annotated[int, Bounds(0, 1000)] = 3
     """Most effects that are added."""
     adequate_ratio: float = 1.25
     """RMS residual over noise up to which a model explains the data [-]. Empirical."""
-    null_samples: int = 400
+    null_samples: Annotated[int, Bounds(1, 1_000_000)] = 400
     """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
     p-value is 1 / (null_samples + 1)."""
     effects: tuple[str, ...] = ()
     """Names of the effects to consider; all where empty."""
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Length of a window [s]; by default as long as the motion allows."""
-    jobs: int = -1
+    jobs: Annotated[int, Bounds(-1, 4096)] = -1
     """Processes at a time; -1: one per CPU. `joblib.parallel_config` selects another backend."""
     seed: int = 0
     """Seed of all random numbers."""

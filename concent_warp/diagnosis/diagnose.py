@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from concent_warp.checks import check_settings
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import checkpointed_runner
 from concent_warp.diagnosis.procedure import Procedure
@@ -57,6 +58,7 @@ def diagnose(
     """
     model.check_recording(recording)
     cfg, progress = cfg or DiagnoseCfg(), progress or ignore_progress
+    check_settings(cfg)
     if out is None:
         return _diagnosed(model, recording, cfg, TaskRunner(cfg.jobs, progress), engine)
     with lock_folder(Path(out)):

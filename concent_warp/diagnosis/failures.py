@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from concent_warp.checks import check_settings
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.comparison.result import finite
 from concent_warp.comparison.worst_spans import WorstSpan, span_kind
@@ -51,6 +52,7 @@ def locate_failures(
         offsets: Errors of the windows' initial states in units of their standard deviation, one (2 nv,) a window.
     """
     cfg = cfg or FailureCfg()
+    check_settings(cfg)
     started = _with_starts(model, recording, windows, offsets)
     try:
         spans = compare_replays({"model": model}, started, engine).worst_spans

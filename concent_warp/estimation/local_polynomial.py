@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.checks import Count, PositiveDuration
 from concent_warp.estimation.rotations import continuous_quaternions
 from concent_warp.estimation.sensors import Kind
 from concent_warp.estimation.signals import Estimate, OrientationEstimate, sample_values_and_rates
@@ -23,7 +24,7 @@ from concent_warp.recording.recording import Channel
 class LocalPolynomialCfg:
     """Settings of local polynomials."""
 
-    half_width: float = 0.02
+    half_width: PositiveDuration = 0.02
     """Readings within this time before and after a time count in its fit [s]."""
     min_neighbours: int = 2
     """Readings before and after a time that count even if they are farther away than `half_width`; a quantity needs
@@ -31,7 +32,7 @@ class LocalPolynomialCfg:
     one_sided_ratio: float = 0.5
     """Readings on one side of a time alone are used where that reduces the standard error of the rate to less than this
     share: a jump of the velocity, as in an impact, lies on the other side."""
-    precision_probes: int = 40
+    precision_probes: Count = 40
     """Number of times at which the standard error of a velocity sensor is compared with that of the positions."""
 
     def signal(self, channel: Channel, velocity: Channel | None = None, kind: Kind = "other") -> LocalPolynomial | None:

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
+from concent_warp.checks import MAX_COUNT, Bounds, Count
 from concent_warp.estimation.rotations import rotation_vectors
 from concent_warp.estimation.sensors import Kind
 
@@ -40,13 +41,13 @@ WORDS: dict[Source, str] = {
 class NoiseCfg:
     """Settings of the estimation of noise."""
 
-    rest_length: int = 20
+    rest_length: Annotated[int, Bounds(4, MAX_COUNT)] = 20
     """Readings of a window that is tested for rest."""
-    rest_windows: int = 3
+    rest_windows: Count = 3
     """Fewest consecutive windows of a stretch of rest."""
     rest_scatter: float = 2.5
     """Largest scatter of a window at rest, and difference of its halves, over the noise seen in differences [-]."""
-    min_readings: int = 8
+    min_readings: Count = 8
     """Fewest readings from which noise is estimated."""
     rounding: float = 1e-9
     """Scatter below this share of the largest reading is rounding, as of simulated readings without noise [-]."""

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.checks import Count
 from concent_warp.errors import RecordingError
 from concent_warp.perception.rigid_motion import kabsch
 from concent_warp.recording.recording import Channel, Demonstration
@@ -28,7 +29,7 @@ class ObjectTrackCfg:
     rest_displacement: float = 5e-4
     """Displacement of the mean of a body's points below which the body counts as at rest [m]: of the order of the noise
     of a point tracker, averaged over its points."""
-    surface_points: int = 64
+    surface_points: Count = 64
     """Surface points that represent a body whose pose is measured [-]: enough to cover its faces and edges."""
 
 

@@ -8,13 +8,14 @@ likelihood of the readings. The result is band-limited: an impact is spread over
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.spatial.transform import Rotation
 
+from concent_warp.checks import Bounds, Count, Positive
 from concent_warp.estimation.noise import channel_noise
 from concent_warp.estimation.rotations import continuous_quaternions
 from concent_warp.estimation.sensors import Kind
@@ -35,18 +36,18 @@ PENALISED = 3
 class SmoothingSplineCfg:
     """Settings of smoothing splines."""
 
-    min_readings: int = 5
+    min_readings: Count = 5
     """Fewest valid readings of a quantity."""
-    max_knots: int = 4000
+    max_knots: Count = 4000
     """Most intervals between knots; by default there are as many as between readings."""
-    min_noise: float = 1e-5
+    min_noise: Positive = 1e-5
     """Least noise assumed, as a share of the range of the readings: the error of a simulation's time step."""
-    min_range: float = 1e-3
+    min_range: Positive = 1e-3
     """Least range of the readings in that, in their unit."""
-    jerk_range: tuple[float, float] = (-4.0, 6.0)
+    jerk_range: Annotated[tuple[float, float], Bounds(-30, 30, ascending=True)] = (-4.0, 6.0)
     """Decimal logarithms of the smallest and largest standard deviation of a coefficient's third difference tried, in
     standard deviations of the noise."""
-    jerk_steps: int = 3
+    jerk_steps: Count = 3
     """Values tried in each decade of that range."""
 
     def readings(self, channel: Channel, kind: Kind) -> ChannelReadings | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from concent_warp.checks import Count, Share
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.object_tracks import BodyTarget, ObjectTrackCfg, Segment, whole_demonstration
 from concent_warp.estimation.state_estimator import StateEstimator
@@ -24,13 +25,13 @@ from concent_warp.simulate.replay import commands
 class WindowCfg:
     """Settings of the choice of windows."""
 
-    max_shift: float = 0.25
+    max_shift: Share = 0.25
     """How far a start may move to a time with less scatter, as a share of the stride [-]."""
     max_scatter: float = 10.0
     """Scatter of the readings over its median above which a start is left out [-]: it lies in an impact."""
-    contact_share: float = 0.75
+    contact_share: Share = 0.75
     """Contact must begin within this share of a window, so that its outcome is observed [-]."""
-    min_frames: int = 3
+    min_frames: Count = 3
     """Fewest observed frames of a body in a window [-]."""
     tracks: ObjectTrackCfg = field(default_factory=ObjectTrackCfg)
     """How observations become target points."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from concent_warp.checks import check_settings
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.object_tracks import Segment, whole_demonstration
 from concent_warp.estimation.windows import cut_windows, mark_held_out
@@ -82,6 +83,7 @@ def fit_geometry(
         'all 1 generations done'
     """
     cfg = cfg or FitCfg()
+    check_settings(cfg)
     model.check_recording(recording)
     if model.geometry is None:
         model = model.with_geometry((start or ContactGeometryCfg()).build(model.scene))

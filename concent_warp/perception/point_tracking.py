@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import MAX_COUNT, Bounds, Count, Positive, Share, check_settings
 from concent_warp.errors import RecordingError
 from concent_warp.perception.optical_flow import corners, depth_at, eroded, grayscale, track_pixels
 from concent_warp.perception.pinhole import Pinhole
@@ -27,13 +29,13 @@ from concent_warp.scene.scene import Scene
 class TrackingCfg:
     """Settings of the point tracking."""
 
-    count: int = 60
+    count: Count = 60
     """Largest number of points of a body that are tracked at a time."""
-    refill_share: float = 0.7
+    refill_share: Share = 0.7
     """Share of `count` below which new corners are detected [-]."""
-    spacing: float = 3.0
+    spacing: Positive = 3.0
     """Least distance between new points [px]."""
-    window: int = 7
+    window: Annotated[int, Bounds(3, 1001)] = 7
     """Edge of the square that optical flow compares [px]."""
     return_tolerance: float = 0.5
     """Largest forward-backward error [px]."""
@@ -45,9 +47,9 @@ class TrackingCfg:
     """Distance that new points keep from the outline of what is visible [px]."""
     max_outlier_frames: int = 3
     """Consecutive frames in which a point may disagree with the motion of its body before it is dropped."""
-    min_points: int = 6
+    min_points: Annotated[int, Bounds(3, MAX_COUNT)] = 6
     """Least number of points that agree with a rigid motion; with fewer, the body is lost in this frame."""
-    min_visible_share: float = 0.5
+    min_visible_share: Share = 0.5
     """Share of the pixels of a lost body, at its last pose, that must be visible before it is tracked again [-]."""
     seed: int = 0
     """Seed of the random samples."""
@@ -174,6 +176,7 @@ def track_points(
         RecordingError: There is no such stream, no initial state, or a body is not to be seen in the first frame.
     """
     cfg = cfg or TrackingCfg()
+    check_settings(cfg)
     where = f"{recording.source}, {demonstration.name}"
     stream = _chosen_stream(demonstration, camera, where)
     scene = Scene(recording.scene, recording.source)

@@ -11,16 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.checks import Count, Positive
+
 
 @dataclass(frozen=True)
 class ConsensusCfg:
     """Settings of the random sample consensus."""
 
-    samples: int = 200
+    samples: Count = 200
     """Triples of points that are tried."""
     refits: int = 2
     """Rounds of refitting to the points that agree."""
-    max_over_median: float = 3.0
+    max_over_median: Positive = 3.0
     """Largest distance of an agreeing point over the median of all agreeing points [-]. With the same normal noise
     along all axes, all but one in ten thousand are nearer."""
 

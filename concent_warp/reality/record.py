@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
-from concent_warp.checks import check_seed
+from concent_warp.checks import Bounds, check_seed, check_settings
 from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
@@ -36,11 +38,11 @@ class RealityCfg:
     """Noise and rates of encoders, pose tracker and depth camera."""
     footage: FootageCfg = field(default_factory=FootageCfg)
     """Colour cameras."""
-    place_spread: float = 0.02
+    place_spread: Annotated[float, Bounds(0, 10)] = 0.02
     """Half width of the square in which the block's position is sampled [m]."""
-    yaw_spread: float = 0.15
+    yaw_spread: Annotated[float, Bounds(0, math.pi)] = 0.15
     """Half width of the block's rotation about the vertical [rad]."""
-    settling_time: float = 0.3
+    settling_time: Annotated[float, Bounds(0, 3600)] = 0.3
     """Time simulated before the recording starts, so that objects and arm come to rest [s]."""
 
 
@@ -75,8 +77,9 @@ def record(
     the seed. `progress` is called with the share done, 0..1.
 
     Raises:
-        ConcentError: A seed is out of bounds.
+        ConcentError: A seed or a setting is out of bounds.
     """
+    check_settings(cfg)
     for seed in seeds:
         check_seed(seed)
     scene = cfg.task.build()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Positive, TimeStep
 from concent_warp.scene.scene import Scene
 
 
@@ -34,11 +35,11 @@ class HiddenEffect:
 class WorldCfg:
     """Physics of Reality."""
 
-    timestep: float = 0.001
+    timestep: TimeStep = 0.001
     """Step [s]."""
     chamfer: float = 0.0015
     """Chamfer of the edges of free box-shaped objects [m]."""
-    solref: tuple[float, float] = (0.003, 1.0)
+    solref: tuple[Positive, Positive] = (0.003, 1.0)
     """Contact time constant [s] and damping ratio [-]."""
 
     def build(self, scene: Scene, effects: tuple[HiddenEffect, ...] = ()) -> mujoco.MjSpec:

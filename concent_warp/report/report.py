@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from concent_warp.checks import check_settings
 from concent_warp.comparison.result import Comparison, finite
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
@@ -65,6 +66,7 @@ def write_report(
         >>> cw.write_report("report.html", recording, comparison)
     """
     cfg = cfg or ReportCfg()
+    check_settings(cfg)
     path, events, overlap = Path(path), events or comparison.events, overlap or {}
     diagnosis = diagnosis.to_json() if isinstance(diagnosis, Diagnosis) else diagnosis
     location = location.to_json() if isinstance(location, UnexplainedForces) else location

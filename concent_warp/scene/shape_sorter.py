@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, Length, Place, TimeStep, Turn
 from concent_warp.scene.robot import HOME_ANGLES, RobotCfg
 from concent_warp.scene.scene import OBJECTS_TEXT, Scene
 
@@ -19,29 +21,29 @@ class ShapeSorterCfg:
 
     robot: RobotCfg = field(default_factory=RobotCfg)
     """The arm."""
-    block_size: float = 0.04
+    block_size: Length = 0.04
     """Edge of the block [m]."""
-    block_mass: float = 0.08
+    block_mass: Annotated[float, Bounds(0, 1000, above_low=True)] = 0.08
     """Mass of the block [kg]."""
-    hole_size: float = 0.042
+    hole_size: Length = 0.042
     """Edge of the square hole [m]."""
-    box_size: float = 0.07
+    box_size: Length = 0.07
     """Outer edge of the box [m]."""
-    box_height: float = 0.022
+    box_height: Length = 0.022
     """Height of the box [m]."""
-    floor: float = 0.003
+    floor: Length = 0.003
     """Thickness of the box's floor [m]."""
-    friction: float = 0.3
+    friction: Annotated[float, Bounds(0, 100)] = 0.3
     """Sliding friction of the objects' surfaces [-]."""
-    block_position: tuple[float, float] = (0.45, -0.12)
+    block_position: tuple[Place, Place] = (0.45, -0.12)
     """Block on the table [m]."""
-    block_yaw: float = 0.0
+    block_yaw: Turn = 0.0
     """Rotation of the block about the vertical [rad]."""
-    box_position: tuple[float, float] = (0.5, 0.08)
+    box_position: tuple[Place, Place] = (0.5, 0.08)
     """Box on the table [m]; it is clamped there."""
-    box_yaw: float = 0.0
+    box_yaw: Turn = 0.0
     """Rotation of the box about the vertical [rad]."""
-    timestep: float = 0.005
+    timestep: TimeStep = 0.005
     """Simulation time step [s]."""
 
     def build(self) -> Scene:

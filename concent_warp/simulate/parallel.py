@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
+from concent_warp.checks import Count
+
 if TYPE_CHECKING:
     from concent_warp.simulate.engine import Variants
     from concent_warp.simulate.inputs import SimulationRun
@@ -23,7 +25,7 @@ _limit: ContextVar[int | None] = ContextVar("limit of simulations at a time", de
 class ProcessPoolCfg:
     """When simulations whose steps call Python are distributed over processes."""
 
-    min_processes: int = 3
+    min_processes: Count = 3
     """Fewest processes that are started [-]: with two, sending data takes as long as is saved."""
     min_steps: int = 20_000
     """Fewest steps of all simulations together for which processes are started [-]: about one second in one thread."""

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from concent_warp.checks import Bounds, Count, Pixels, Share, SmallShare
 
 
 @dataclass(frozen=True)
 class FlowNetworkCfg:
     """Sizes of the U-Net."""
 
-    size: int = 64
+    size: Pixels = 64
     """Edge of the images [px], a multiple of 2 for each level but the first."""
-    width: int = 64
+    width: Annotated[int, Bounds(1, 16_384)] = 64
     """Channels of the first level."""
-    factors: tuple[int, ...] = (1, 2, 4)
+    factors: tuple[Annotated[int, Bounds(1, 1024)], ...] = (1, 2, 4)
     """Channels of each level, relative to the first; each level halves the resolution of the one before."""
-    blocks: int = 1
+    blocks: Annotated[int, Bounds(1, 1000)] = 1
     """Residual blocks of a level, on the way down; one more on the way up."""
     posed: bool = False
     """Whether the end-effector's pose is a condition, as for a camera on the wrist."""
@@ -25,9 +28,9 @@ class FlowNetworkCfg:
 class SuperResolutionCfg:
     """Sizes of the network."""
 
-    width: int = 64
+    width: Annotated[int, Bounds(1, 16_384)] = 64
     """Channels."""
-    blocks: int = 8
+    blocks: Annotated[int, Bounds(1, 1000)] = 8
     """Residual blocks."""
     scale: float = 0.1
     """Factor on what a block adds, which keeps deep networks stable."""
@@ -37,15 +40,15 @@ class SuperResolutionCfg:
 class NetworkTrainCfg:
     """Training of one network."""
 
-    steps: int = 20_000
+    steps: Count = 20_000
     """Steps of the optimiser."""
-    batch: int = 32
+    batch: Annotated[int, Bounds(1, 100_000)] = 32
     """Images of a step."""
-    learning_rate: float = 3e-4
+    learning_rate: Annotated[float, Bounds(0, 1, above_low=True)] = 3e-4
     """Learning rate after the warm-up; it falls to a tenth along a cosine."""
     warm_up: int = 200
     """Steps in which the learning rate rises."""
-    ema: float = 0.999
+    ema: SmallShare = 0.999
     """Share of the running mean of the weights that a step keeps (Polyak and Juditsky 1992)."""
 
 
@@ -53,16 +56,16 @@ class NetworkTrainCfg:
 class AugmentCfg:
     """Augmentation of the conditions, so that errors of generated images do not accumulate (paper: autoregressive)."""
 
-    back: int = 5
+    back: Count = 5
     """How many frames older than it is the previous image may be, at most; 1 for the very frame before. A network
     trained on these takes the robot's position from the simulated image."""
-    blank: float = 0.3
+    blank: Share = 0.3
     """Share of the previous images replaced by the mean image, the initial condition of an episode."""
-    noise: float = 0.06
+    noise: Annotated[float, Bounds(0, 2)] = 0.06
     """Largest deviation of noise on the previous image, of colours in -1..1."""
-    colour: float = 0.1
+    colour: Share = 0.1
     """Largest change of brightness, contrast and saturation of the previous image."""
-    blur: float = 0.3
+    blur: Share = 0.3
     """Share of the previous images that are blurred."""
 
 
@@ -82,7 +85,7 @@ class RenderTrainCfg:
     """The network that enlarges images."""
     augment: AugmentCfg = field(default_factory=AugmentCfg)
     """Augmentation of previous images."""
-    crop: int = 24
+    crop: Pixels = 24
     """Edge of the pieces that the super-resolution learns from, in its input [px]."""
     checkpoint: float = 60.0
     """Time between checkpoints [s]."""

@@ -16,6 +16,7 @@ import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from concent_warp.checkpoint_file import read_checkpoint, write_checkpoint
+from concent_warp.checks import check_settings
 from concent_warp.errors import RenderError
 from concent_warp.render.cameras import Camera
 from concent_warp.render.networks.cfg import FlowNetworkCfg, NetworkTrainCfg, RenderTrainCfg
@@ -100,6 +101,7 @@ class RenderTraining:
                     found=" x ".join(map(str, one.real.shape[2:])),
                     fix="crop and resize the images, or choose another size",
                 )
+        check_settings(cfg, RenderError)
         self.cfg, self.folder, self.device = cfg, folder, torch.device(device)
         self.pairs = [one.to(self.device) for one in pairs]
         torch.manual_seed(cfg.seed)

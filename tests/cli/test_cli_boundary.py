@@ -76,6 +76,11 @@ def shell(command, **environment):
     )
 
 
+def without_loading(said: str) -> str:
+    """Return what a command says but for the line that appears where loading takes long."""
+    return "".join(line for line in said.splitlines(keepends=True) if not line.endswith(": loading ...\n"))
+
+
 @pytest.mark.parametrize("command", ["concent --help", "concent --version", "concent fit --help"])
 def test_a_full_disk_behind_standard_output_is_one_sentence(command):
     done = shell(f"{command} > /dev/full")
@@ -87,14 +92,14 @@ def test_a_full_disk_behind_standard_output_is_one_sentence(command):
 def test_a_closed_standard_output_or_error_is_no_failure(bench):
     for closed in (">&-", "2>&-", ">&- 2>&-"):
         done = shell(f"concent compare {bench / 'demo.h5'} --model {bench / 'inset.toml'} {closed}")
-        assert (done.returncode, done.stderr) == (0, ""), closed
+        assert (done.returncode, without_loading(done.stderr)) == (0, ""), closed
     assert shell("concent compare nowhere.h5 2>&-").returncode == 2
 
 
 def test_a_terminal_of_ascii_alone_gets_the_whole_table(bench):
     command = f"concent compare {bench / 'demo.h5'} --model {bench / 'inset.toml'} --baseline {bench / 'surface.toml'}"
     done = shell(command, PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, without_loading(done.stderr)) == (0, "")
     assert "block" in done.stdout
 
 

@@ -80,7 +80,10 @@ def test_an_unknown_option_ends_with_code_2(bench, capsys):
         (["fit", "demo.h5", "--demonstrations", "demo_9", "--out", "run"], "no such demonstration"),
         (["fit", "demo.h5", "--scene", "nowhere.xml", "--out", "run"], "no such MJCF"),
         (["replay", "demo.h5", "--model", "demo.h5"], "not a TOML"),
-        (["events", "demo.h5", "--model", "inset.toml", "--staging.min-touch-share", "3"], "min_touch_share"),
+        (
+            ["events", "demo.h5", "--model", "inset.toml", "--staging.min-touch-share", "3"],
+            "--staging.min-touch-share is",
+        ),
         (["geometry", "demo.h5"], "nothing to write"),
         (["geometry", "demo.h5", "--out", "x.toml", "--count", "1"], "too few spheres"),
         (["record", "--out", "new/r.h5", "--robot", "nowhere.xml"], "no such robot"),

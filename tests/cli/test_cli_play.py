@@ -141,9 +141,12 @@ def test_commands_are_scaled_as_in_an_evaluation():
     ("options", "sentence"),
     [
         (["--hide", "mass=1.5"], "hidden effects exist only in Reality"),
-        (["--states", "0"], "number of states"),
-        (["--setpoint-lead-scale", "0"], "setpoint lead scale is out of bounds; expected above 0, at most 1, found 0"),
-        (["--states", "1", "--speed", "9"], "speed is not right; expected 0.1 to 4"),
+        (["--states", "0"], "--states is out of bounds; expected at least 1"),
+        (
+            ["--setpoint-lead-scale", "0"],
+            "--setpoint-lead-scale is out of bounds; expected above 0 and at most 1, found 0",
+        ),
+        (["--states", "1", "--speed", "9"], "--speed is out of bounds; expected at least 0.1 and at most 4"),
         (["--states", "1", "--host", "203.0.113.7"], "no page can be served at this address"),
     ],
 )

@@ -74,7 +74,10 @@ BROKEN = {
         lambda t: t.replace('"normal": [', '"normal": [[], ', 1),
         "normal: wrong length.*expected 3, found 4",
     ),
-    "settings": (lambda t: t.replace('"min_touch_share": 0.5', '"min_touch_share": 7'), "share is not right"),
+    "settings": (
+        lambda t: t.replace('"min_touch_share": 0.5', '"min_touch_share": 7'),
+        "min_touch_share is out of bounds; expected above 0 and at most 1, found 7",
+    ),
     "beyond the end": (lambda t: t.replace('"steps": 7', '"steps": 1', 1), "times that cannot be"),
 }
 

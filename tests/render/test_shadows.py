@@ -121,5 +121,5 @@ def test_lights_that_cannot_be_are_refused():
         lambda: ShadowCfg(elevation=(60.0, 50.0)),
         lambda: ShadowCfg(strength=(0.1, 1.2)),
     ):
-        with pytest.raises(RenderError, match="lights that cannot be"):
+        with pytest.raises(RenderError, match="is out of bounds"):
             make()

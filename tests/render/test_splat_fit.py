@@ -121,7 +121,7 @@ def test_what_cannot_be_fitted_is_refused(views, hull):
         SplatFit(views, hull[:5], CFG)
     with pytest.raises(RenderError, match="no images are left"):
         SplatFit(views, hull, replace(CFG, held_out=1))
-    with pytest.raises(RenderError, match="degree of 0 to 3"):
+    with pytest.raises(RenderError, match="degree is out of bounds; expected at least 0 and at most 3"):
         replace(CFG, degree=4)
 
 

@@ -134,10 +134,10 @@ def test_given_surface_replaces_the_geoms():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"radius": -1.0}, "radius is not right"),
-        ({"radius": float("nan")}, "radius is not right"),
-        ({"count": 0}, "number of spheres"),
-        ({"friction": -0.1}, "friction is not right"),
+        ({"radius": -1.0}, "radius is out of bounds; expected above 0"),
+        ({"radius": float("nan")}, "radius is not a number"),
+        ({"count": 0}, "count is out of bounds; expected at least 1"),
+        ({"friction": -0.1}, "friction is out of bounds; expected at least 0"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 from rich.markup import escape
 
+from concent_warp.checks import PositiveDuration
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
 from concent_warp.cli.options import EngineOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
@@ -43,7 +44,7 @@ class Arguments:
     """Recording to fit it to."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations of it; all by default."""
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     engine: EngineOption = "mujoco"
     out: OptionalOutPath = None

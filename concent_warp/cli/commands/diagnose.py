@@ -6,10 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.markup import escape
 
+from concent_warp.checks import Bounds, PositiveDuration
 from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.options import EngineOption, OptionalOutPath
@@ -51,15 +53,15 @@ class Arguments:
     """Write a report with the diagnosis, charts, replay and 3D views to this file."""
     apply: Path | None = None
     """Save the model with all accepted effects, fitted together with intervals, to this file (.toml)."""
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
-    additions: int = 3
+    additions: Annotated[int, Bounds(0, 1000)] = 3
     """Most effects that are added."""
     gradient: bool = False
     """Let fits of friction, mass and contact stiffness start from where gradients through Newton lead, where that is
     better; needs contact geometry and observed objects."""
     engine: EngineOption = "mujoco"
-    jobs: int = -1
+    jobs: Annotated[int, Bounds(-1, 4096)] = -1
     """Processes at a time; -1: one a CPU."""
     seed: int = 0
     """Seed of all random numbers."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from concent_warp.checks import Bounds
 from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
@@ -33,7 +34,7 @@ class Arguments:
     """Run a policy that comes with the package, shape_sorter where no name is given."""
     world: Literal["simulation", "reality", "both"] = "both"
     """Where to run the policy."""
-    episodes: int = 200
+    episodes: Annotated[int, Bounds(1, 1_000_000)] = 200
     """Initial states, of which each is run once in each world."""
     seed: int = 0
     """Seed of the initial states."""

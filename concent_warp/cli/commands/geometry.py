@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.checks import Positive
 from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
@@ -35,7 +36,7 @@ class Arguments:
     """Bodies to lay spheres on; by default those that the scene names, else those with a free joint."""
     add: Mapping[str, Path] = field(default_factory=dict)
     """Objects to add to the scene first, as name and file: a mesh, a point cloud or Gaussian splats."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """Factor from the unit of these files to metres."""
     overwrite: bool = False
     """Replace files that are there."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 from rich.markup import escape
 
+from concent_warp.checks import PositiveDuration
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.options import EngineOption
 from concent_warp.cli.terminal import say, say_written
@@ -32,7 +33,7 @@ class Arguments:
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
     engine: EngineOption = "mujoco"
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Time over which forces are averaged [s]; 0.1 s for joints, 0.12 s with objects, more where readings are rare, by
     default."""
     json: bool = False

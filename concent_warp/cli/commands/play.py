@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from concent_warp.checks import Count
 from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.terminal import say
 from concent_warp.deploy.cfg import PlayCfg, WorldName
@@ -27,7 +28,7 @@ class Arguments:
     """Show a policy that comes with the package, shape_sorter where no name is given."""
     world: WorldName = "simulation"
     """Where the policy acts: in the model that it was trained in, or in Reality."""
-    episodes: int | None = None
+    episodes: Count | None = None
     """Episodes after which to end; by default when interrupted."""
     seed: int = 0
     """Seed of the initial states."""

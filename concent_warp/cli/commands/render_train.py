@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from concent_warp.checks import Count
 from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
@@ -32,7 +33,7 @@ class Arguments:
     """Run folder."""
     cameras: tuple[str, ...] = ()
     """Cameras to learn; all of the recording by default."""
-    steps: int | None = None
+    steps: Count | None = None
     """Steps of each network; short for --flow.steps and --enlarge.steps."""
     device: DeviceOption = None
     resume: bool = False

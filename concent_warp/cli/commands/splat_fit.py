@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from concent_warp.checks import Pixels, Positive
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.errors import RenderError
@@ -42,9 +43,9 @@ class Arguments:
     """Run folder; by default runs/splats_<name of the folder>."""
     points: Path | None = None
     """Mesh or point cloud to start from, in the frame of the object; by default the hull that the masks agree on."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """Factor from the unit of the points to metres."""
-    longest: int = 800
+    longest: Pixels = 800
     """Larger images are made smaller, so that their longer edge has so many pixels."""
     device: DeviceOption = None
     resume: bool = False

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from concent_warp.checks import Count, Worlds
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.given_policy import check_policy, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
@@ -49,13 +50,13 @@ class Arguments:
     """Replace an earlier run in the folder."""
     stage: str | None = None
     """Stage to train, or all for the chain of all stages; short for --environment.stage."""
-    worlds: int | None = None
+    worlds: Worlds | None = None
     """Parallel environments; short for --environment.worlds."""
     reward: Literal["contact", "engineered"] | None = None
     """Reward; short for --environment.reward.kind."""
     collision: Literal["vcp", "full"] | None = None
     """Spheres in the physics; short for --environment.collision."""
-    iterations: int | None = None
+    iterations: Count | None = None
     """Iterations of PPO; short for --ppo.iterations."""
     train: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from concent_warp.checks import check_settings
 from concent_warp.comparison.units import channel_text, ratio_text
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
@@ -69,6 +70,7 @@ def suggest_experiment(
         ('rad', True)
     """
     cfg = cfg or SuggestExperimentCfg()
+    check_settings(cfg)
     chosen = dict(list(models.items())[: cfg.max_hypotheses])
     if len(chosen) < 2:
         return None

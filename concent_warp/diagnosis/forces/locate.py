@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from concent_warp.checks import check_settings
 from concent_warp.diagnosis.forces.body_forces import body_force, with_significance
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.dependence import blocks_of, dependences, min_share
@@ -56,6 +57,7 @@ def locate_forces(
         ['hinge']
     """
     cfg = cfg or LocateForcesCfg()
+    check_settings(cfg)
     simulator = make_engine(engine, model)
     chosen = recording.demonstrations
     motions = [StateEstimator.of(model, d, StateEstimatorCfg("smoothing_spline"), engine=simulator) for d in chosen]

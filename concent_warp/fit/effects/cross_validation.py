@@ -17,9 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from concent_warp.checks import Bounds, Count, PositiveDuration
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Linear
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.robust import huber_weight
@@ -29,15 +31,15 @@ from concent_warp.fit.effects.robust import huber_weight
 class BlockCfg:
     """How a recording is cut into blocks and folds."""
 
-    folds: int = 5
+    folds: Annotated[int, Bounds(2, 1000)] = 5
     """Folds of the cross-validation [-]: the usual 5 to 10 (Hastie, Tibshirani and Friedman, "The Elements of
     Statistical Learning", 2009, section 7.10)."""
-    min_blocks: int = 12
+    min_blocks: Count = 12
     """Least blocks that a recording is cut into [-], at the cost of shorter blocks: the smallest p-value of a sign-flip
     test is then 1 / 4096."""
-    max_blocks: int = 60
+    max_blocks: Count = 60
     """Most blocks [-]."""
-    min_length: float = 0.1
+    min_length: PositiveDuration = 0.1
     """Shortest block [s], unless there are fewer than `min_blocks`: residuals are correlated over shorter times."""
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Duration, PositiveDuration, Share
 from concent_warp.fit.effects.prediction import Course, Prediction, SimulationRequest
 
 
@@ -20,13 +21,13 @@ from concent_warp.fit.effects.prediction import Course, Prediction, SimulationRe
 class FadingCfg:
     """When errors of an initial state count as faded."""
 
-    time: float = 1.0
+    time: PositiveDuration = 1.0
     """Time after which an error has to have faded [s]: several time constants of position-controlled joints."""
-    min_window: float = 3.0
+    min_window: Duration = 3.0
     """Length of a window above which fading is tested [s]: the test itself simulates `time`."""
     max_share: float = 1e-3
     """Share of an error that may be left, in units of the state's spread [-]: far below the noise."""
-    checks: tuple[float, ...] = (0.75, 0.85, 0.95, 1.0)
+    checks: tuple[Share, ...] = (0.75, 0.85, 0.95, 1.0)
     """Instants at which that is tested, as shares of `time` [-]: several, since an oscillation passes through zero."""
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from concent_warp.checks import PositiveDuration, Share, check_settings
 from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -79,14 +80,14 @@ class FitEffectsCfg(EffectSolverCfg):
         0.5
     """
 
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     seed: int = 0
     """Seed of the disturbances that determine how long windows may be."""
     undetermined_share: float = 0.5
     """Standard deviation of a parameter over that of its weak prior from which the parameter counts as not determined
     by the recording [-]."""
-    max_correlation: float = 0.98
+    max_correlation: Share = 0.98
     """Correlation of two parameters beyond which a remark says that they cannot be distinguished [-]."""
     noise_ratio: float = 1.05
     """Residual over noise below which a fit counts as complete [-]: smaller differences are within the noise."""
@@ -131,6 +132,7 @@ def fit_effects(
         ['torque[hinge] = 0.030 N m']
     """
     cfg = cfg or FitEffectsCfg()
+    check_settings(cfg)
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
     report = progress or _silent

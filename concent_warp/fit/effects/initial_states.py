@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from concent_warp.checks import Positive
 from concent_warp.fit.effects.fading import FadingCfg, ReferenceSimulation, is_long, residuals_near
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
@@ -31,15 +32,15 @@ class InitialStateCfg:
     """Relative fall of a window's cost below which its initial state counts as found [-]."""
     max_expected_falls: float = 3.0
     """Multiple of a window's last fall of the cost that must suffice to reach its bound, or its fit ends [-]."""
-    dampings: tuple[float, ...] = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
+    dampings: tuple[Positive, ...] = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
     """Levenberg-Marquardt dampings that are tried in each iteration, relative to the curvature [-]."""
-    first_step: float = 0.3
+    first_step: Positive = 0.3
     """First step of a finite difference, in units of the state's spread [-]."""
-    smallest_step: float = 0.003
+    smallest_step: Positive = 0.003
     """Smallest step of a finite difference, in units of the state's spread [-]."""
-    largest_step: float = 1.0
+    largest_step: Positive = 1.0
     """Largest step of a finite difference, in units of the state's spread [-]."""
-    target_changes: tuple[float, ...] = (1.0, 3.0, 0.3)
+    target_changes: tuple[Positive, ...] = (1.0, 3.0, 0.3)
     """Mean changes of the residuals that finite differences aim at, in units of noise [-]. An impact is linear over a
     small difference only, so the next value is taken where an outlying window makes no progress."""
     outlier_ratio: float = 1.2

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from concent_warp.checks import Count, Factor, Positive
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch, start_cost
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import RobustLossCfg, cauchy_cost, cauchy_weight, huber, huber_limit, huber_weight
@@ -27,17 +28,17 @@ class LeastSquaresCfg:
     """Most steps [-]."""
     tolerance: float = 1e-3
     """Relative fall of the cost below which the fit ends [-]."""
-    damping: float = 1e-3
+    damping: Positive = 1e-3
     """First Levenberg-Marquardt damping, relative to the curvature [-]."""
-    max_damping_trials: int = 5
+    max_damping_trials: Count = 5
     """Most values of the damping tried for one step [-]."""
-    damping_decrease: float = 5.0
+    damping_decrease: Factor = 5.0
     """Factor by which the damping falls after a step that lowers the cost [-]. Empirical, as the following."""
-    damping_increase: float = 8.0
+    damping_increase: Factor = 8.0
     """Factor by which the damping rises after a step that does not [-]."""
-    min_damping: float = 1e-6
+    min_damping: Positive = 1e-6
     """Damping below which it falls no further [-]."""
-    min_raised_damping: float = 1e-2
+    min_raised_damping: Positive = 1e-2
     """Least damping after a step that does not lower the cost [-]."""
     predicted_share: float = 0.25
     """Share of the predicted fall of the cost that a step must reach to be taken without a refit of the initial states
@@ -48,13 +49,13 @@ class LeastSquaresCfg:
     """Most refits of the initial states after steps that lower the cost by much less than predicted [-]."""
     refit_iterations: int = 2
     """Most iterations of such a refit [-]."""
-    first_step: float = 0.1
+    first_step: Positive = 0.1
     """First step of a parameter's finite difference, in units of its typical scale [-]."""
-    min_step: float = 0.01
+    min_step: Positive = 0.01
     """Least step of a finite difference, in units of the parameter's typical scale [-]."""
-    max_step: float = 0.3
+    max_step: Positive = 0.3
     """Largest step of a finite difference, in units of the parameter's typical scale [-]."""
-    target_change: float = 3.0
+    target_change: Positive = 3.0
     """Mean change of the residuals that a finite difference aims at, in units of noise [-]: with contacts, residuals
     jump a little from value to value, and smaller steps measure the jumps."""
     noise_ratio: float = 1.05
@@ -65,17 +66,17 @@ class LeastSquaresCfg:
     """The same for a thorough polish, which is for the sake of the parameters' values [-]."""
     polish_steps: int = 6
     """Most steps of the parameters in a polish [-]."""
-    polish_step_decrease: float = 3.0
+    polish_step_decrease: Factor = 3.0
     """Factor by which a step at fixed initial states is shortened where it raises the cost [-]."""
-    polish_step_lengths: tuple[float, ...] = (1.0, 3.0)
+    polish_step_lengths: tuple[Positive, ...] = (1.0, 3.0)
     """Lengths that are tried for such a step, relative to the least-squares step [-]."""
     screened_gain: float = 0.5
     """Share of a step's predicted fall of the cost in the windows that are simulated first [-]."""
-    max_polished_windows: int = 16
+    max_polished_windows: Count = 16
     """Most windows that are polished together; of more, a sample is polished first [-]."""
-    polish_sample: int = 8
+    polish_sample: Count = 8
     """Windows in such a sample [-]."""
-    prior: float = 10.0
+    prior: Positive = 10.0
     """Standard deviation of a parameter's weak prior, in units of its typical scale [-]: wide enough to change no value
     that the data determine."""
     robust: RobustLossCfg = field(default_factory=RobustLossCfg)

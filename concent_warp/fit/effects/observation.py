@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Count, Positive, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
@@ -31,34 +32,34 @@ class ObservationCfg:
     "Empirical" values were set on the scenes of the hidden-effect benchmark.
     """
 
-    velocity_time: float = 0.03
+    velocity_time: PositiveDuration = 0.03
     """Time over which the noise of a position makes a velocity at the start of a window uncertain [s]: about the time
     over which a velocity is estimated."""
-    state_noise: float = 3.0
+    state_noise: Positive = 3.0
     """Uncertainty of a measured state at the start of a window, in standard deviations of the measurement noise [-]:
     3 sigma."""
-    unmeasured_position: float = 1e-3
+    unmeasured_position: Positive = 1e-3
     """Uncertainty of a position that no sensor measures [m or rad]. Empirical."""
-    unmeasured_velocity: float = 1e-2
+    unmeasured_velocity: Positive = 1e-2
     """Uncertainty of a velocity that no sensor measures [m/s or rad/s]. Empirical."""
-    min_values: int = 12
+    min_values: Count = 12
     """Least measured values of a recording that can be compared with a model [-]: one for each block of time."""
-    probe_pairs: int = 6
+    probe_pairs: Count = 6
     """Pairs of simulations from opposite errors of the initial state, from which the length of windows is chosen [-].
     Empirical."""
-    max_curvature: float = 3.0
+    max_curvature: Positive = 3.0
     """Deviation of the mean of such a pair from the simulation without an error, over the noise, at which a window ends
     [-]: beyond it, the effect of an error is no longer in proportion to it. Empirical."""
     max_scatter: float = 2.0
     """Scatter of the samples about a smooth motion over its median below which a window may start [-]: it is larger at
     impacts, where velocities are unknown. Empirical."""
-    min_length: float = 0.12
+    min_length: PositiveDuration = 0.12
     """Shortest window [s]. Empirical."""
-    max_length: float = 20.0
+    max_length: PositiveDuration = 20.0
     """Longest window [s], for the simulations' memory."""
-    default_position_noise: float = 1e-3
+    default_position_noise: Positive = 1e-3
     """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
-    default_noise: float = 1e-2
+    default_noise: Positive = 1e-2
     """The same for all other channels [their unit]."""
 
     def noise_of_unit(self, unit: str) -> float:

@@ -6,12 +6,13 @@ import itertools
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.checks import Bounds, Duration, Positive
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, variant_fields
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
@@ -27,13 +28,13 @@ if TYPE_CHECKING:
 class PredictionCfg:
     """Settings of predicted readings."""
 
-    max_residual: float = 1e3
+    max_residual: Positive = 1e3
     """Largest residual, in units of noise, and that of readings which a diverged simulation does not predict [-]: far
     above what robust losses are linear from."""
-    extrapolation: float = 0.05
+    extrapolation: Duration = 0.05
     """Time before and after a window over which predictions are continued linearly [s]: readings may be delayed by as
     much."""
-    cache_bytes: int = 2**25
+    cache_bytes: Annotated[int, Bounds(0, 2**40)] = 2**25
     """Size of the simulations that are kept for repeated requests [bytes]."""
 
 

@@ -11,15 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.checks import Positive
+
 
 @dataclass(frozen=True)
 class RobustLossCfg:
     """Scales of the robust losses."""
 
-    residual_limit: float = 4.0
+    residual_limit: Positive = 4.0
     """Residual over the spread of the residuals beyond which Huber's loss is linear [-]: of normal noise, 6 samples in
     100 000 are beyond."""
-    state_scale: float = 2.0
+    state_scale: Positive = 2.0
     """Scale of Cauchy's loss of an error of an initial state, in units of the state's spread [-]: near the 2.39 with 95
     % efficiency under normal noise (Holland and Welsch, 1977)."""
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
+from concent_warp.checks import Bounds, Positive, PositiveShare, Share, SmallShare
 from concent_warp.fit.geometry.faces import FaceCfg, Faces
 from concent_warp.fit.geometry.objective import Candidates
 from concent_warp.fit.geometry.offset import OffsetCfg
@@ -17,33 +19,33 @@ from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 class EvolutionCfg:
     """Settings of the strategy."""
 
-    population: int = 32
+    population: Annotated[int, Bounds(2, 100_000)] = 32
     """Candidates a generation. On six seeds of the shape sorter that no page reports, 20 to 40 reached the same errors;
     the time of a fit grows with it."""
-    sigma: float | None = None
+    sigma: Positive | None = None
     """Standard deviation of a sphere's displacement in the first generation [m]. None takes `sigma_share` of the
     starting Chamfer distance (both directions together), at most `max_sigma`: large steps far from the goal, small ones
     near it."""
-    sigma_share: float = 1 / 6
+    sigma_share: Positive = 1 / 6
     """That share of the Chamfer distance [-]. Empirical."""
-    max_sigma: float = 3e-3
+    max_sigma: Positive = 3e-3
     """Largest standard deviation that is chosen automatically [m]."""
-    sigma_decay: float = 0.975
+    sigma_decay: PositiveShare = 0.975
     """Factor on sigma from one generation to the next."""
-    length: float = 0.03
+    length: Positive = 0.03
     """Length scale of the RBF kernel [m]: how far a dent reaches."""
     noise: Noise = "gaussian_process"
     """Gaussian-process samples; "centroid" is the paper's wording taken literally; "independent" for comparison."""
     swelling: float = 1.0
     """Displacement outward, of all faces of a region by the same distance, relative to sigma; 0 for none."""
-    swelling_length: float = 0.1
+    swelling_length: Positive = 0.1
     """Length over which the swelling varies [m]."""
     flat_start: bool = True
     """Flatten the faces of the starting geometry unless that makes the replay worse: noise of single spheres, which
     one demonstration cannot distinguish from the true shape, is removed."""
-    flattening: float = 0.1
+    flattening: Share = 0.1
     """Share by which each generation takes the roughness out of the faces inside the mask; 0 for none."""
-    face_length: float = 0.03
+    face_length: Positive = 0.03
     """Length over which a face is flat [m]: its distance from the nominal surface varies linearly."""
     faces: FaceCfg = field(default_factory=FaceCfg)
     """Settings of the search for faces and of their flattening."""
@@ -51,9 +53,9 @@ class EvolutionCfg:
     """Settings of the directions in which spheres move when their body grows."""
     antithetic: bool = True
     """Sample candidates in pairs of opposite displacement."""
-    elite_share: float = 0.25
+    elite_share: PositiveShare = 0.25
     """Share of the candidates that move the estimate."""
-    momentum: float = 0.6
+    momentum: SmallShare = 0.6
     """Weight of the elites' mean in the exponential moving average [-]."""
     mean_smoothing: float = 0.0
     """Length [m] of a further smoothing of the update inside the mask; 0 leaves it as smooth as the noise is."""
@@ -61,7 +63,7 @@ class EvolutionCfg:
     """Neighbours of each touched sphere that may move too [-]."""
     freeze_gripped: bool = True
     """Keep the spheres that the robot touches where they are: otherwise the fit changes the grasp."""
-    max_displacement: float = 0.012
+    max_displacement: Positive = 0.012
     """How far a sphere may end from where it started [m]."""
     fit_radius: bool = False
     """Fit radii too."""

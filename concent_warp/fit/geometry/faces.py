@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from concent_warp.checks import Angle, Count, Positive
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
@@ -25,21 +26,21 @@ class FaceCfg:
     "Empirical" values were set on perturbed boxes and on the fit of the shape sorter.
     """
 
-    probes: int = 40_000
+    probes: Count = 40_000
     """Sampled surface points among which the faces of a sphere are found [-]: about 1 mm apart on a hand-held
     object."""
     slack: float = 2e-3
     """A sphere is on all faces no farther from its centre than the nearest one plus this [m]. Empirical."""
     max_beside: float = 1e-3
     """Distance beside a face at which a sphere's foot on it may lie [m]: the distance of samples."""
-    max_angle: float = 25.0
+    max_angle: Angle = 25.0
     """Largest angle between the normals at two places of one face [deg]. Empirical."""
     max_slope: float = 0.35
     """Distance of a face from the tangent plane at one of its places over the distance from the place, at most [-]:
     below tan(`max_angle`)."""
     min_weight: float = 1e-3
     """Weight below which a neighbour does not count [-]."""
-    outlier_ratio: float = 4.5
+    outlier_ratio: Positive = 4.5
     """Deviation from the plane of a face beyond which a neighbour does not count, in medians of the deviations [-]: 3
     standard deviations of a normal distribution."""
     rounding: float = 1e-9
@@ -48,7 +49,7 @@ class FaceCfg:
     """Rounds of reweighting [-]. Empirical."""
     flattenings: int = 3
     """Rounds of flattening a whole geometry [-]: what counts as an outlier changes from one to the next. Empirical."""
-    ridge: float = 1e-3
+    ridge: Positive = 1e-3
     """Regularisation of the least squares, relative to the eigenvalue 1 of a normal's outer product [-]: nothing
     moves along directions without a face."""
 

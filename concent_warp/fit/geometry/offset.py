@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from concent_warp.checks import Count, Positive
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
@@ -22,13 +23,13 @@ from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 class OffsetCfg:
     """Settings of the directions in which spheres move when their body grows."""
 
-    probes: int = 40_000
+    probes: Count = 40_000
     """Sampled surface points among which the faces of a sphere are found [-]: about 1 mm apart on a hand-held
     object."""
     slack: float = 1e-3
     """A sphere is on all faces no farther from its centre than the nearest one plus this [m]: the distance of
     samples."""
-    ridge: float = 1e-3
+    ridge: Positive = 1e-3
     """Regularisation of the least squares, relative to the eigenvalue 1 of a normal's outer product [-]: nothing
     moves along directions without a face."""
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, Count, PositiveDuration, Share, SmallShare
 from concent_warp.estimation.object_tracks import Segment, observed_states
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.evolution import Evolution, EvolutionCfg
@@ -28,24 +29,24 @@ class GeometrySearchCfg:
 
     evolution: EvolutionCfg = field(default_factory=EvolutionCfg)
     """Settings of the evolution strategy."""
-    generations: int = 70
+    generations: Annotated[int, Bounds(0, 1_000_000)] = 70
     """Generations at most."""
-    plateau_generations: int = 20
+    plateau_generations: Count = 20
     """Generations without progress after which the search ends: neither the lowest distance over the frames of the fit
     nor the one over the held-out frames has fallen by `min_gain`. Chosen on seeds of the shape sorter that no page
     reports: shorter ones stop on the flat stretch after the first generations."""
-    min_gain: float = 0.02
+    min_gain: Share = 0.02
     """Relative fall of the distance that counts as progress [-], measured from its value at the last progress."""
-    held_out: float = 0.2
+    held_out: SmallShare = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
-    block: float = 0.2
+    block: PositiveDuration = 0.2
     """Length of the held-out blocks [s]."""
-    window: float | None = None
+    window: PositiveDuration | None = None
     """Length of windows to simulate on their own [s], each from the measured state at its start; None simulates whole
     demonstrations. Motion with impacts or tumbling asks for 0.1-0.3 s."""
-    window_stride: float | None = None
+    window_stride: PositiveDuration | None = None
     """Time from the start of one window to that of the next [s]; None takes the length."""
-    batch: int | None = None
+    batch: Count | None = None
     """Segments that a generation tries its candidates on, sampled anew each time; None takes all. With hundreds of
     windows a sample of 40-80 gives the same result at less cost."""
     jitter: float = 7e-4

@@ -14,11 +14,12 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from concent_warp.array_file import write_arrays
+from concent_warp.checks import Bounds, Count, Factor, OpenShare, Positive
 from concent_warp.errors import ModelError
 from concent_warp.fit.geometry.perturbation import rbf
 from concent_warp.fit.newton.horizon import HorizonCfg
@@ -32,33 +33,33 @@ from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 class GradientCfg:
     """Settings of the descent."""
 
-    starts: int = 2
+    starts: Annotated[int, Bounds(1, 10_000)] = 2
     """Geometries to start from, all at once: the model's, then disturbed ones."""
     iterations: int = 16
     """Steps of each start at most."""
-    step: float | None = None
+    step: Positive | None = None
     """Length of the first step of the sphere that moves farthest [m]. None takes a third of the starting distance, at
     most `largest_step`."""
-    largest_step: float = 1.5e-3
+    largest_step: Positive = 1.5e-3
     """Longest first step that is chosen automatically [m]."""
-    step_increase: float = 1.2
+    step_increase: Factor = 1.2
     """Factor by which a step grows after one that lowers the loss [-]. Empirical."""
-    step_decrease: float = 0.5
+    step_decrease: OpenShare = 0.5
     """Factor by which a step shrinks after one that does not [-]: bisection."""
-    plateau_iterations: int = 4
+    plateau_iterations: Count = 4
     """Steps in which the lowest loss must fall below `plateau_ratio`, or the descent ends [-]. Empirical."""
     plateau_ratio: float = 0.97
     """Lowest loss over that `plateau_iterations` before, above which the descent ends [-]. Empirical."""
-    smallest_step: float = 2e-5
+    smallest_step: Positive = 2e-5
     """A start whose steps are shorter is finished [m]."""
     prior: float = 5.0
     """Weight of the mean squared displacement in the loss [1/m]."""
-    rescored_iterates: int = 4
+    rescored_iterates: Count = 4
     """Iterates of each start that are evaluated again in MuJoCo [-]."""
-    first_rescoring: int = 8
+    first_rescoring: Count = 8
     """Steps after which iterates are evaluated in MuJoCo for the first time [-]: where none of them is better than the
     start, the descent ends."""
-    max_engine_ratio: float = 5.0
+    max_engine_ratio: Positive = 5.0
     """Loss in Newton of the best start over that of the model in MuJoCo, on the same segments, above which gradients
     are not used [-]: Newton then simulates another motion, such as a slipping grasp. Empirical."""
     min_gain: float = 0.05

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from concent_warp.checks import Count, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.object_tracks import BodyTarget, Segment, observed_poses
 from concent_warp.estimation.windows import cut_windows
@@ -30,11 +31,11 @@ class HorizonCfg:
 
     tumbling_tilt: float = 0.35
     """Change of an object's tilt above which it counts as tumbling [rad]: 20 degrees."""
-    tumbling_window: float = 0.25
+    tumbling_window: PositiveDuration = 0.25
     """Length of a window of a demonstration in which an object tumbles [s]. Empirical: a few impacts."""
-    calm_window: float = 3.0
+    calm_window: PositiveDuration = 3.0
     """Longest window of a demonstration in which none does [s]. Empirical."""
-    max_windows: int = 24
+    max_windows: Count = 24
     """Most windows [-]; more are thinned out evenly."""
 
 

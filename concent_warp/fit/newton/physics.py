@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from concent_warp.checks import Count, Positive, Share, TimeStep
 from concent_warp.errors import EngineError
 
 
@@ -24,31 +25,31 @@ from concent_warp.errors import EngineError
 class NewtonCfg:
     """How contacts are simulated in Newton."""
 
-    frequency: float = 200.0
+    frequency: Positive = 200.0
     """Natural frequency of a body on its contacts [rad/s]: a resting body sinks by g / frequency^2, 0.2 mm."""
-    damping: float = 2.0
+    damping: Positive = 2.0
     """Damping ratio of that motion [-]. Newton's dampers act on approach only: with less of it bodies bounce off, where
     MuJoCo's contacts take the speed out."""
-    onset: float = 3e-4
+    onset: Positive = 3e-4
     """Depth at which a damper acts in full [m]. One that acts at once makes the motion jump with the step of the first
     touch, and gradients wrong."""
-    longest_step: float = 5e-4
+    longest_step: TimeStep = 5e-4
     """Longest time step [s]."""
-    shortest_step: float = 1e-4
+    shortest_step: TimeStep = 1e-4
     """Shortest time step; a scene that asks for a shorter one is refused [s]."""
-    creep: float = 0.02
+    creep: Positive = 0.02
     """Largest speed at which a body creeps although friction should stop it [m/s]."""
     reach: float = 0.004
     """A sphere that comes this near to something, in MuJoCo or as observed, may collide with it [m]."""
-    min_contacts: int = 4
+    min_contacts: Count = 4
     """Contacts that carry a resting body [-]: they share its stiffness, and at least so many are assumed."""
-    min_damping: float = 0.6
+    min_damping: Share = 0.6
     """Share of `damping` below which a body would bounce [-]."""
-    max_spring_number: float = 0.5
+    max_spring_number: Positive = 0.5
     """Largest dt^2 ke L [-]: semi-implicit Euler is stable below 4, and accurate well below 1."""
-    max_damper_number: float = 0.8
+    max_damper_number: Positive = 0.8
     """Largest dt kd L and dt kf L [-]: an explicit damper overshoots from 1 on and is unstable from 2 on."""
-    pair_states: int = 200
+    pair_states: Count = 200
     """States of a segment, of those simulated, in which pairs that may collide are searched for [-]."""
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from concent_warp.checks import Positive, PositiveInterval
 from concent_warp.errors import EngineError, ModelError, RecordingError
 from concent_warp.estimation.object_tracks import Segment, whole_demonstration
 from concent_warp.fit.newton.horizon import HorizonCfg, gradient_segments
@@ -30,19 +31,19 @@ class FactorCfg:
 
     iterations: int = 8
     """Steps at most; each costs two simulations of each factor on each stretch in Newton."""
-    step: float = 0.3
+    step: Positive = 0.3
     """First step of the logarithm of a factor [-]."""
-    smallest_step: float = 0.03
+    smallest_step: Positive = 0.03
     """Step of the logarithm of a factor below which its descent ends [-]."""
     min_gain: float = 0.05
     """Share by which a factor must lower the loss; otherwise it counts as 1 [-]. Empirical."""
-    friction_range: tuple[float, float] = (0.2, 5.0)
+    friction_range: PositiveInterval = (0.2, 5.0)
     """Smallest and largest factor on friction [-]."""
-    stiffness_range: tuple[float, float] = (0.25, 2.0)
+    stiffness_range: PositiveInterval = (0.25, 2.0)
     """Smallest and largest factor on stiffness [-]: contacts stay stable within them."""
-    mass_range: tuple[float, float] = (0.7, 2.0)
+    mass_range: PositiveInterval = (0.7, 2.0)
     """Smallest and largest factor on masses [-]: contacts stay stable within them."""
-    max_engine_ratio: float = 5.0
+    max_engine_ratio: Positive = 5.0
     """Loss of the model in Newton over that in MuJoCo above which gradients are not used [-]: Newton then simulates
     another motion, such as a slipping grasp. Empirical."""
     device: str | None = None

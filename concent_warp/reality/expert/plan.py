@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
+from concent_warp.checks import Bounds, Rate
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
 
 
@@ -19,13 +21,13 @@ from concent_warp.scene.shape_sorter import ShapeSorterCfg
 class ExpertCfg:
     """How the expert moves; offsets are sampled per demonstration."""
 
-    rate: float = 50.0
+    rate: Rate = 50.0
     """Rate of the commands [Hz]."""
-    grip_height: float = 0.014
+    grip_height: Annotated[float, Bounds(-1, 1)] = 0.014
     """Tool centre above the block's centre in the grasp [m]."""
-    clearance: float = 0.05
+    clearance: Annotated[float, Bounds(0, 1)] = 0.05
     """Height above the objects in transfer [m]."""
-    offset: tuple[float, float] = (0.007, 0.011)
+    offset: Annotated[tuple[float, float], Bounds(0, 1, ascending=True)] = (0.007, 0.011)
     """Distance beside the hole at which the block is set down, least and most [m]."""
     press: float = 8.0
     """Force with which the block is leaned on the rim while it slides [N]."""
@@ -35,7 +37,7 @@ class ExpertCfg:
     """Force with which the block is pushed into the hole [N]."""
     yaw_error: float = 0.02
     """Spread of the block's rotation against the hole [rad]."""
-    speed: float = 1.0
+    speed: Annotated[float, Bounds(0.01, 100)] = 1.0
     """Factor on the speed of the whole motion [-]."""
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, Pixels, Positive, Rate, Share
 from concent_warp.reality.appearance.surroundings import furnish
 from concent_warp.recording.recording import ImageStream
 from concent_warp.scene.cameras import add_cameras
@@ -19,21 +20,21 @@ class FootageCfg:
 
     cameras: tuple[str, ...] = ()
     """Cameras whose frames are recorded: base and wrist, or such as the scene has; none by default."""
-    size: tuple[int, int] = (256, 256)
+    size: tuple[Pixels, Pixels] = (256, 256)
     """Height and width of a frame [px]."""
-    rate: float = 10.0
+    rate: Rate = 10.0
     """Frame rate [Hz]."""
     objects: bool = True
     """Whether the objects are visible. Frames without them are for training the appearance of robot and background."""
-    noise: float = 2.0
+    noise: Annotated[float, Bounds(0, 255)] = 2.0
     """Standard deviation of the colours' noise [1/255]."""
     white_balance: tuple[float, float, float] = (1.10, 1.0, 0.84)
     """Gains of red, green and blue [-]: warmer than the simulated camera."""
-    gamma: float = 0.85
+    gamma: Positive = 0.85
     """Exponent of the tone curve [-]."""
-    vignette: float = 0.22
+    vignette: Share = 0.22
     """Share of the light that the corners lose [-]."""
-    samples: int = 2
+    samples: Annotated[int, Bounds(1, 64)] = 2
     """Colour samples along each edge of a pixel."""
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, OpenAngle, Pixels, PositiveShare
 from concent_warp.reality.sensors.camera import camera_world
 from concent_warp.reality.sensors.sensing import SensingCfg
 
@@ -19,19 +20,19 @@ VISIBLE_GROUP, HIDDEN_GROUP = 0, 5
 class PhotographsCfg:
     """How an object is photographed."""
 
-    count: int = 48
+    count: Annotated[int, Bounds(1, 100_000)] = 48
     """Photographs, spread over the sphere around the object."""
-    size: int = 128
+    size: Pixels = 128
     """Width and height [px]."""
-    samples: int = 3
+    samples: Annotated[int, Bounds(1, 64)] = 3
     """Rays along each edge of a pixel [-]."""
-    fovy: float = 20.0
+    fovy: OpenAngle = 20.0
     """Vertical field of view [degrees]."""
-    fill: float = 0.8
+    fill: PositiveShare = 0.8
     """Share of the image's height that the object's bounding sphere takes."""
-    rgb_std: float = 0.0
+    rgb_std: Annotated[float, Bounds(0, 255)] = 0.0
     """Standard deviation of the colours' noise [1/255]."""
-    lowest: float = -90.0
+    lowest: Annotated[float, Bounds(-90, 90)] = -90.0
     """Least elevation of the camera [degrees]: -90 also sees the object from below, as where it is turned by hand."""
 
 

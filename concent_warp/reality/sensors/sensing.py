@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, OpenAngle, Pixels, PositiveDuration, Rate, Share, Signed
 from concent_warp.perception.pinhole import Pinhole
 from concent_warp.perception.visible_region import cast_rays
 from concent_warp.recording.recording import Channel
@@ -19,38 +21,38 @@ class SensingCfg:
 
     encoder_std: float = 2e-4
     """Joint encoder noise [rad], gripper [m]."""
-    encoder_rate: float = 100.0
+    encoder_rate: Rate = 100.0
     """Rate of joint readings [Hz]."""
     position_std: float = 3e-4
     """Noise of tracked positions [m]."""
     orientation_std: float = 3e-3
     """Noise of tracked orientations [rad]."""
-    pose_rate: float = 60.0
+    pose_rate: Rate = 60.0
     """Rate of tracked poses [Hz]."""
     point_std: float = 1e-3
     """Noise of each tracked surface point [m]."""
-    point_rate: float = 30.0
+    point_rate: Rate = 30.0
     """Rate of the point tracks, that is of the camera [Hz]."""
     visibility_slack: float = 2e-3
     """Distance of a surface in front of a point below which the point counts as visible [m]: larger than rounding of
     sampled surface points, smaller than objects."""
-    point_count: int = 96
+    point_count: Annotated[int, Bounds(1, 100_000)] = 96
     """Points tracked on each object."""
-    camera_position: tuple[float, float, float] = (1.05, -0.45, 0.65)
+    camera_position: tuple[Signed, Signed, Signed] = (1.05, -0.45, 0.65)
     """Position of the camera [m]."""
-    camera_target: tuple[float, float, float] = (0.48, -0.02, 0.02)
+    camera_target: tuple[Signed, Signed, Signed] = (0.48, -0.02, 0.02)
     """Point at which the camera is aimed [m]."""
-    camera_fovy: float = 20.0
+    camera_fovy: OpenAngle = 20.0
     """Vertical field of view of the camera [degrees]."""
     images: bool = False
     """Whether the camera's RGB-D frames are recorded, besides the points tracked in them."""
-    image_rate: float = 10.0
+    image_rate: Rate = 10.0
     """Rate of the recorded frames [Hz]."""
-    image_size: tuple[int, int] = (96, 128)
+    image_size: tuple[Pixels, Pixels] = (96, 128)
     """Height and width of the frames [px]."""
-    image_samples: int = 2
+    image_samples: Annotated[int, Bounds(1, 64)] = 2
     """Colour samples along each edge of a pixel [-]."""
-    rgb_std: float = 2.0
+    rgb_std: Annotated[float, Bounds(0, 255)] = 2.0
     """Standard deviation of the colours' noise [1/255]."""
     depth_noise: float = 1.425e-3
     """Depth noise per squared depth [1/m]: std = depth_noise * z^2, 1.3 mm at 0.95 m. The figure of a structured-light
@@ -59,11 +61,11 @@ class SensingCfg:
     """Step in which depth is reported [m], 0.24 mm."""
     depth_jump: float = 0.01
     """Difference of depth between neighbouring pixels from which on they lie on an edge [m]."""
-    depth_dropout: float = 0.5
+    depth_dropout: Share = 0.5
     """Share of the pixels on an edge that have no depth [-]: half of what they cover is hidden from the second eye."""
     tracking_std: float = 1e-4
     """Slow deviation of the joints from their commands that no encoder measures [rad]."""
-    tracking_time: float = 0.3
+    tracking_time: PositiveDuration = 0.3
     """Correlation time of this deviation [s]."""
 
     def pinhole(self) -> Pinhole:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+
+from concent_warp.checks import MAX_COUNT, Bounds, Count, Positive, PositiveDuration, Share
 
 
 @dataclass(frozen=True)
 class ClockCheckCfg:
     """Thresholds of the check that clocks are in seconds and start together."""
 
-    min_samples: int = 10
+    min_samples: Count = 10
     """Samples below which a channel is not judged [-]: a state before and one after are a sound recording."""
-    slow_period: float = 0.95
+    slow_period: PositiveDuration = 0.95
     """Sampling period that no measurement of a contact has, but that one in milliseconds has at up to 1 kHz [s]."""
-    fast_period: float = 1e-6
+    fast_period: Positive = 1e-6
     """Sampling period below which a clock cannot be in seconds [s]: no sensor of a robot is read at 1 MHz."""
     max_span_ratio: float = 10.0
     """Duration of a slow channel over that of the fast ones above which its clock is in another unit, and first sample
@@ -30,14 +33,14 @@ class ClockCheckCfg:
 class FallCfg:
     """Thresholds above which a motion is taken for a free fall."""
 
-    min_share: float = 0.25
+    min_share: Share = 0.25
     """Least share of a track in which its acceleration is that of gravity [-]."""
     max_error: float = 0.25
     """Largest deviation of that acceleration from gravity, as a share of it [-]: air drag at half the final speed."""
-    span: float = 0.25
+    span: PositiveDuration = 0.25
     """Length of the pieces of which each acceleration is estimated [s], or `min_samples` periods if these are more:
     noise of 5 mm at 30 Hz leaves an error of 0.8 m/s^2."""
-    min_samples: int = 6
+    min_samples: Annotated[int, Bounds(3, MAX_COUNT)] = 6
     """Fewest samples of such a piece [-]."""
     margin: float = 1.5
     """Distance that the demonstration may reach, as a multiple of the largest in the fall [-]."""

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
+from concent_warp.checks import MAX_COUNT, Bounds, Count
 from concent_warp.errors import SceneError
 from concent_warp.scene.shapes.solid import Distances, Solid, normalised
 
@@ -26,20 +27,20 @@ if TYPE_CHECKING:
 class PointCloudCfg:
     """How a cloud of points becomes a solid. Values were set on scans of boxes with holes, at noise below a spacing."""
 
-    plane_neighbours: int = 12
+    plane_neighbours: Annotated[int, Bounds(3, MAX_COUNT)] = 12
     """Nearest points that a local plane is fitted to, the point itself included [-]."""
-    views: int = 48
+    views: Count = 48
     """Viewpoints around the object from which visibility is determined [-]."""
-    flip_radius: float = 100.0
+    flip_radius: Annotated[float, Bounds(1, above_low=True)] = 100.0
     """Radius of the sphere at which the cloud is inverted, over the distance of the farthest point [-]: larger values
     count more points as visible (Katz, Tal and Basri 2007)."""
     vote_averagings: int = 2
     """How often votes on the outward side are averaged over neighbours [-]."""
-    max_points: int = 20_000
+    max_points: Count = 20_000
     """Points to about which a larger cloud is thinned out [-]."""
-    distance_neighbours: int = 6
+    distance_neighbours: Count = 6
     """Nearest points over whose planes the distance is averaged [-]."""
-    min_points: int = 50
+    min_points: Count = 50
     """Fewest points that describe a surface [-]."""
 
 

@@ -16,6 +16,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Count, Positive
 from concent_warp.errors import SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, Ellipsoid, PlacedSolid, Solid
@@ -25,13 +26,13 @@ from concent_warp.scene.shapes.solid import Box, Capsule, Cylinder, Distances, E
 class SurfaceCfg:
     """How the outer surface of a union is sampled."""
 
-    probe_distance: float = 1e-6
+    probe_distance: Positive = 1e-6
     """Distance from a surface point to the probe that distinguishes outer faces from inner ones, over the root of the
     largest area [-]: above rounding, below the gaps between faces."""
-    max_batches: int = 200
+    max_batches: Count = 200
     """Batches of samples after which a union counts as without outer surface [-]: as many as a surface needs of which
     one in 200 points is outer."""
-    area_samples: int = 20_000
+    area_samples: Count = 20_000
     """Samples from which the area of a union is estimated [-], to about 1 %."""
 
 

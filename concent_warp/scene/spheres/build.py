@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
 
+from concent_warp.checks import Bounds, Share, check_settings
 from concent_warp.errors import ModelError, SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
@@ -34,39 +35,34 @@ class ContactGeometryCfg:
         64
     """
 
-    count: int = 512
+    count: Annotated[int, Bounds(1, 100_000)] = 512
     """Spheres of all objects together. More follow the shape more closely and cost simulation time."""
     split: Literal["area", "equal"] = "area"
     """Share of each object: in proportion to its surface area (the same spacing everywhere), or the same number."""
-    counts: Mapping[str, int] = field(default_factory=dict)
+    counts: Mapping[str, Annotated[int, Bounds(1, 100_000)]] = field(default_factory=dict)
     """Number of spheres by body name; the bodies not named share what is left of `count`."""
     placement: Literal["inset", "surface"] = "inset"
     """Spheres within the object, or centred on its surface as in the paper (which inflates it by the radius)."""
-    radius: float | Literal["auto"] = 0.004
+    radius: Annotated[float, Bounds(0, 10, above_low=True)] | Literal["auto"] = 0.004
     """Radius [m]; "auto" makes it half the mean spacing of the object's spheres, so that neighbours touch."""
     thin: Literal["shrink", "refuse"] = "shrink"
     """Where an object is thinner than an inset sphere: make the sphere as large as fits, or raise an error."""
-    friction: float | None = None
+    friction: Annotated[float, Bounds(0, 100)] | None = None
     """Sliding friction coefficient [-]; None takes it from the nearest geom of the body."""
-    min_radius_share: float = 0.05
+    min_radius_share: Share = 0.05
     """Share of the radius below which a shrunk sphere, at a sharp edge, is not a candidate [-]: smaller ones add
     nothing to the shape. Empirical."""
     inset: InsetCfg = field(default_factory=InsetCfg)
     """How inset spheres are moved into the object."""
     mass: MassSplitCfg = field(default_factory=MassSplitCfg)
     """How the mass of a body is split over its spheres."""
-    candidates: int = 20_000
+    candidates: Annotated[int, Bounds(1, 10_000_000)] = 20_000
     """Surface points of each object to choose from."""
     seed: int = 0
     """Seed of the surface points."""
 
     def __post_init__(self) -> None:
-        if self.radius != "auto" and not 0 < self.radius < np.inf:
-            raise ModelError("contact geometry: the radius is not right", expected="> 0 m", found=self.radius)
-        if self.friction is not None and not 0 <= self.friction < np.inf:
-            raise ModelError("contact geometry: the friction is not right", expected=">= 0", found=self.friction)
-        if self.count < 1 or any(n < 1 for n in self.counts.values()):
-            raise ModelError("contact geometry: the number of spheres is not right", expected="at least 1 an object")
+        check_settings(self, ModelError)
 
     def build(
         self,

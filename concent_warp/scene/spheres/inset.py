@@ -8,9 +8,11 @@ enough. Where the object is thinner than the sphere there is no such centre, and
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from concent_warp.checks import Bounds
 from concent_warp.scene.shapes.surface import Surface
 
 
@@ -18,11 +20,11 @@ from concent_warp.scene.shapes.surface import Surface
 class InsetCfg:
     """How sphere centres are moved into an object."""
 
-    radius_steps: int = 6
+    radius_steps: Annotated[int, Bounds(1, 10_000)] = 6
     """Steps from radius 0 to the wanted one [-]: so that no centre passes through a thin wall."""
-    max_moves: int = 16
+    max_moves: Annotated[int, Bounds(1, 10_000)] = 16
     """Moves after which a centre that is still too near a face counts as without room [-]. Empirical."""
-    bisections: int = 10
+    bisections: Annotated[int, Bounds(0, 100)] = 10
     """Bisection steps towards the largest radius that fits where the wanted one does not [-]: to a thousandth."""
     overshoot: tuple[float, float] = (1e-9, 1e-3)
     """Depth that a move exceeds the wanted one by, relative to it, in the first and the second half of the moves [-]:

@@ -13,9 +13,11 @@ simulation: a body keeps the explicit inertia of its scene, whatever its spheres
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from concent_warp.checks import Bounds, OpenShare, Positive
 from concent_warp.errors import ModelError
 
 
@@ -23,15 +25,15 @@ from concent_warp.errors import ModelError
 class MassSplitCfg:
     """Settings of the quadratic programme."""
 
-    tolerance: float = 1e-9
+    tolerance: Positive = 1e-9
     """Residual of the scaled equations below which they hold [-]: above the rounding of float64."""
-    softness: float = 1e-6
+    softness: Positive = 1e-6
     """Inverse weight of equations that need only hold nearly [-]: small against 1, large against rounding."""
-    max_steps: int = 200
+    max_steps: Annotated[int, Bounds(1, 100_000)] = 200
     """Most Newton steps [-]; a few dozen are usual."""
-    min_step_length: float = 1e-8
+    min_step_length: Positive = 1e-8
     """Length of a damped Newton step below which the equations count as without solution [-]."""
-    sufficient_decrease: float = 1e-4
+    sufficient_decrease: OpenShare = 1e-4
     """Share of the linearly predicted decrease that a step must reach [-] (Armijo; Nocedal and Wright, "Numerical
     Optimization", section 3.1)."""
 
