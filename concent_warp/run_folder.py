@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shlex
 import shutil
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from concent_warp.errors import ConcentError, TrainError
-from concent_warp.files import NotWrittenError, claim, write_text
+from concent_warp.files import NotWrittenError, claim, not_written, write_text
 from concent_warp.version import __version__
 
 SETTINGS = "settings.toml"
@@ -36,6 +37,8 @@ STATES = ("checkpoint.*", f"{EPISODES}/{6 * '[0-9]'}", f"{EPISODES}/dropped-*", 
 """Patterns of the files from which a run is resumed: of fits and trainings, and of data sets."""
 FREE = ("out", "resume", "overwrite", "engine", "recording", "model", "scene")
 """Settings that may differ when a run is continued: paths, and those without influence on the result."""
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of the system where a disk, the share of a user, or a file is full."""
 INVOCATION: ContextVar[tuple[str, ...]] = ContextVar("INVOCATION", default=())
 """The command that is running and its arguments."""
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "numpy", "scipy")
@@ -139,6 +142,10 @@ class RunFolder:
                 shutil.rmtree(self.path, ignore_errors=True)
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(self._interrupted()) from None
+        if isinstance(error, OSError) and error.errno in FULL:
+            error = not_written(Path(error.filename or self.path), error)
+            if not self.can_be_resumed():
+                raise error from None
         if isinstance(error, NotWrittenError) and self.can_be_resumed():
             said = f"{str(error).rstrip('.')}; the state is saved, continue with `{resuming_command()}`"
             raise NotWrittenError(said) from None

@@ -89,19 +89,29 @@ class DatasetFilming:
     def end(self, world: int, *, keep: bool, success: bool = True) -> None:
         """End the episode of a world, and keep it or not; `success` is whether the task succeeded."""
         key, episode, film = self._open.pop(world)
-        if film is not None and self._films is not None:
-            film.close()
-            self._unfinished(key).replace(self._films / f"episode_{key:06d}.mp4")
         if keep:
             try:
+                self._end_film(key, film)
                 episode.save(success=success)
             except OSError:  # as on a full disk
                 episode.discard()
                 raise
             self.kept += 1
         else:
+            self._end_film(key, film)
             episode.drop()
             self.dropped += 1
+
+    def _end_film(self, key: int, film: VideoWriter | None) -> None:
+        """Close the video of an episode, if there is one, and give it its name."""
+        if film is None or self._films is None:
+            return
+        try:
+            film.close()
+            self._unfinished(key).replace(self._films / f"episode_{key:06d}.mp4")
+        except OSError:
+            self._unfinished(key).unlink(missing_ok=True)
+            raise
 
     def leave(self) -> None:
         """Discard the episodes that have not ended."""

@@ -34,7 +34,7 @@ from concent_warp.fit.geometry.checkpoint import Checkpoint
 
 TRIES = 5
 """Most starts of a trial: a run that has ended before its moment is started again, to be killed earlier."""
-TORCHRUN = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0")
+TORCHRUN = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone")
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def render(
     check_settings(cfg, RenderError)
     check_device(device)
     if cfg.figure is not None:
-        claim_file(cfg.figure, overwrite=overwrite)
+        claim_file(cfg.figure, overwrite=overwrite or resume)
     _check_replaced(out, overwrite=overwrite)
     with run_folder(out, overwrite=overwrite, resume=resume, keep_folders=False) as claimed:
         to = Destination(claimed.path, cfg, format, device, resume)

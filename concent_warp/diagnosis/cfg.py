@@ -169,7 +169,8 @@ class FailureCfg:
     max_forces: int = 3
     """Most unexplained forces that are listed."""
     max_seconds: float = 60.0
-    """Longest search for unexplained forces [s]; never longer than the diagnosis itself took."""
+    """Longest search for unexplained forces [s]; the forces are left out where it takes longer. No share of the time
+    that the diagnosis takes: one that is resumed takes less, and gives the same result."""
     forces: LocateForcesCfg = field(default_factory=LocateForcesCfg)
     """Settings of the search for unexplained forces."""
 

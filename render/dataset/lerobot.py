@@ -269,7 +269,8 @@ class LeRobotEpisode:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        self._close()
+        for video in self._videos.values():
+            video.close()
         state, action = np.stack(self._state), np.stack(self._action)
         time = np.arange(len(state), dtype=np.float32) / np.float32(self._writer.layout.rate)
         columns = {"observation.state": _fixed(state), "action": _fixed(action), "timestamp": pa.array(time)}
@@ -288,20 +289,19 @@ class LeRobotEpisode:
 
     def drop(self) -> None:
         """See `EpisodeWriter.drop`."""
-        self._close()
+        self._abandon()
         self._writer._staging.drop(self._key)
         self._writer.staged(self._key, dropped=True)
 
     def discard(self) -> None:
         """See `EpisodeWriter.discard`."""
-        self._close()
+        self._abandon()
         self._writer._staging.discard(self._key)
 
-    def _close(self) -> None:
-        """Close the videos; those without frames have nothing to be closed with."""
-        if self._state:
-            for video in self._videos.values():
-                video.close()
+    def _abandon(self) -> None:
+        """Close the videos, which are to be removed."""
+        for video in self._videos.values():
+            video.abandon()
 
 
 def _fixed(values: np.ndarray) -> pa.Array:

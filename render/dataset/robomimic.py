@@ -15,7 +15,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from concent_warp.hdf5_output import DiskFile, new_hdf5
+from concent_warp.files import DiskFile
+from concent_warp.hdf5_output import new_hdf5
 from concent_warp.render.dataset.layout import EpisodeLayout, Staging
 
 NAME = "dataset.hdf5"

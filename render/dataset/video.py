@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from concent_warp.files import DiskFile
+
 Codec = Literal["h264", "av1"]
 ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     # A key frame every second frame lets readers that pick frames at random decode little, as LeRobot has it.
@@ -34,7 +36,8 @@ class VideoWriter:
         import av
 
         name, options = ENCODERS[codec]
-        self._container = av.open(str(path), "w", format="mp4")
+        self._disk = DiskFile(path)
+        self._container = av.open(self._disk, "w", format="mp4")
         stream: Any = self._container.add_stream(name, rate=rate, options=options)
         stream.height, stream.width = size
         stream.pix_fmt = PIXELS
@@ -42,11 +45,16 @@ class VideoWriter:
         self._stream = stream
 
     def add(self, image: np.ndarray) -> None:
-        """Add a frame, shape (H, W, 3) uint8."""
+        """Add a frame, shape (H, W, 3) uint8.
+
+        Raises:
+            OSError: The file cannot be written, as on a full disk.
+        """
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         self._container.mux(self._stream.encode(frame))
+        self._disk.check()
 
     def abandon(self) -> None:
         """Close a discarded file; it may have no frames."""
@@ -56,11 +64,19 @@ class VideoWriter:
             self._container.close()
         except FFmpegError:  # without frames there is no stream to end
             return
+        finally:
+            self._disk.close()
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write what is left and close the file.
+
+        Raises:
+            OSError: The file cannot be written, as on a full disk.
+        """
         self._container.mux(self._stream.encode(None))
         self._container.close()
+        self._disk.close()
+        self._disk.check()
 
 
 def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: Path) -> None:
@@ -71,10 +87,13 @@ def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: P
         lengths: Frames of each.
         rate: Frames a second.
         out: File to write.
+
+    Raises:
+        OSError: The file cannot be written, as on a full disk.
     """
     import av
 
-    with av.open(str(out), "w", format="mp4") as whole:
+    with DiskFile(out) as disk, av.open(disk, "w", format="mp4") as whole:
         stream: Any = None
         before = 0
         for path, length in zip(paths, lengths, strict=True):
@@ -92,3 +111,4 @@ def join_videos(paths: Sequence[Path], lengths: Sequence[int], rate: int, out: P
                     packet.stream = stream
                     whole.mux(packet)
             before += length
+    disk.check()

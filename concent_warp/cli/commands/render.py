@@ -59,7 +59,7 @@ def run(arguments: Arguments) -> Dataset:
             "there are no trained networks", where=arguments.cfg.networks, fix="train them with concent render-train"
         )
     if arguments.cfg.figure is not None:
-        claim_file(arguments.cfg.figure, overwrite=arguments.overwrite)
+        claim_file(arguments.cfg.figure, overwrite=arguments.overwrite or arguments.resume)
     if arguments.recording is not None:
         source = load_recording(arguments.recording)
         quiet_warp()
