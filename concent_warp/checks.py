@@ -68,18 +68,21 @@ class Bounds:
     """Whether the smallest value itself is excluded."""
     below_high: bool = False
     """Whether the largest value itself is excluded."""
+    excluded: float | None = None
+    """A value within that is not allowed."""
     ascending: bool = False
     """Whether the numbers of a tuple must not decrease."""
 
     def include(self, value: float) -> bool:
         """Return whether a number is within the bounds."""
         low = value > self.low if self.above_low else value >= self.low
-        return low and (value < self.high if self.below_high else value <= self.high)
+        return low and (value < self.high if self.below_high else value <= self.high) and value != self.excluded
 
     def sentence(self) -> str:
         """Return the bounds in words, such as "above 0 and at most 1"."""
         low, high = "above" if self.above_low else "at least", "below" if self.below_high else "at most"
-        return f"{low} {self.low:g} and {high} {self.high:g}"
+        but = "" if self.excluded is None else f", but not {self.excluded:g}"
+        return f"{low} {self.low:g} and {high} {self.high:g}{but}"
 
 
 NOT_NEGATIVE = Bounds()

@@ -56,6 +56,10 @@ def say_written(*paths: Path) -> None:
     out.print(Text("wrote ") + Text(printable(", ".join(map(str, paths))), style="bold"), soft_wrap=not out.is_terminal)
 
 
+CANCELLED = r"\d+ tasks which were still being processed by the workers have been cancelled"
+"""Warning of joblib after an interruption."""
+
+
 @contextmanager
 def one_line_warnings(command: str) -> Iterator[None]:
     """Show each warning of Python as one line, without the place in the code."""
@@ -67,7 +71,9 @@ def one_line_warnings(command: str) -> Iterator[None]:
 
     warnings.formatwarning = line
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", CANCELLED)
+            yield
     finally:
         warnings.formatwarning = before
 

@@ -203,7 +203,7 @@ class DiagnoseCfg:
     """Names of the effects to consider; all where empty."""
     window: PositiveDuration | None = None
     """Length of a window [s]; by default as long as the motion allows."""
-    jobs: Annotated[int, Bounds(-1, 4096)] = -1
+    jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time; -1: one per CPU. `joblib.parallel_config` selects another backend."""
     seed: int = 0
     """Seed of all random numbers."""

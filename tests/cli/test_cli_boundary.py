@@ -5,6 +5,9 @@ import re
 import signal
 import subprocess
 import sys
+import time
+from io import BytesIO, TextIOWrapper
+from pathlib import Path
 
 import pytest
 
@@ -101,6 +104,66 @@ def test_a_terminal_of_ascii_alone_gets_the_whole_table(bench):
     done = shell(command, PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
     assert (done.returncode, without_loading(done.stderr)) == (0, "")
     assert "block" in done.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_fails_where_its_help_cannot_be_written(command, monkeypatch, capsys):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main([command, "--help"]) == 2
+        monkeypatch.undo()
+    assert "No space left on device" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "stdout", None)
+    assert main([command, "--help"]) == 0
+    monkeypatch.setattr(sys, "stdout", text := TextIOWrapper(BytesIO(), encoding="ascii"))
+    assert main([command, "--help"]) == 0
+    assert text.buffer.getvalue().startswith(b"usage: concent")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+PARALLEL = """
+import sys, time
+import numpy as np
+import concent_warp.cli.entry as entry
+from concent_warp.diagnosis.tasks import TaskRunner
+
+def run(*_):
+    many = np.zeros(1_000_000)  # so large that joblib shares them through a file
+    for found in TaskRunner(2).results(time.sleep, [(0.0,), (0.0,)]):
+        pass
+    for found in TaskRunner(2).results(pause, [(many, 0.0), (many, 60.0), (many, 60.0)]):
+        print("running", flush=True)
+
+def pause(many, seconds):
+    time.sleep(seconds)
+
+entry._run = run
+sys.exit(entry.main(["diagnose"]))
+"""
+
+
+def test_termination_leaves_no_files_of_parallel_processes(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", PARALLEL],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "running\n"
+
+    def shared():
+        return [path for folder in (Path("/dev/shm"), tmp_path) for path in folder.glob(f"*{process.pid}*")]
+
+    assert any("joblib" in path.name for path in shared())
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert err == "\nconcent diagnose: terminated.\n"
+    end = time.monotonic() + 20
+    while shared() and time.monotonic() < end:
+        time.sleep(0.1)
+    assert shared() == []
 
 
 SLEEPING = """

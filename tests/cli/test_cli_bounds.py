@@ -149,6 +149,10 @@ LINES = [
     ("record --reality.sensing.image-size 0 128", "--reality.sensing.image-size is out of bounds"),
     ("diagnose demo.h5 --window 0", "--window is out of bounds; expected above 0"),
     ("diagnose demo.h5 --jobs -2", "--jobs is out of bounds; expected at least -1"),
+    (
+        "diagnose demo.h5 --jobs 0",
+        "--jobs is out of bounds; expected at least -1 and at most 4096, but not 0",
+    ),
     ("locate demo.h5 --window -1", "--window is out of bounds; expected above 0"),
     ("add joint_friction --model m.toml --fit demo.h5 --window nan -o x.toml", "--window is not a number"),
     ("compare demo.h5 --places -1", "--places is out of bounds"),

@@ -61,7 +61,7 @@ class Arguments:
     """Let fits of friction, mass and contact stiffness start from where gradients through Newton lead, where that is
     better; needs contact geometry and observed objects."""
     engine: EngineOption = "mujoco"
-    jobs: Annotated[int, Bounds(-1, 4096)] = -1
+    jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time; -1: one a CPU."""
     seed: int = 0
     """Seed of all random numbers."""
