@@ -12,6 +12,7 @@ import numpy as np
 from concent_warp.checks import check_settings
 from concent_warp.comparison.bootstrap import BootstrapCfg
 from concent_warp.comparison.contact_names import ContactPartners
+from concent_warp.comparison.initial_states import with_initial_states
 from concent_warp.comparison.phases import MotionPhaseCfg, Phase, StageLike, has_task, phases_by_body, stage_phases
 from concent_warp.comparison.residuals import ResidualCfg, instrument_noise, residuals
 from concent_warp.comparison.result import Comparison
@@ -103,7 +104,8 @@ def compare(
     remarks: tuple[str, ...] = ()
     if events is None and cfg.phases == "auto" and named:
         try:
-            events = extract_events(list(named.values())[-1], chosen, engine=engine)
+            last = list(named.values())[-1]
+            events = extract_events(last, with_initial_states(last, chosen, engine), engine=engine)
         except EventsError as error:
             remarks = (f"No contact stages: {error}",)
     stages = {name: sequence.stages for name, sequence in (events or {}).items()}
@@ -175,7 +177,7 @@ def compare_replays(
         simulator = make_engine(engine, model)
         compiled = model.compile()
         noise = instrument_noise(compiled, recording.demonstrations)
-        for d in chosen:
+        for d in with_initial_states(model, replace(recording, demonstrations=chosen), engine).demonstrations:
             rollout = replay(model, d, simulator, contacts="all" if name == last else "none").numpy()
             found[name, d.name] = residuals(compiled, rollout, d, noise, model.effects, residual_cfg)
             if rollout.diverged[0]:

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from concent_warp.checks import Count
-from concent_warp.comparison.noise_ratio import rms_noise
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.noise import Noise, Source, channel_noise, pooled_noise
+from concent_warp.estimation.noise_ratio import rms_noise
 from concent_warp.estimation.rotations import (
     continuous_quaternions,
     rotation_between,

@@ -11,13 +11,13 @@ import numpy as np
 
 from concent_warp.comparison.bootstrap import BootstrapCfg, effective_count, mean_interval
 from concent_warp.comparison.html import comparison_html
-from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import FREE, Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.units import ratio_text, unit_text, value_text
 from concent_warp.comparison.worst_spans import WorstSpan, WorstSpanCfg
 from concent_warp.errors import ModelError, RecordingError
 from concent_warp.estimation.noise import Source
+from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
 
@@ -50,7 +50,7 @@ class Summary:
     noise: float | None
     """Root mean square error that the measurement noise alone leaves; None where it is not known."""
     ratio: float | None
-    """Root mean square error over `noise` [-] ("x noise", see `concent_warp.comparison.noise_ratio`)."""
+    """Root mean square error over `noise` [-] ("x noise", see `concent_warp.estimation.noise_ratio`)."""
     source: Source
     """Where the noise is from."""
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from concent_warp.checks import Count, Share
 from concent_warp.comparison.contact_names import ContactPartners
-from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.comparison.phases import Phase
 from concent_warp.comparison.residuals import Residual
 from concent_warp.comparison.units import channel_text, ratio_text, unit_text, value_text
+from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.events.filter import true_runs
 
 AXES = "xyz"

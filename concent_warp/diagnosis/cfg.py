@@ -40,10 +40,12 @@ class SearchCfg:
     over the noise standard deviation [-].
     """
 
-    quiet_quantile: Share = 0.25
-    """Quantile of the blocks' RMS residuals that bounds an estimated noise from below [-]. Empirical."""
-    quiet_state_iterations: int = 3
-    """Iterations of the initial states in the fit from which that quantile is taken. Empirical."""
+    far_ratio: Positive = 20.0
+    """Noise ratio of the model as given beyond which the search begins with shorter windows [-]: over long ones, a
+    motion so far off is no longer in proportion to an effect's size, and fits end in local minima. Empirical."""
+    coarse_windows: tuple[PositiveDuration, ...] = (2.0, 0.5)
+    """Lengths of these windows [s], the first that reduces the noise ratio below `far_ratio`, else the last.
+    Empirical."""
     max_state_offset: float = 1.0
     """Largest fitted error of an initial state, in units of its standard deviation, up to which sensitivities are taken
     at the fitted states alone and not at the measured ones too: 1 sigma."""
@@ -196,6 +198,8 @@ class DiagnoseCfg:
     """Most effects that are added."""
     adequate_ratio: float = 1.25
     """RMS residual over noise up to which a model explains the data [-]. Empirical."""
+    adequate_channel_ratio: Positive = 1.5
+    """The same of each channel alone [-]: many good channels do not outweigh one that the model misses. Empirical."""
     null_samples: Annotated[int, Bounds(1, 1_000_000)] = 400
     """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
     p-value is 1 / (null_samples + 1)."""

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import mujoco
 import numpy as np
 
 from concent_warp.diagnosis.cfg import CheckDataCfg
+from concent_warp.estimation.noise import Noise
+from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.recording.recording import Recording
 
 
@@ -47,3 +52,23 @@ def _is_white(values: np.ndarray, cfg: CheckDataCfg) -> bool:
     moving = variance > 0
     step = np.mean(np.diff(values, axis=0) ** 2, axis=0)
     return bool(moving.any() and (step[moving] > 2 * cfg.white_noise_ratio * variance[moving]).all())
+
+
+def noise_remarks(m: mujoco.MjModel, noises: Mapping[str, Noise]) -> list[str]:
+    """Return a sentence on the channels whose noise is not stated, with what was estimated; none where all is stated.
+
+    Args:
+        m: The compiled model.
+        noises: Noise of each channel.
+    """
+    said = []
+    for channel, noise in noises.items():
+        unit = kind_and_unit(m, m.sensor(channel).id)[1]
+        if noise.source == "unknown":
+            said.append(f"{channel} (the readings do not tell)")
+        elif noise.source != "stated":
+            said.append(f"{channel} {noise.std:.2g} {unit} [{noise.low:.2g}, {noise.high:.2g}]".replace(" -", ""))
+    if not said:
+        return []
+    shown = ", ".join(said[:4]) + (f" and {len(said) - 4} more" if len(said) > 4 else "")
+    return [f"Noise that is not stated was estimated from the readings alone: {shown}. State it where it is known."]

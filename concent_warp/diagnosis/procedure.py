@@ -14,30 +14,36 @@ from typing import Any
 
 import numpy as np
 
+from concent_warp.comparison.residuals import instrument_noise
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.check_data import check_data
+from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, Verdict
+from concent_warp.diagnosis.search.adequacy import is_adequate
 from concent_warp.diagnosis.search.baseline import (
     add_candidate,
     fit_baseline,
-    quiet_noise_ratios,
     refit_from_rivals,
     refit_without_effect,
 )
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.candidates import candidates
-from concent_warp.diagnosis.search.evidence import assess, detectable_size
+from concent_warp.diagnosis.search.evidence import assess, detectable_size, profile_widening
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
 from concent_warp.diagnosis.search.gradient_start import GradientStarts
 from concent_warp.diagnosis.search.grouping import group_indistinguishable
+from concent_warp.diagnosis.search.joint_fit import (
+    joint_finding,
+    joint_parameters,
+    refit_jointly,
+    with_intervals,
+)
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.effects.effect import Effect
-from concent_warp.estimation.noise import UNDERESTIMATE
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
 from concent_warp.fit.effects.observation import Window
@@ -72,7 +78,9 @@ class Procedure:
         self.groups: list[tuple[str, ...]] = []
         self.hypotheses: list[dict[str, Model]] = []
         self.gradient = GradientStarts(model, recording) if cfg.gradient else None
+        self.widening: dict[int, np.ndarray] = {}
         self.noise: dict[str, float] = {}
+        self.noise_factors: dict[str, float] = {}
 
     def run(self) -> Diagnosis:
         """Return the diagnosis."""
@@ -81,10 +89,31 @@ class Procedure:
 
     def _run(self) -> Diagnosis:
         cfg, runner = self.cfg, self.runner
-        issues = check_data(self.recording, cfg.data)
+        noises = instrument_noise(self.model.compile(), self.recording.demonstrations)
+        self.noise_factors = {channel: noise.factor for channel, noise in noises.items()}
+        issues = [*check_data(self.recording, cfg.data), *noise_remarks(self.model.compile(), noises)]
         runner.progress(0.0, "cutting windows")
         fitted, detectable = [self.baseline()], ()
-        for step in range(cfg.max_additions):
+        if (coarse := self.coarse_baseline(fitted[0])) is not None:
+            found, detectable = self.add_effects([coarse], detectable)
+            fitted += [self._refitted(one.model, fitted[0].windows) for one in found[1:]]
+        fitted, smallest = self.add_effects(fitted, detectable)
+        detectable = detectable or smallest
+        fitted = self.final_values(self.remove_superfluous(fitted))
+        runner.progress(1.0, "done")
+        return self.conclude(fitted, detectable, issues)
+
+    def add_effects(
+        self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
+    ) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
+        """Return the fitted models with one more for each effect that is added, and the detectable sizes of all.
+
+        Args:
+            fitted: The model as given and after earlier additions.
+            detectable: Smallest detectable sizes as far as they are known.
+        """
+        cfg, runner, fitted = self.cfg, self.runner, list(fitted)
+        for step in range(len(fitted) - 1, cfg.max_additions):
             if step and fitted[-1].ratio ** 2 < 1 + cfg.min_gain:
                 break  # the residual beyond the noise is less than an effect must remove
             runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
@@ -93,36 +122,35 @@ class Procedure:
             if best is None:
                 break
             fitted.append(add_candidate(fitted[-1], best))
-        fitted = self.remove_superfluous(fitted)
-        runner.progress(1.0, "done")
-        return self.conclude(fitted, detectable, issues)
+        return fitted, detectable
+
+    def coarse_baseline(self, base: FittedModel) -> FittedModel | None:
+        """Return the model as given over shorter windows where it is far off over its own, None where it is not."""
+        search, found = self.cfg.search, None
+        if base.ratio <= search.far_ratio:
+            return None
+        for length in search.coarse_windows:
+            if max(w.end - w.start for w in base.windows) < 2 * length:
+                continue
+            found = self._refitted(base.model, self._windows(base.model, length))
+            if found.ratio <= search.far_ratio:
+                break
+        return found
+
+    def _refitted(self, model: Model, windows: Sequence[Window]) -> FittedModel:
+        """Return a model with its own parameters and the initial states fitted to some windows."""
+        fits = self.cfg.fits
+        return fit_baseline(model, windows, cut_blocks(windows, fits.blocks), self.engine, cfg=fits)
 
     def baseline(self) -> FittedModel:
-        """Return the model as given, with its own parameters and the initial states fitted.
-
-        Noise that is estimated and not stated is increased where the blocks that the model explains best show more:
-        filtered readings have less noise between neighbours than over time.
-        """
-        noise = channel_noises(self.model, self.recording, self.cfg.fits.observation)
-        recorded = [d.measured for d in self.recording.demonstrations]
-        stated = {c for c in noise if all(m[c].noise_std for m in recorded if c in m)}
-        if stated >= set(noise):
-            return self._fitted_baseline(noise)
-        search = self.cfg.search
-        rough = self._fitted_baseline(noise, search.quiet_state_iterations)
-        ratios = quiet_noise_ratios(rough, search.quiet_quantile)
-        larger = {c: r for c, r in ratios.items() if c not in stated and r > UNDERESTIMATE}
-        return self._fitted_baseline({c: std * larger.get(c, 1.0) for c, std in noise.items()})
-
-    def _fitted_baseline(self, noise: Mapping[str, float], state_iterations: int | None = None) -> FittedModel:
-        """Return the model as given, fitted to readings of some noise."""
-        self.noise, fits = dict(noise), self.cfg.fits
+        """Return the model as given, with its own parameters and the initial states fitted."""
+        fits = self.cfg.fits
+        self.noise = channel_noises(self.model, self.recording, fits.observation)
         windows = self._windows(self.model, self.cfg.window)
         self.runner.progress(0.03, "fitting the model as given")
         given = Prediction(self.model, (), windows, engine=self.engine, cfg=fits.prediction)
         check_finite(given, self.model.scene.source)
-        blocks = cut_blocks(windows, fits.blocks)
-        return fit_baseline(self.model, windows, blocks, self.engine, state_iterations=state_iterations, cfg=fits)
+        return self._refitted(self.model, windows)
 
     def _windows(self, model: Model, length: float | None) -> Sequence[Window]:
         """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None."""
@@ -161,7 +189,7 @@ class Procedure:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         group = group_indistinguishable(base, accepted, finding, self.runner, cfg)
-        self._record(group, findings)
+        self._record(base, group, findings)
         return group[0][0], smallest
 
     def _screened(self, base: FittedModel, effects: Sequence[Effect]) -> list[ScreenedCandidate]:
@@ -170,11 +198,14 @@ class Procedure:
         screened = self.runner.run(screen, [(base, e, self.cfg.search) for e in effects], "screening", span)
         return self.gradient.apply(base, screened, self.runner) if self.gradient else screened
 
-    def _record(self, group: Sequence[tuple[FittedCandidate, Finding]], findings: Sequence[Finding]) -> None:
-        """Keep the findings of an addition, the accepted one first, and its group."""
+    def _record(
+        self, base: FittedModel, group: Sequence[tuple[FittedCandidate, Finding]], findings: Sequence[Finding]
+    ) -> None:
+        """Keep the findings of an addition to a fitted model, the accepted one first, and its group."""
         updated = {f.name: f for _, f in group}
         self.groups.append(tuple(updated))
         self.hypotheses.append({f.name: c.model for c, f in group})
+        self.widening[group[0][1].step] = profile_widening(base, group[0][0])
         first = group[0][1]
         rest = [f for f in (updated.get(f.name, f) for f in findings) if f is not first]
         self.findings.append(first)
@@ -211,6 +242,25 @@ class Procedure:
         self.groups = [group for group in self.groups if group]
         return fitted
 
+    def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
+
+        The gain of each effect is then that over the same model without it.
+        """
+        accepted = sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
+        if not accepted:
+            return fitted
+        self.runner.progress(self.runner.share, "fitting all effects together")
+        last = refit_jointly(fitted[-1])
+        owned = len(last.model.effects) - len(accepted)
+        widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
+        parameters = joint_parameters(last, widening)
+        for k, f in enumerate(accepted):
+            without = fitted[0] if len(accepted) == 1 else refit_without_effect(last, owned + k)
+            final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
+            self.findings[self.findings.index(f)] = final
+        return [*fitted[:-1], with_intervals(last, parameters)]
+
     def conclude(
         self, fitted: Sequence[FittedModel], detectable: tuple[Detectable, ...], issues: Sequence[str]
     ) -> Diagnosis:
@@ -224,9 +274,12 @@ class Procedure:
         cfg, first, last = self.cfg, fitted[0].ratio, fitted[-1].ratio
         beyond = max(first**2 - 1.0, 1e-9)
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > cfg.adequate_ratio else 0.0
-        unknown = unknown_force(fitted, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs))
+        adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
+        unknown = None
+        if adequate:
+            unknown = unknown_force(fitted, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs))
         verdict: Verdict = "none_needed"
-        if last > cfg.adequate_ratio or unknown is not None:
+        if not adequate or unknown is not None:
             verdict = "none_of_these"
         elif len(fitted) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"

@@ -1,21 +1,24 @@
 """Measurement noise of a channel: as its instrument states it, else estimated from the readings themselves.
 
-Three estimates, the first that applies. At rest: the scatter about the mean of stretches in which nothing moves, which
-sees slow noise too. From differences: the third difference of independent noise has 20 times its variance, and smooth
-motion leaves little there; noise that is correlated from sample to sample leaves little there too, so that the
-estimate can be `UNDERESTIMATE` times too small. Neither falls below what the resolution of the readings leaves, a
-step / sqrt(12).
+The model plays no part. Two estimates, the first that applies. At rest: the scatter about the mean of stretches in
+which nothing moves, which sees slow noise too. From differences: the third difference of independent noise has 20 times
+its variance at every lag (of first differences: von Neumann, "Distribution of the ratio of the mean square successive
+difference to the variance", Ann. Math. Stat. 12, 1941), that of a smooth motion grows with the sixth power of the lag,
+and that of noise which is correlated over some samples grows slowly until the lag exceeds its correlation time. The
+noise is read off at the largest lag before the motion takes over; what is left open between it and the motion is the
+interval. Neither estimate falls below what the resolution of the readings leaves, a step / sqrt(12).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from concent_warp.checks import MAX_COUNT, Bounds, Count
+from concent_warp.checks import MAX_COUNT, Bounds, Count, Factor, Share
 from concent_warp.estimation.rotations import rotation_vectors
 from concent_warp.estimation.sensors import Kind
 
@@ -24,12 +27,10 @@ if TYPE_CHECKING:
 
 Source = Literal["stated", "rest", "differences", "resolution", "points", "unknown"]
 """Where a noise figure is from."""
-UNDERESTIMATE = 1.8
-"""By how much differences underestimate strongly autocorrelated noise."""
 WORDS: dict[Source, str] = {
     "stated": "stated in the recording",
     "rest": "estimated where nothing moves",
-    "differences": f"estimated from sample-to-sample differences, up to {UNDERESTIMATE:g} x too small if it is slow",
+    "differences": "estimated from differences between samples",
     "resolution": "from the resolution of the readings",
     "points": "estimated from the scatter of the first sightings of each point",
     "unknown": "not known",
@@ -49,6 +50,14 @@ class NoiseCfg:
     """Largest scatter of a window at rest, and difference of its halves, over the noise seen in differences [-]."""
     min_readings: Count = 8
     """Fewest readings from which noise is estimated."""
+    lags: tuple[Count, ...] = (1, 2, 4, 8, 16)
+    """Lags of the third differences [samples]; each twice the one before."""
+    max_growth: Factor = 2.0
+    """Growth of the differences from one lag to the next up to which they count as noise [-]: 1 for independent noise,
+    1.4 for noise that is slow against both lags, 8 for smooth motion."""
+    max_share: Share = 0.05
+    """Share of the standard deviation of a channel up to which differences over more than one sample may be noise [-]:
+    differences over a good part of a period of the motion grow no more, and are no noise."""
     rounding: float = 1e-9
     """Scatter below this share of the largest reading is rounding, as of simulated readings without noise [-]."""
 
@@ -62,11 +71,26 @@ class Noise:
     a component of the quaternion. NaN where the readings do not determine it."""
     source: Source
     """Where it is from."""
+    low: float = np.nan
+    """Lower end of a 95 % interval; `std` where it is stated, 0 where the readings show no noise beside the motion."""
+    high: float = np.nan
+    """Upper end: noise that is slow against the sampling may be as large, and not larger."""
+
+    def __post_init__(self) -> None:
+        """Fill in the interval of a value that is exact."""
+        for name in ("low", "high"):
+            if np.isnan(getattr(self, name)):
+                object.__setattr__(self, name, self.std)
 
     @property
     def words(self) -> str:
         """Where it is from, in words."""
         return WORDS[self.source]
+
+    @property
+    def factor(self) -> float:
+        """By how much the noise may be larger than `std` [-]."""
+        return max(self.high / self.std, 1.0) if np.isfinite(self.high) and self.std > 0 else 1.0
 
 
 def channel_noise(channel: Channel, kind: Kind, cfg: NoiseCfg | None = None) -> Noise:
@@ -97,13 +121,15 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
     pieces = [piece for c in channels for piece in _finite_pieces(c.value)]
     if sum(len(piece) for piece in pieces) < cfg.min_readings:
         return Noise(np.nan, "unknown")
-    fast = _difference_std(pieces, kind)
     floor = 0.0 if kind == "orientation" else _resolution(pieces) / np.sqrt(12)
-    found = Noise(fast, "differences")
+    found = _noise_in_differences(pieces, kind, cfg)
+    fast = _difference_std(pieces, kind, 1)
     if (rest := _rest_std(pieces, kind, max(fast, floor), cfg)) is not None:
-        found = Noise(max(rest, fast), "rest")
+        scatter, freedom = rest
+        std, error = max(scatter, fast), 2 / np.sqrt(2 * freedom)
+        found = Noise(std, "rest", std * (1 - error), std * (1 + error))
     if found.std < floor:
-        return Noise(floor, "resolution")
+        return Noise(floor, "resolution", floor, max(floor, found.high))
     size = max(float(np.abs(piece).max()) for piece in pieces)
     return found if found.std > cfg.rounding * size else Noise(np.nan, "unknown")
 
@@ -125,7 +151,11 @@ def _noise_of_components(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg)
     if not known:
         return Noise(np.nan, "unknown")
     largest = max(known, key=lambda noise: noise.std)
-    return Noise(float(np.sqrt(np.mean([noise.std**2 for noise in known]))), largest.source)
+    std, low, high = (
+        float(np.sqrt(np.mean([value**2 for value in values])))
+        for values in ([n.std for n in known], [n.low for n in known], [n.high for n in known])
+    )
+    return Noise(std, largest.source, low, high)
 
 
 def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:
@@ -137,25 +167,52 @@ def _finite_pieces(value: np.ndarray) -> list[np.ndarray]:
     return [value[rows] for rows in parts if len(rows) and bool(valid[rows].all())]
 
 
-def _difference_std(pieces: Sequence[np.ndarray], kind: Kind) -> float:
+def _noise_in_differences(pieces: Sequence[np.ndarray], kind: Kind, cfg: NoiseCfg) -> Noise:
+    """Return the noise per component seen in third differences over several lags.
+
+    Of two lags h and 2 h, noise s and smooth motion m h^3 leave s^2 = (64 v(h) - v(2 h)) / 63 of the variances v.
+    """
+    lags = [h for h in cfg.lags if sum(max(len(piece) - 3 * h, 0) for piece in pieces) >= cfg.min_readings]
+    values = [_difference_std(pieces, kind, h) for h in lags or cfg.lags[:1]]
+    std, low, high = values[0], 0.0, values[0]
+    most = cfg.max_share * _spread(pieces, kind)
+    for k, (near, far) in enumerate(pairwise(values)):
+        if far <= cfg.max_growth * near and near > 0 and (k == 0 or near <= most):
+            std = max(std, float(np.sqrt(max(64 * near**2 - far**2, 0.0) / 63)))
+            low, high = values[0], max(high, near, far if far <= most else near)
+    error = 2 / np.sqrt(sum(len(piece) for piece in pieces))
+    return Noise(std, "differences", max(low * (1 - error), 0.0), max(high, std) * (1 + error))
+
+
+def _spread(pieces: Sequence[np.ndarray], kind: Kind) -> float:
+    """Return the standard deviation of a component of readings about their mean, root mean square."""
+    centred = np.concatenate([_centred(piece, kind) for piece in pieces])
+    return float(np.sqrt(np.mean(centred**2)))
+
+
+def _difference_std(pieces: Sequence[np.ndarray], kind: Kind, lag: int) -> float:
     """Return the noise per component seen in third differences, by their median size, so that impacts count little.
 
     Third differences of independent noise have the variance 1 + 9 + 9 + 1 = 20. Of orientations the first difference
-    is the rotation vector from one reading to the next.
+    is the rotation vector from one reading to a later one.
     """
     third = []
     for piece in pieces:
-        if len(piece) > 3:
-            first = rotation_vectors(piece[:-1], piece[1:]) if kind == "orientation" else np.diff(piece, axis=0)
-            third.append(np.diff(first, n=2, axis=0))
+        if len(piece) > 3 * lag:
+            first = (
+                rotation_vectors(piece[:-lag], piece[lag:])
+                if kind == "orientation"
+                else np.asarray(piece[lag:] - piece[:-lag])
+            )
+            third.append(first[2 * lag :] - 2 * first[lag:-lag] + first[: -2 * lag])
     if not third:
         return np.nan
     spread = np.median(np.abs(np.concatenate(third)), axis=0) / 0.67449
     return float(np.sqrt(np.mean(spread**2) / 20))
 
 
-def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseCfg) -> float | None:
-    """Return the scatter about the mean of stretches of rest, None where there is none.
+def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseCfg) -> tuple[float, int] | None:
+    """Return the scatter about the mean of stretches of rest and its degrees of freedom, None where there is none.
 
     A window is at rest if it scatters, and its two halves differ, by no more than `cfg.rest_scatter` times `fast`.
     """
@@ -170,7 +227,7 @@ def _rest_std(pieces: Sequence[np.ndarray], kind: Kind, fast: float, cfg: NoiseC
             if end - start >= cfg.rest_windows and _is_still(stretch, cfg.rest_scatter * fast):
                 square += float((stretch**2).sum())
                 freedom += stretch.size - stretch.shape[1]
-    return float(np.sqrt(square / freedom)) if freedom else None
+    return (float(np.sqrt(square / freedom)), freedom) if freedom else None
 
 
 def _is_still(window: np.ndarray, limit: float) -> bool:

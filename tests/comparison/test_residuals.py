@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.comparison.noise_ratio import noise_ratio, rms_noise
 from concent_warp.comparison.residuals import _rms_mean_distance, residuals
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.noise_ratio import noise_ratio, rms_noise
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack
 from concent_warp.scene.scene import Scene

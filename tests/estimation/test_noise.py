@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
-from concent_warp.estimation.noise import UNDERESTIMATE, channel_noise, pooled_noise
+from concent_warp.estimation.noise import NoiseCfg, channel_noise, pooled_noise
 from concent_warp.recording.recording import Channel
 
 RATE = 100
@@ -41,12 +42,13 @@ def test_white_noise_on_motion_with_impacts_is_found_from_differences(seed):
     assert noise.std == pytest.approx(STD, rel=0.2)
 
 
-def test_slow_noise_is_found_at_rest_where_differences_miss_half_of_it():
+def test_slow_noise_is_found_at_rest_and_within_the_interval_of_differences():
     rng = np.random.default_rng(1)
     value = moving(rng, slow)
     moved = channel_noise(Channel(TIME, value), "position")
     assert moved.source == "differences"
-    assert STD / (1.3 * UNDERESTIMATE) < moved.std < STD / 1.3
+    assert 0.6 * STD < moved.std < 1.1 * STD
+    assert moved.low < STD < moved.high < 2 * STD
     value[300:] = value[300] + slow(rng, value[300:].shape)
     rested = channel_noise(Channel(TIME, value), "position")
     assert rested.source == "rest"
@@ -106,3 +108,61 @@ def test_gaps_are_bridged_and_too_few_readings_have_no_information():
     few = channel_noise(Channel(TIME[:4], value[1:5]), "position")
     assert few.source == "unknown"
     assert np.isnan(few.std)
+
+
+def autoregressive(rng, shape, correlation):
+    found = np.zeros(shape)
+    for i in range(1, len(found)):
+        found[i] = correlation * found[i - 1] + np.sqrt(1 - correlation**2) * rng.normal(0, STD, shape[1:])
+    return found
+
+
+def filtered(rng, shape):
+    """Noise after a Butterworth low-pass at a tenth of the sampling rate."""
+    found = lfilter(*butter(2, 0.2), rng.normal(0, 1, shape), axis=0)
+    return STD * found / found.std()
+
+
+@pytest.mark.parametrize("rate", [200, 500, 1000])
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_is_correlated_over_samples_is_within_the_interval(rate, seed):
+    time = np.arange(0, 6, 1 / rate)
+    swing = 0.05 * np.sin(2 * np.pi * time[:, None] * [0.7, 1.1, 0.4] + [0, 1, 2])
+    for make, most in (
+        (white, 1.1),
+        (lambda rng, shape: autoregressive(rng, shape, 0.6), 1.2),
+        (lambda rng, shape: autoregressive(rng, shape, 0.9), 2.4),
+        (filtered, 1.3),
+    ):
+        rng = np.random.default_rng(seed)
+        noise = channel_noise(Channel(time, swing + make(rng, swing.shape)), "position")
+        assert noise.low <= noise.std <= noise.high
+        assert noise.low < STD < 1.35 * noise.high
+        assert STD / most < noise.std < 1.15 * STD
+        assert noise.factor == pytest.approx(noise.high / noise.std)
+
+
+def test_motion_without_noise_is_no_noise():
+    time = np.arange(0, 6, 0.01)
+    swing = 0.05 * np.sin(2 * np.pi * time[:, None] * [0.7, 1.1, 0.4])
+    noise = channel_noise(Channel(time, swing), "position")
+    assert noise.low == 0.0
+    assert noise.std < 1e-5
+    assert noise.high < 1.2 * noise.std
+    fast = channel_noise(Channel(time, np.sin(2 * np.pi * 9 * time[:, None])), "position")  # 11 samples a period
+    assert fast.low == 0.0
+    assert fast.std < 0.06
+
+
+def test_an_interval_that_is_not_given_is_the_value_itself():
+    noise = channel_noise(Channel(TIME, np.zeros((len(TIME), 3)), noise_std=0.01), "position")
+    assert (noise.low, noise.high, noise.factor) == (0.01, 0.01, 1.0)
+    assert channel_noise(Channel(TIME, np.zeros((len(TIME), 3))), "position").factor == 1.0
+
+
+def test_lags_are_settings():
+    rng = np.random.default_rng(0)
+    value = 0.01 * np.sin(TIME)[:, None] + autoregressive(rng, (len(TIME), 1), 0.6)
+    near = channel_noise(Channel(TIME, value), "position", NoiseCfg(lags=(1, 2)))
+    far = channel_noise(Channel(TIME, value), "position")
+    assert near.std < 0.75 * STD < far.std

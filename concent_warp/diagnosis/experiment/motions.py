@@ -96,7 +96,8 @@ class RecordedRange:
     def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the measured state of a demonstration; its initial one where it was not measured."""
         try:
-            return self.source.state(d, time)
+            found = self.source.state(d, time)
+            return found.qpos, found.qvel
         except RecordingError:
             return initial_state(self.m, d)
 

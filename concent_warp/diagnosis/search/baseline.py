@@ -24,7 +24,6 @@ def fit_baseline(
     blocks: Blocks,
     engine: EngineName = "mujoco",
     *,
-    state_iterations: int | None = None,
     cfg: EffectSolverCfg | None = None,
 ) -> FittedModel:
     """Fit a model's own parameters and the initial states of all windows.
@@ -34,20 +33,16 @@ def fit_baseline(
         windows: The measured windows.
         blocks: Blocks of time of the windows' residuals.
         engine: Which engine simulates.
-        state_iterations: Most iterations of the initial states; with fewer than by default, as the settings have it,
-            parameters get no second fit.
         cfg: Settings.
     """
     cfg = cfg or EffectSolverCfg()
-    enough = cfg.least_squares.initial_states.iterations
-    state_iterations = enough if state_iterations is None else state_iterations
     solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
     measured = [np.zeros(len(w.spread)) for w in windows]
-    fit = solver.fit(None, *solver.fit_initial_states(solver.p.start, measured, state_iterations))
-    if len(fit.values) and state_iterations >= enough:
+    fit = solver.fit(None, *solver.fit_initial_states(solver.p.start, measured))
+    if len(fit.values):
         fit = solver.polish(fit)
         model = solver.p.model(fit.values)
-    return _fitted_model(model, windows, blocks, fit, engine, cfg)
+    return fitted_model(model, windows, blocks, fit, engine, cfg)
 
 
 def refit_without_effect(last: FittedModel, effect: int) -> FittedModel:
@@ -55,12 +50,12 @@ def refit_without_effect(last: FittedModel, effect: int) -> FittedModel:
     model = replace(last.model, effects=tuple(a for i, a in enumerate(last.model.effects) if i != effect))
     solver = replace(last, model=model).solver()
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
-    return _fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
+    return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
 
 
 def add_candidate(base: FittedModel, added: FittedCandidate) -> FittedModel:
     """Return the baseline with the effect of a fitted candidate."""
-    return _fitted_model(added.model, base.windows, base.blocks, added.fit, base.engine, base.cfg)
+    return fitted_model(added.model, base.windows, base.blocks, added.fit, base.engine, base.cfg)
 
 
 def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> FittedModel:
@@ -70,26 +65,11 @@ def refit_from_rivals(base: FittedModel, rivals: Sequence[FittedCandidate]) -> F
     """
     solver = base.solver()
     fit = solver.improve_initial_states(base.fit, [c.fit.offsets for c in rivals])
-    found = _fitted_model(base.model, base.windows, base.blocks, fit, base.engine, base.cfg)
+    found = fitted_model(base.model, base.windows, base.blocks, fit, base.engine, base.cfg)
     return replace(found, limit=base.limit) if found.errors.sum() < base.errors.sum() else base
 
 
-def quiet_noise_ratios(base: FittedModel, quantile: float) -> dict[str, float]:
-    """Return the RMS residual over the noise of each channel in its quietest blocks [-].
-
-    Args:
-        base: The fitted model.
-        quantile: Quantile of the blocks' RMS residuals, 0..1.
-    """
-    blocks: dict[str, list[float]] = {}
-    for window, piece, rows in zip(base.windows, base.pieces, base.blocks.of_row, strict=True):
-        for r in window.readings:
-            square, block = piece.residual[r.rows] ** 2, rows[r.rows]
-            blocks.setdefault(r.channel, []).extend(float(np.sqrt(square[block == b].mean())) for b in np.unique(block))
-    return {channel: float(np.quantile(values, quantile)) for channel, values in blocks.items()}
-
-
-def _fitted_model(
+def fitted_model(
     model: Model, windows: Sequence[Window], blocks: Blocks, fit: Fit, engine: EngineName, cfg: EffectSolverCfg
 ) -> FittedModel:
     """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""

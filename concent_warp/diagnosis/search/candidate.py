@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.effects.effect import Effect
+from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected

@@ -13,7 +13,7 @@ from concent_warp.diagnosis.search.candidates import label
 from concent_warp.diagnosis.search.null_distribution import null_p_value
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, discretisation_errors
 
 
 def assess(
@@ -76,15 +76,21 @@ def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedPara
     formula = discretisation_errors(
         [prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :], base.cfg.discretisation_error
     )
-    found = []
-    for k in fresh:
-        p, value = prediction.parameters[k], float(c.fit.values[k])
-        reach = 1.96 * np.hypot(std[k] * p.scale, formula[k - prediction.owned])
-        low, high = max(value - reach, p.low), min(value + reach, p.high)
-        bound = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
-        at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bound)
-        found.append(FittedParameter(p.name, value, float(low), float(high), p.unit, p.null, at_bound))
-    return tuple(found)
+    reaches = [
+        NORMAL_QUANTILE * np.hypot(std[k] * prediction.parameters[k].scale, formula[k - prediction.owned])
+        for k in fresh
+    ]
+    return tuple(
+        FittedParameter.within(prediction.parameters[k], float(c.fit.values[k]), float(reach))
+        for k, reach in zip(fresh, reaches, strict=True)
+    )
+
+
+def profile_widening(base: FittedModel, c: FittedCandidate) -> np.ndarray:
+    """Return by how much a candidate's profile likelihood is wider than its linear fit, a factor a parameter (P,)."""
+    own = slice(base.prediction(c.effect).owned, None)
+    linear = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior)))[own]
+    return np.ones(len(linear)) if c.std is None else c.std[own] / linear
 
 
 def removed_by_channel(base: FittedModel, c: FittedCandidate) -> tuple[tuple[str, float], ...]:

@@ -40,7 +40,6 @@ def unknown_force(nodes: Sequence[FittedModel], cfg: DiagnoseCfg, results: Resul
 
     It is fitted to the residual of the last model, unless that is little more than noise; and, where several effects
     were added, to the residual before each of them but the first: there it must explain more than the effect does.
-    Where the last model leaves much more than noise, no such force is needed to show that something is missing.
 
     Args:
         nodes: The fitted model as given and those after each addition.
@@ -49,7 +48,7 @@ def unknown_force(nodes: Sequence[FittedModel], cfg: DiagnoseCfg, results: Resul
     """
     first, last, min_gain = nodes[0], nodes[-1], cfg.unknown_force.min_gain
     runs = all("mujoco" in added.effect.engines for added in last.model.effects)
-    if last.ratio > cfg.adequate_ratio or not runs:
+    if not runs:
         return None
     lacked = max(max(first.ratio, last.ratio) ** 2 - 1, min_gain)
     if last.ratio**2 >= 1 + min_gain and (found := _best_force(last, None, lacked, cfg, results)) is not None:

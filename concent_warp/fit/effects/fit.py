@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from concent_warp.checks import PositiveDuration, Share, check_settings
-from concent_warp.comparison.noise_ratio import noise_ratio
 from concent_warp.errors import ModelError
+from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, discretisation_errors
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
@@ -23,9 +23,6 @@ from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
-
-NORMAL_QUANTILE = 1.96
-"""Half width of a 95 % interval of the normal distribution, in standard deviations [-]."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 
+NORMAL_QUANTILE = 1.96
+"""Half width of a 95 % interval of the normal distribution, in standard deviations [-]."""
+
 
 @dataclass(frozen=True)
 class FittedParameter:
@@ -27,6 +30,14 @@ class FittedParameter:
     """Value at which the effect does nothing."""
     at_bound: bool = False
     """Whether it has run to a bound that is not the null value."""
+
+    @staticmethod
+    def within(p: Parameter, value: float, reach: float) -> FittedParameter:
+        """Return a parameter with the interval of a half width about its value, cut at its bounds."""
+        low, high = max(value - reach, p.low), min(value + reach, p.high)
+        bounds = [b for b in (p.low, p.high) if abs(b - p.null) > 1e-3 * p.scale]
+        at_bound = any(abs(value - b) < 1e-3 * p.scale for b in bounds)
+        return FittedParameter(p.name, value, float(low), float(high), p.unit, p.null, at_bound)
 
     @property
     def excludes_null(self) -> bool:

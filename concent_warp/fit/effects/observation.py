@@ -9,7 +9,7 @@ as in impacts and tumbling, it ends before they have grown much.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -17,6 +17,7 @@ import numpy as np
 
 from concent_warp.checks import Count, Positive, PositiveDuration
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.partial_state import PartialState, partial_state
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
@@ -42,6 +43,14 @@ class ObservationCfg:
     """Uncertainty of a position that no sensor measures [m or rad]. Empirical."""
     unmeasured_velocity: Positive = 1e-2
     """Uncertainty of a velocity that no sensor measures [m/s or rad/s]. Empirical."""
+    unknown_position: Positive = 0.1
+    """Uncertainty of a coordinate that was not measured of a free body of which others were [m]. Empirical."""
+    unknown_velocity: Positive = 0.5
+    """Uncertainty of its velocity [m/s]. Empirical."""
+    unknown_orientation: Positive = 0.3
+    """Uncertainty of an orientation that was not measured of a body whose position was [rad]. Empirical."""
+    unknown_spin: Positive = 3.0
+    """Uncertainty of its angular velocity [rad/s]. Empirical."""
     min_values: Count = 12
     """Least measured values of a recording that can be compared with a model [-]: one for each block of time."""
     probe_pairs: Count = 6
@@ -113,20 +122,36 @@ class Window:
     """Time in the demonstration that each residual belongs to [s], shape (count,)."""
 
 
-def start_spread(m: mujoco.MjModel, noise: Mapping[str, float], cfg: ObservationCfg | None = None) -> np.ndarray:
+def start_spread(
+    m: mujoco.MjModel,
+    noise: Mapping[str, float],
+    cfg: ObservationCfg | None = None,
+    *,
+    measured: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the standard deviation of a measured initial state, positions and then velocities, shape (2 nv,).
 
     Args:
         m: The compiled model.
         noise: Standard deviation of a component of each channel.
         cfg: Settings.
+        measured: Which degrees of freedom were measured, shape (nv,) bool; as the channels say by default. Those that
+            were not, of free bodies of which others were, are far more uncertain.
     """
     cfg = cfg or ObservationCfg()
     position, velocity = np.full(m.nv, cfg.unmeasured_position), np.full(m.nv, cfg.unmeasured_velocity)
+    if measured is not None:
+        for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+            dof = int(m.jnt_dofadr[joint])
+            if measured[dof : dof + 6].any():
+                position[dof : dof + 3], position[dof + 3 : dof + 6] = cfg.unknown_position, cfg.unknown_orientation
+                velocity[dof : dof + 3], velocity[dof + 3 : dof + 6] = cfg.unknown_velocity, cfg.unknown_spin
 
     def seen(dof: slice, std: float) -> None:
-        position[dof] = cfg.state_noise * std
-        velocity[dof] = cfg.state_noise * std / cfg.velocity_time
+        here = np.arange(m.nv)[dof]
+        here = here if measured is None else here[measured[here]]
+        position[here] = cfg.state_noise * std
+        velocity[here] = cfg.state_noise * std / cfg.velocity_time
 
     for sensor, std in noise.items():
         row = m.sensor(sensor).id
@@ -162,23 +187,19 @@ class ObservedRecording:
     cfg: ObservationCfg = field(default_factory=ObservationCfg)
     """Settings."""
 
-    def state(self, d: Demonstration, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the measured state of a demonstration at a time [s], qpos (nq,) and qvel (nv,)."""
+    def state(self, d: Demonstration, time: float) -> PartialState:
+        """Return the state of a demonstration at a time [s], as recorded or measured, else of the reference pose."""
         m = self.model.scene.model
-        qpos, qvel = initial_state(m, d)
+        every = np.ones(m.nv, dtype=bool)
         if time <= 0.0 and d.qpos is not None and d.qvel is not None:
-            return qpos, qvel
-        measured = self.measured(d)
-        if measured is not None:
-            states = measured.states(np.array([time]))
-            return states.qpos[0], states.qvel[0]
-        if time <= 0.0:
-            return qpos, qvel
-        raise RecordingError(
-            "a window cannot start where the state was not measured",
-            where=d.name,
-            fix="record poses of all free bodies and all joints",
-        )
+            return PartialState(*initial_state(m, d), every)
+        if (estimator := self.measured(d)) is not None:
+            states = estimator.states(np.array([time]))
+            return PartialState(states.qpos[0], states.qvel[0], every)
+        found = partial_state(m, d, time)
+        if time <= 0.0 and d.qpos is not None:
+            return replace(found, qpos=initial_state(m, d)[0])
+        return found
 
     def measured(self, d: Demonstration) -> StateEstimator | None:
         """Return the estimated motion of a demonstration, None where the pose of a body or joint was not measured."""
@@ -214,9 +235,10 @@ class ObservedRecording:
             count += size
         if not count:
             return None
-        qpos, qvel = self.state(d, start)
-        spread = start_spread(m, {r.channel: r.std for r in readings}, self.cfg)
-        return Window(d, number, start, end, qpos, qvel, spread, tuple(readings), count, np.concatenate(clock))
+        state, noise = self.state(d, start), {r.channel: r.std for r in readings}
+        spread = start_spread(m, noise, self.cfg, measured=None if state.measured.all() else state.measured)
+        clocks = np.concatenate(clock)
+        return Window(d, number, start, end, state.qpos, state.qvel, spread, tuple(readings), count, clocks)
 
 
 def first_time(d: Demonstration, channels: Sequence[str]) -> float:

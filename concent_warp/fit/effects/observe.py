@@ -132,7 +132,8 @@ def keeps_close(
     cfg, m = source.cfg, source.model.compile()
     span = min(last - start, cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
-    qpos, qvel = source.state(d, start)
+    state = source.state(d, start)
+    qpos, qvel = state.qpos, state.qvel
     noise = {c: source.noise[c] for c in source.noise if c in d.measured}
     spread = start_spread(m, noise, cfg) / cfg.state_noise
     rng = np.random.default_rng(seed)

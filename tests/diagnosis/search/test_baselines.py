@@ -34,27 +34,22 @@ class Fit:
     starts: Any = "starts"
 
 
-@pytest.mark.parametrize(
-    ("values", "iterations", "polished"),
-    [((1.0,), None, True), ((1.0,), 12, True), ((1.0,), 11, False), ((), None, False), ((), 3, False)],
-)
-def test_parameters_of_the_baseline_get_a_second_fit_after_enough_iterations(monkeypatch, values, iterations, polished):
+@pytest.mark.parametrize(("values", "polished"), [((1.0,), True), ((), False)])
+def test_parameters_of_the_baseline_get_a_second_fit(monkeypatch, values, polished):
     done: list[Any] = []
     solver = SimpleNamespace(
         p=SimpleNamespace(start="start", model=lambda v: f"model at {v}"),
-        fit_initial_states=lambda start, offsets, n: (
-            done.append((start, [o.tolist() for o in offsets], n)) or ("o", "s")
-        ),
+        fit_initial_states=lambda start, offsets: done.append((start, [o.tolist() for o in offsets])) or ("o", "s"),
         fit=lambda start, offsets, starts: done.append((start, offsets, starts)) or Fit("fit", values=values),
         polish=lambda fit: replace(fit, name="polished"),
     )
     monkeypatch.setattr(baseline, "Prediction", lambda *_, **__: ANY)
     monkeypatch.setattr(baseline, "Solver", lambda *_: solver)
-    monkeypatch.setattr(baseline, "_fitted_model", lambda model, _w, _b, fit, *_: (model, fit.name))
+    monkeypatch.setattr(baseline, "fitted_model", lambda model, _w, _b, fit, *_: (model, fit.name))
     windows: Any = [SimpleNamespace(spread=np.ones(2)), SimpleNamespace(spread=np.ones(4))]
-    found: Any = fit_baseline("model", windows, ANY, state_iterations=iterations)  # pyright: ignore[reportArgumentType]
+    found: Any = fit_baseline("model", windows, ANY)  # pyright: ignore[reportArgumentType]
     assert found == ((f"model at {values}", "polished") if polished else ("model", "fit"))
-    assert done == [("start", [[0, 0], [0, 0, 0, 0]], iterations or 12), (None, "o", "s")]
+    assert done == [("start", [[0, 0], [0, 0, 0, 0]]), (None, "o", "s")]
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ def test_a_baseline_is_replaced_where_states_of_its_rivals_leave_less(monkeypatc
     solver = SimpleNamespace(improve_initial_states=lambda fit, offsets: tried.append((fit, offsets)) or "improved")
     base: Any = Base(np.array([1.0, 1.0]), made=solver)
     found: Any = Base(np.array([left, 0.0]), limit=9.0, name="found")
-    monkeypatch.setattr(baseline, "_fitted_model", lambda *args: found if args[3] == "improved" else ANY)
+    monkeypatch.setattr(baseline, "fitted_model", lambda *args: found if args[3] == "improved" else ANY)
     rivals: Any = [SimpleNamespace(fit=SimpleNamespace(offsets=k)) for k in "ab"]
     after: Any = refit_from_rivals(base, rivals)
     assert tried == [(base.fit, ["a", "b"])]

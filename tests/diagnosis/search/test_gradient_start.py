@@ -9,7 +9,7 @@ import pytest
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
 from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.tasks import TaskRunner
@@ -77,7 +77,7 @@ def test_gradients_start_the_fit_of_friction_near_the_truth_and_leave_others_alo
     assert screened[0].start[0] == pytest.approx(0.7 * GIVEN)
     assert friction.start[0] == pytest.approx(TRUE, rel=0.15)
     assert friction.scanned_gain > screened[0].scanned_gain
-    found = fit_candidate(base, friction)
+    found = polish_candidate(base, fit_candidate(base, friction))
     assert found.fit.values[0] == pytest.approx(TRUE, rel=0.02)
     assert found.ratio < 1.2
 

@@ -140,7 +140,6 @@ def test_the_unknown_force_is_not_tested_where_the_residual_is_noise():
     def never(work, tasks):
         raise AssertionError(work, tasks)
 
-    assert unknown_force(nodes_of(ridden(friction=FRICTION)), CFG, never) is None
     assert unknown_force(nodes_of(ridden()), CFG, never) is None
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from concent_warp.errors import RecordingError
+from concent_warp.estimation.partial_state import PartialState
 from concent_warp.fit.effects import observe as observing
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, first_time, start_spread
 from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
@@ -110,6 +111,10 @@ def test_a_window_without_samples_is_none():
     assert found.count == 1
 
 
+def first(state: PartialState) -> list[float]:
+    return [float(state.qpos[0]), float(state.qvel[0])]
+
+
 def test_a_state_is_the_recorded_one_at_the_start_and_the_measured_one_later(monkeypatch):
     recording = swung()
     source = observed(recording, angle=NOISE)
@@ -121,17 +126,25 @@ def test_a_state_is_the_recorded_one_at_the_start_and_the_measured_one_later(mon
         return SimpleNamespace(qpos=np.array([[7.0], [8.0]]), qvel=np.array([[9.0], [10.0]]))
 
     monkeypatch.setattr(ObservedRecording, "measured", lambda *_: SimpleNamespace(states=states))
-    assert [float(x[0]) for x in source.state(d, 0.0)] == [0.3, 0.0]
-    assert [float(x[0]) for x in source.state(d, -0.1)] == [0.3, 0.0]
+    assert first(source.state(d, 0.0)) == [0.3, 0.0]
+    assert first(source.state(d, -0.1)) == [0.3, 0.0]
     assert seen == []
-    assert [float(x[0]) for x in source.state(d, 0.5)] == [7.0, 9.0]
-    assert [float(x[0]) for x in source.state(replace(d, qvel=None), 0.0)] == [7.0, 9.0]
-    assert [float(x[0]) for x in source.state(replace(d, qpos=None), 0.0)] == [7.0, 9.0]
+    assert first(source.state(d, 0.5)) == [7.0, 9.0]
+    assert first(source.state(replace(d, qvel=None), 0.0)) == [7.0, 9.0]
+    assert first(source.state(replace(d, qpos=None), 0.0)) == [7.0, 9.0]
     assert seen == [[0.5], [0.0], [0.0]]
     monkeypatch.setattr(ObservedRecording, "measured", lambda *_: None)
-    assert [float(x[0]) for x in source.state(replace(d, qvel=None), 0.0)] == [0.3, 0.0]
-    with pytest.raises(RecordingError, match="a window cannot start where the state was not measured"):
-        source.state(d, 1e-6)
+    assert first(source.state(replace(d, qvel=None), 0.0))[0] == 0.3
+    bare = replace(d, qpos=None, qvel=None, measured={})
+    found = source.state(bare, 0.5)
+    assert first(found) == [0.0, 0.0]
+    assert found.measured.tolist() == [False]
+    read = source.state(replace(d, qpos=None), 0.5)
+    assert read.measured.tolist() == [True]
+    angle = d.measured["angle"]
+    assert first(read) == pytest.approx(
+        [float(np.interp(0.5, angle.time, angle.value[:, 0])), first(read)[1]], abs=0.01
+    )
 
 
 def test_what_was_not_seen_has_no_measured_motion():
@@ -208,7 +221,8 @@ def test_pairs_start_off_by_the_noise_on_either_side(monkeypatch):
     np.testing.assert_array_equal(record, np.arange(0, 281, 2))
     recording = swung(quaternion=True)
     source = observed(recording, angle=2e-3)
-    qpos, qvel = source.state(recording[0], 0.5)
+    state = source.state(recording[0], 0.5)
+    qpos, qvel = state.qpos, state.qvel
     rng = np.random.default_rng(3)
     np.testing.assert_array_equal([variants.qpos[0], variants.qvel[0]], [qpos, qvel])
     for k in range(6):
@@ -280,7 +294,9 @@ def cuts(monkeypatch) -> dict[str, Any]:
     monkeypatch.setattr(observing, "keeps_close", keeps)
     monkeypatch.setattr(observing, "_calmest", lambda _, start, reach, __: start + reach)
     monkeypatch.setattr(ObservedRecording, "measured", lambda *_: told["measured"])
-    monkeypatch.setattr(ObservedRecording, "state", lambda *_: (np.zeros(1), np.zeros(1)))
+    monkeypatch.setattr(
+        ObservedRecording, "state", lambda *_: PartialState(np.zeros(1), np.zeros(1), np.ones(1, dtype=bool))
+    )
     return told
 
 

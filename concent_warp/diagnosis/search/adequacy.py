@@ -1,0 +1,36 @@
+"""Whether a fitted model leaves no more than noise, channel by channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.fit.effects.robust import robust_noise_ratio
+
+
+def channel_residuals(base: FittedModel) -> dict[str, np.ndarray]:
+    """Return the residuals of each channel in units of its noise, initial states eliminated, each (n,)."""
+    found: dict[str, list[np.ndarray]] = {}
+    for window, piece in zip(base.windows, base.pieces, strict=True):
+        for r in window.readings:
+            found.setdefault(r.channel, []).append(piece.residual[r.rows])
+    return {channel: np.concatenate(parts) for channel, parts in found.items()}
+
+
+def is_adequate(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:
+    """Return whether residuals are no larger than the noise may be, altogether and in each channel.
+
+    Args:
+        base: The fitted model.
+        noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
+        cfg: Settings.
+    """
+    robust = base.cfg.least_squares.robust
+    scaled = {c: r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()}
+    worst = max(robust_noise_ratio([r], robust) for r in scaled.values())
+    return (
+        robust_noise_ratio(list(scaled.values()), robust) <= cfg.adequate_ratio and worst <= cfg.adequate_channel_ratio
+    )

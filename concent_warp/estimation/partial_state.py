@@ -1,0 +1,71 @@
+"""The state of a scene at one time where only a part of it was measured.
+
+Joints and free bodies are estimated from their own readings by local polynomials, positions of a body component by
+component; what was not measured stands as the recording's initial state or the model's reference pose has it, at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from concent_warp.estimation.joint_signals import joint_signals
+from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
+from concent_warp.estimation.object_tracks import frame_channel
+from concent_warp.recording.recording import Channel
+from concent_warp.simulate.replay import initial_state
+
+if TYPE_CHECKING:
+    from concent_warp.recording.recording import Demonstration
+
+
+@dataclass(frozen=True)
+class PartialState:
+    """A state, and which part of it was measured."""
+
+    qpos: np.ndarray
+    """Shape (nq,) [m, rad]; quaternions wxyz of unit length."""
+    qvel: np.ndarray
+    """Shape (nv,) [m/s, rad/s]; 0 where it was not measured."""
+    measured: np.ndarray
+    """Which degrees of freedom were measured, shape (nv,) bool."""
+
+
+def partial_state(
+    m: mujoco.MjModel, demonstration: Demonstration, time: float, cfg: LocalPolynomialCfg | None = None
+) -> PartialState:
+    """Return the state at a time, as far as it was measured.
+
+    Args:
+        m: The compiled scene.
+        demonstration: What was measured.
+        time: Time [s].
+        cfg: How readings are smoothed.
+    """
+    cfg, at = cfg or LocalPolynomialCfg(), np.array([time])
+    qpos, qvel = initial_state(m, demonstration)
+    measured = np.zeros(m.nv, dtype=bool)
+    for joint in joint_signals(m, demonstration, cfg):
+        found = joint.position.estimate(at)
+        qpos[joint.qpos], qvel[joint.dof] = found.value[0, 0], found.rate[0, 0]
+        measured[joint.dof] = True
+    for joint in np.flatnonzero(m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        body = m.body(int(m.jnt_bodyid[joint])).name
+        place, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
+        position = frame_channel(m, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEPOS)
+        for k in range(3 if position is not None else 0):
+            signal = cfg.signal(Channel(position.time, position.value[:, [k]]))
+            if signal is not None:
+                found = signal.estimate(at)
+                qpos[place + k], qvel[dof + k] = found.value[0, 0], found.rate[0, 0]
+                measured[dof + k] = True
+        turned = frame_channel(m, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
+        orientation = None if turned is None else cfg.orientation(turned)
+        if orientation is not None:
+            seen = orientation.estimate(at)
+            qpos[place + 3 : place + 7], qvel[dof + 3 : dof + 6] = seen.quaternion[0], seen.velocity[0]
+            measured[dof + 3 : dof + 6] = True
+    return PartialState(qpos, qvel, measured)
