@@ -29,3 +29,12 @@ DeviceOption = Annotated[
     ),
 ]
 """``--device``: where torch and Warp compute."""
+NoiseOption = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="CHANNEL=NUMBER",
+        help="Standard deviation of the measurement noise of channels, such as angle=0.001 or '*_position=2e-4', in "
+        "their units; by default as the recording states it, else estimated from the readings.",
+    ),
+]
+"""``--noise``: what a user knows about the instruments."""

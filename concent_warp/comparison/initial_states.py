@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
-    from concent_warp.recording.recording import Recording
+    from concent_warp.recording.recording import Demonstration, Recording
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class FittedStartCfg:
     max_steps: int = 400_000
     """Most simulation steps for a second fit, to all readings of a demonstration [-]; with more, only the first counts.
     A second of computation."""
+    few_iterations: int = 3
+    """Iterations of the second fit."""
     search: InitialStateCfg = field(default_factory=lambda: InitialStateCfg(iterations=6, restart_samples=0))
     """Search for the states."""
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -58,24 +61,26 @@ def with_initial_states(
     except RecordingError:  # too few readings to fit anything to
         return recording
     source = ObservedRecording(model, recording, noise, cfg.observation)
-    windows: list[Window] = []
+    first: list[Window] = []
     for number, d in enumerate(recording.demonstrations):
-        first = first_time(d, list(noise))
-        last = min(
-            max((float(c.time[-1]) for n, c in d.measured.items() if n in noise), default=0.0), first + cfg.length
-        )
-        if not unknown[number] or last <= first:
-            continue
-        reach = last if source.measured(d) is None else keeps_close(source, d, 0.0, last, engine, 0)
-        if (window := source.window(number, 0.0, min(last, max(reach, first)))) is not None:
-            windows.append(window)
-    if not windows:
+        begin, last = first_time(d, list(noise)), _last_time(d, list(noise))
+        end = min(last, begin + cfg.length)
+        if unknown[number] and end > begin:
+            reach = end if source.measured(d) is None else keeps_close(source, d, 0.0, end, engine, 0)
+            if (window := source.window(number, 0.0, min(end, max(reach, begin)))) is not None:
+                first.append(window)
+    if not first:
         return recording
-    prediction = Prediction(model, (), windows, engine=engine)
-    zero = [np.zeros(len(w.spread)) for w in windows]
-    search = InitialStateSearch(prediction, cfg.search)
-    offsets, _, _ = search.refined(prediction.start, zero, range(len(windows)), cfg.search.iterations)
-    starts = {w.number: _moved(model.scene.model, w, o) for w, o in zip(windows, offsets, strict=True)}
+    offsets = _fitted(model, first, [np.zeros(len(w.spread)) for w in first], engine, cfg, cfg.search.iterations)
+    step, few = model.scene.model.opt.timestep, cfg.few_iterations
+    for k, w in enumerate(first):
+        last = _last_time(w.demonstration, list(noise))
+        trials = len(w.spread) + len(cfg.search.dampings)
+        if last > w.end and few * trials * last / step <= cfg.max_steps:
+            whole = source.window(w.number, 0.0, last)
+            if whole is not None:
+                (offsets[k],) = _fitted(model, [replace(whole, spread=w.spread)], [offsets[k]], engine, cfg, few)
+    starts = {w.number: _moved(model.scene.model, w, o) for w, o in zip(first, offsets, strict=True)}
     demonstrations = []
     for number, d in enumerate(recording.demonstrations):
         qpos, qvel = starts.get(number, (d.qpos, d.qvel))
@@ -83,6 +88,25 @@ def with_initial_states(
             replace(d, qpos=qpos if d.qpos is None else d.qpos, qvel=qvel if d.qvel is None else d.qvel)
         )
     return replace(recording, demonstrations=tuple(demonstrations))
+
+
+def _last_time(d: Demonstration, channels: Sequence[str]) -> float:
+    """Return when the last of some channels was last read [s]."""
+    return max((float(d.measured[c].time[-1]) for c in channels if c in d.measured), default=0.0)
+
+
+def _fitted(
+    model: Model,
+    windows: Sequence[Window],
+    offsets: Sequence[np.ndarray],
+    engine: EngineName,
+    cfg: FittedStartCfg,
+    iterations: int,
+) -> list[np.ndarray]:
+    """Return the errors of the initial states of windows, in units of their spread, each window by itself."""
+    prediction = Prediction(model, (), windows, engine=engine)
+    search = InitialStateSearch(prediction, cfg.search)
+    return search.refined(prediction.start, offsets, range(len(windows)), iterations)[0]
 
 
 def _moved(m: mujoco.MjModel, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

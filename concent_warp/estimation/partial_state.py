@@ -56,8 +56,8 @@ def partial_state(
         body = m.body(int(m.jnt_bodyid[joint])).name
         place, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
         position = frame_channel(m, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEPOS)
-        for k in range(3 if position is not None else 0):
-            signal = cfg.signal(Channel(position.time, position.value[:, [k]]))
+        for k in range(3):
+            signal = None if position is None else cfg.signal(Channel(position.time, position.value[:, [k]]))
             if signal is not None:
                 found = signal.estimate(at)
                 qpos[place + k], qvel[dof + k] = found.value[0, 0], found.rate[0, 0]

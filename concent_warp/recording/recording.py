@@ -6,6 +6,7 @@ Each channel has clock readings of its own; a value may be NaN (missing), a time
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -133,6 +134,37 @@ class Recording:
             if demonstration.name == name:
                 return demonstration
         raise KeyError(f"{self.source}: no demonstration {name!r}; it has {[d.name for d in self.demonstrations]}")
+
+    def with_noise(self, noise: Mapping[str, float]) -> Recording:
+        """Return the recording with the noise of some channels stated.
+
+        Args:
+            noise: Standard deviation of a component by the name of the channel, or by a pattern of names such as
+                ``*_position``, in the channel's unit; of an orientation per component of the rotation vector
+                [rad].
+
+        Raises:
+            RecordingError: No channel has such a name, or a value is not above 0.
+        """
+        names = {name for d in self.demonstrations for name in d.measured}
+        stated: dict[str, float] = {}
+        for pattern, std in noise.items():
+            if not (std > 0 and np.isfinite(std)):
+                raise RecordingError(f"noise of {pattern!r} makes no sense", expected="a number above 0", found=std)
+            meant = sorted(fnmatch.filter(names, pattern))
+            if not meant:
+                raise RecordingError(
+                    "noise of a channel that was not measured",
+                    where=self.source,
+                    expected=f"one of {sorted(names)}, or a pattern",
+                    found=pattern,
+                )
+            stated |= dict.fromkeys(meant, float(std))
+        demonstrations = []
+        for d in self.demonstrations:
+            measured = {n: replace(c, noise_std=stated.get(n, c.noise_std)) for n, c in d.measured.items()}
+            demonstrations.append(replace(d, measured=measured))
+        return replace(self, demonstrations=tuple(demonstrations))
 
     def only(self, names: Sequence[str]) -> Recording:
         """Return the recording with some of its demonstrations, in its own order; with all where `names` is empty.

@@ -12,7 +12,8 @@ from rich.markup import escape
 
 from concent_warp.checks import PositiveDuration
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
-from concent_warp.cli.options import EngineOption, OptionalOutPath
+from concent_warp.cli.given_recording import given_recording
+from concent_warp.cli.options import EngineOption, NoiseOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ConcentError
@@ -44,6 +45,7 @@ class Arguments:
     """Recording to fit it to."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations of it; all by default."""
+    noise: NoiseOption = ()
     window: PositiveDuration | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     engine: EngineOption = "mujoco"
@@ -69,9 +71,8 @@ def run(arguments: Arguments) -> FittedEffects | Model | None:
     fitted = None
     if arguments.fit is not None:
         from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
-        from concent_warp.recording.load import load_recording
 
-        recording = load_recording(arguments.fit).only(arguments.demonstrations)
+        recording = given_recording(arguments.fit, arguments.demonstrations, arguments.noise)
         model.check_recording(recording)
         with work_progress("fitting") as progress:
             cfg = FitEffectsCfg(window=arguments.window)

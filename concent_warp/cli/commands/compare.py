@@ -11,7 +11,8 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.options import EngineOption
+from concent_warp.cli.given_recording import given_recording
+from concent_warp.cli.options import EngineOption, NoiseOption
 from concent_warp.cli.summary import say_diverged
 from concent_warp.cli.terminal import say, say_written, table_width
 from concent_warp.comparison.compare import CompareCfg, compare
@@ -19,7 +20,6 @@ from concent_warp.comparison.result import Comparison
 from concent_warp.comparison.table import markdown_table, rich_table
 from concent_warp.comparison.worst_spans import span_kind
 from concent_warp.estimation.noise import WORDS
-from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
 
@@ -37,6 +37,7 @@ class Arguments:
     """Model to compare it with."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
+    noise: NoiseOption = ()
     engine: EngineOption = "mujoco"
     json: bool = False
     """Print one JSON object with all figures in SI units instead of the table."""
@@ -57,7 +58,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> Comparison:
     """Compare, and print or write what was asked for."""
-    recording = load_recording(arguments.recording).only(arguments.demonstrations)
+    recording = given_recording(arguments.recording, arguments.demonstrations, arguments.noise)
     models = {} if arguments.baseline is None else {"baseline": given_model(arguments.baseline, recording)}
     models["model"] = given_model(arguments.model, recording)
     if arguments.html is not None:

@@ -12,9 +12,10 @@ import tyro
 from rich.markup import escape
 
 from concent_warp.checks import Bounds, PositiveDuration
-from concent_warp.cli.fitted_effects import say_fitted, value_and_interval, work_progress
+from concent_warp.cli.fitted_effects import value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
-from concent_warp.cli.options import EngineOption, OptionalOutPath
+from concent_warp.cli.given_recording import given_recording
+from concent_warp.cli.options import EngineOption, NoiseOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare_replays
 from concent_warp.diagnosis.cfg import DiagnoseCfg
@@ -23,9 +24,7 @@ from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.files import all_or_none
-from concent_warp.fit.effects.fit import FitEffectsCfg, fit_effects
 from concent_warp.model import Model
-from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
@@ -45,6 +44,7 @@ class Arguments:
     """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
+    noise: NoiseOption = ()
     effects: tuple[str, ...] = ()
     """Effects to consider; all by default. "concent add --list" lists them."""
     json: bool = False
@@ -74,7 +74,7 @@ class Arguments:
 
 def run(arguments: Arguments) -> Diagnosis:
     """Diagnose, and print or write what was asked for."""
-    recording = load_recording(arguments.recording).only(arguments.demonstrations)
+    recording = given_recording(arguments.recording, arguments.demonstrations, arguments.noise)
     model = given_model(arguments.model, recording)
     _check_numbers(arguments)
     _check_effects(model, recording, arguments.effects)
@@ -89,7 +89,7 @@ def run(arguments: Arguments) -> Diagnosis:
     if arguments.out is not None and found.next_experiment is not None and not arguments.json:
         say_written(arguments.out / EXPERIMENT_FILE)
     with all_or_none():
-        _save_accepted(arguments, found, recording)
+        _save_accepted(arguments, found)
         _write_report(arguments, found, recording)
     if not arguments.json:
         for path in (arguments.apply if found.accepted else None, arguments.html):
@@ -187,8 +187,8 @@ def _say_effects(effects: Sequence[Finding]) -> None:
     say(table)
 
 
-def _save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
-    """Fit all accepted effects together and save the model; say so where none was accepted."""
+def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
+    """Save the model with all accepted effects; say so where none was accepted."""
     path = arguments.apply
     if path is None:
         return
@@ -196,13 +196,10 @@ def _save_accepted(arguments: Arguments, found: Diagnosis, recording: Recording)
         if not arguments.json:
             say(escape(f"No effect was accepted: {path} was not written."))
         return
-    with work_progress("fitting") as progress:
-        cfg = FitEffectsCfg(window=arguments.window, seed=arguments.seed)
-        fitted = fit_effects(found.model, recording, cfg, engine=arguments.engine, progress=progress)
     make_folder(path.parent)
-    fitted.model.save(path)
+    found.model.save(path)
     if not arguments.json:
-        say_fitted(fitted)
+        say_written(path)
 
 
 def _write_report(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:

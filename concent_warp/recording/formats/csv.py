@@ -6,6 +6,9 @@ A folder holds ``scene.xml`` and, either in itself or in ``demo_*`` subfolders (
   Names of components (``x``, ``qw``, ``pos_z``) say the order, see `csv_columns`; other names are read as they stand.
 - ``action_<actuator>.csv``: the same with one value column.
 - ``initial.csv``, optional: a row ``qpos,...`` and a row ``qvel,...`` with the state at time 0.
+- ``noise.csv``, optional: a row ``<sensor>,<number>`` for each sensor whose noise is known, the standard deviation of
+  one of its numbers; of an orientation of a component of the rotation vector [rad]. Beside ``scene.xml`` it holds for
+  all demonstrations.
 
 Cells are SI numbers with a decimal point, separated by commas; an empty cell is a missing value. A ``/`` in a name is
 written as ``%2F`` in the file's name. Files of other kinds are left alone.
@@ -16,6 +19,7 @@ from __future__ import annotations
 import csv
 from array import array
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -31,6 +35,7 @@ from concent_warp.scene.scene import Scene
 
 SCENE = "scene.xml"
 INITIAL = "initial.csv"
+NOISE = "noise.csv"
 
 
 def read_csv(folder: Path) -> Recording:
@@ -45,7 +50,7 @@ def read_csv(folder: Path) -> Recording:
     if not (folder / SCENE).is_file():
         raise RecordingError("the folder has no scene", where=folder, expected=SCENE, fix="put the MJCF into it")
     nested = sorted((f for f in folder.glob(f"{PREFIX}*") if f.is_dir()), key=lambda f: by_number(f.name))
-    if nested and any(folder.glob("*.csv")):
+    if nested and any(path.name != NOISE for path in folder.glob("*.csv")):
         raise RecordingError(
             "the folder has CSV files of its own beside its demonstrations",
             where=folder,
@@ -72,6 +77,8 @@ def read_csv(folder: Path) -> Recording:
     demonstrations = tuple(_read_demonstration(f, f.name, m) for f in nested) or (
         _read_demonstration(folder, f"{PREFIX}0", m),
     )
+    if nested and (folder / NOISE).exists():
+        demonstrations = _with_noise(demonstrations, _read_noise(folder / NOISE), folder / NOISE)
     recording = Recording(scene.xml, demonstrations, str(folder))
     validate(recording)
     return recording
@@ -97,6 +104,7 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
     action: dict[str, Channel] = {}
     measured: dict[str, Channel] = {}
     state: dict[str, np.ndarray] = {}
+    noise: dict[str, float] = {}
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise RecordingError(
@@ -114,6 +122,8 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
         kind, _, channel = path.stem.partition("_")
         if path.name == INITIAL:
             state = _read_state(path)
+        elif path.name == NOISE:
+            noise = _read_noise(path)
         elif kind == "measured" and channel:
             header, table = _read_table(path)
             order = column_order(path, header[1:], m, name_of(channel))
@@ -130,10 +140,41 @@ def _read_demonstration(folder: Path, name: str, m: mujoco.MjModel) -> Demonstra
             raise RecordingError(
                 "a CSV file has a name that says nothing",
                 where=path,
-                expected=f"measured_<sensor>.csv, action_<actuator>.csv or {INITIAL}",
+                expected=f"measured_<sensor>.csv, action_<actuator>.csv, {INITIAL} or {NOISE}",
                 fix="rename it or take it out of the folder",
             )
-    return Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
+    found = Demonstration(name=name, action=action, measured=measured, qpos=state.get("qpos"), qvel=state.get("qvel"))
+    return _with_noise((found,), noise, folder / NOISE)[0]
+
+
+def _with_noise(found: tuple[Demonstration, ...], noise: dict[str, float], path: Path) -> tuple[Demonstration, ...]:
+    """Return demonstrations with the noise of some channels, as a file states it."""
+    known = sorted({channel for d in found for channel in d.measured})
+    if unknown := sorted(set(noise) - set(known)):
+        raise RecordingError(
+            "noise of a channel that was not measured", where=path, expected=f"some of {known}", found=unknown
+        )
+    return tuple(
+        replace(d, measured={n: replace(c, noise_std=noise.get(n, c.noise_std)) for n, c in d.measured.items()})
+        for d in found
+    )
+
+
+def _read_noise(path: Path) -> dict[str, float]:
+    """Read the noise of channels: rows of a name and a number, below a header ``sensor,...`` where there is one."""
+    noise: dict[str, float] = {}
+    for line, cells in _read_rows(path):
+        name, where = cells[0].strip(), f"{path}, line {line}"
+        if not noise and name.lower() in ("sensor", "channel", "name"):
+            continue
+        if len(cells) != 2 or name in noise:
+            raise RecordingError(
+                "not a row of noise", where=where, expected="a sensor, once, and a number", found=",".join(cells)[:80]
+            )
+        noise[name] = _number(cells[1], path, line, name)
+        if not (np.isfinite(noise[name]) and noise[name] > 0):
+            raise RecordingError("noise makes no sense", where=where, expected="a number above 0", found=cells[1][:40])
+    return noise
 
 
 def _read_table(path: Path) -> tuple[list[str], np.ndarray]:

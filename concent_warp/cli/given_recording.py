@@ -1,0 +1,33 @@
+"""The recording that a command was given, with what its options say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.load import load_recording
+from concent_warp.recording.recording import Recording
+
+
+def given_recording(path: Path, demonstrations: Sequence[str] = (), noise: Sequence[str] = ()) -> Recording:
+    """Return a recording.
+
+    Args:
+        path: File or folder.
+        demonstrations: Names of those to take; all where there are none.
+        noise: Noise of channels, such as ``angle=0.001``.
+
+    Raises:
+        RecordingError: It cannot be read, there is no such demonstration or channel, or the noise is no number.
+    """
+    stated = {}
+    for text in noise:
+        channel, _, value = text.rpartition("=")
+        try:
+            stated[channel] = float(value)
+        except ValueError:
+            channel = ""
+        if not channel:
+            raise RecordingError("noise is not stated so", expected="--noise CHANNEL=NUMBER", found=repr(text[:80]))
+    return load_recording(path).only(demonstrations).with_noise(stated)

@@ -1,0 +1,91 @@
+"""Diagnoses of recordings that no engine of the library made, without stated noise, as folders of CSV files."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import concent_warp as cw
+from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.recording.formats.csv import read_csv
+from concent_warp.recording.recording import Recording
+from tests.scenes.foreign import BALL, pusher, swing_up, thrown_ball, write_csv
+
+
+def read(make: Any, folder: Any) -> Recording:
+    return read_csv(write_csv(make(), folder / make.__name__))
+
+
+def diagnosed(recording: Recording, **settings: Any) -> Diagnosis:
+    return cw.diagnose(cw.Model.from_recording(recording), recording, cw.DiagnoseCfg(jobs=1, explain=False, **settings))
+
+
+def values(found: Diagnosis) -> dict[str, float]:
+    """Return the parameters of all accepted effects."""
+    return {p.name: p.value for f in found.accepted for p in f.parameters}
+
+
+def check_saved(found: Diagnosis, recording: Recording, tmp_path: Any) -> None:
+    """Check that finding and saved model are one set of numbers, and that a comparison shows no more than noise."""
+    found.model.save(tmp_path / "model.toml")
+    saved = cw.Model.load(tmp_path / "model.toml")
+    added = {p.name: v for a in saved.effects for p, v in zip(parameters(a, saved), a.values, strict=True)}
+    assert added == pytest.approx(values(found), rel=1e-6)
+    intervals = [pair for a in saved.effects for pair in a.intervals]
+    assert np.ravel(intervals) == pytest.approx(
+        [e for f in found.accepted for p in f.parameters for e in (p.low, p.high)]
+    )
+    compared = cw.compare(saved, recording)
+    for channel in compared.channels:
+        ratio = compared.summarise("model", channel).ratio
+        assert ratio is not None
+        assert ratio < 1.5
+
+
+def parameters(added: Any, model: cw.Model) -> Any:
+    return added.effect.parameters(model.scene.model)
+
+
+def test_damping_and_delay_of_an_arm_are_found_where_noise_is_not_stated(tmp_path):
+    recording = read(pusher, tmp_path)
+    assert all(c.noise_std is None for d in recording.demonstrations for c in d.measured.values())
+    found = diagnosed(recording)
+    assert found.verdict in ("effect", "group")
+    assert {f.name for f in found.accepted} == {"joint_damping", "actuator_delay"}
+    assert all(len(group) <= 2 for group in found.groups)
+    known = values(found)
+    assert known["delay"] == pytest.approx(0.02, rel=0.05)
+    assert known["damping[elbow]"] == pytest.approx(0.15, rel=0.07)
+    assert any("Noise that is not stated" in issue for issue in found.issues)
+    check_saved(found, recording, tmp_path)
+
+
+@pytest.mark.slow
+def test_friction_and_damping_of_a_swung_up_pendulum_are_found(tmp_path):
+    recording = read(swing_up, tmp_path)
+    found = diagnosed(recording)
+    assert found.verdict == "effect"
+    assert {f.name for f in found.accepted} == {"joint_damping", "joint_friction"}
+    assert values(found)["damping[hinge]"] == pytest.approx(0.01, rel=0.1)
+    assert values(found)["torque[hinge]"] == pytest.approx(0.03, rel=0.1)
+
+
+def test_drag_of_a_ball_that_is_tracked_by_position_is_found(tmp_path):
+    recording = read(thrown_ball, tmp_path)
+    assert recording.scene.count("framequat") == BALL.count("framequat") == 0
+    found = diagnosed(recording)
+    assert found.groups == (("air_drag",),)
+    check_saved(found, recording, tmp_path)
+
+
+def test_no_drag_is_found_where_there_is_none(tmp_path):
+    found = diagnosed(read_csv(write_csv(thrown_ball(drag=0.0), tmp_path / "ball")))
+    assert found.verdict == "none_needed"
+    assert found.ratio[0] == pytest.approx(1.0, abs=0.1)
+
+
+def test_heights_alone_tell_of_drag(tmp_path):
+    found = diagnosed(read_csv(write_csv(thrown_ball(heights_only=True), tmp_path / "ball")), max_additions=1)
+    assert any("air_drag" in group for group in found.groups)
