@@ -198,8 +198,6 @@ def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
         return
     make_folder(path.parent)
     found.model.save(path)
-    if not arguments.json:
-        say_written(path)
 
 
 def _write_report(arguments: Arguments, found: Diagnosis, recording: Recording) -> None:
