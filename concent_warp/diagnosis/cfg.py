@@ -194,7 +194,7 @@ class DiagnoseCfg:
     little."""
     max_fits: Count = 8
     """Most screened candidates that are fitted. Empirical: the truth is among the first eight in nearly all scenes."""
-    max_additions: Annotated[int, Bounds(0, 1000)] = 3
+    max_additions: Annotated[int, Bounds(1, 1000)] = 3
     """Most effects that are added."""
     adequate_ratio: float = 1.25
     """RMS residual over noise up to which a model explains the data [-]. Empirical."""

@@ -174,9 +174,9 @@ def test_a_model_that_diverges_is_an_error(swing, tmp_path, capsys):
         (["--effects", "air_darg"], "did you mean 'air_drag'"),
         (["--effects", "sliding_friction"], "sliding_friction cannot be missing"),
         (["--demonstrations", "demo_7"], "no such demonstration"),
-        (["--jobs", "0"], "no processes"),
+        (["--jobs", "0"], "--jobs is out of bounds; expected at least -1 and at most 4096, but not 0"),
         (["--window", "0"], "window"),
-        (["--additions", "0"], "additions"),
+        (["--additions", "0"], "--additions is out of bounds; expected at least 1"),
         (["--gradient"], "build it with `concent geometry`; or diagnose without --gradient."),
     ],
 )

@@ -35,4 +35,4 @@ def test_locate_prints_one_json_object_and_nothing_else(tmp_path, capsys):
 def test_locate_refuses_windows_without_length(tmp_path, capsys):
     write_hdf5(swing(lambda _: 0.0, duration=0.5), tmp_path / "swing.h5")
     assert main(["locate", str(tmp_path / "swing.h5"), "--window", "0"]) == 2
-    assert "--window above 0 s" in capsys.readouterr().err
+    assert "--window is out of bounds; expected above 0" in capsys.readouterr().err

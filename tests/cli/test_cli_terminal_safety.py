@@ -30,7 +30,7 @@ def test_names_in_files_and_paths_are_shown_with_escapes(tmp_path, monkeypatch, 
     assert main(["compare", f"gone{escape}.h5"]) == 2
     assert main([f"comp{escape}are"]) == 2
     shown = lines(capsys.readouterr().err)
-    assert len(shown) == 3
+    assert len([line for line in shown if not line.endswith(": loading ...")]) == 3
 
 
 @pytest.mark.parametrize("escape", ESCAPES)

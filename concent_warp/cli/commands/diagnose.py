@@ -22,7 +22,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import EXPERIMENT_FILE, diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
-from concent_warp.errors import ConcentError, ModelError
+from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -55,7 +55,7 @@ class Arguments:
     """Save the model with all accepted effects, fitted together with intervals, to this file (.toml)."""
     window: PositiveDuration | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
-    additions: Annotated[int, Bounds(0, 1000)] = 3
+    additions: Annotated[int, Bounds(1, 1000)] = 3
     """Most effects that are added."""
     gradient: bool = False
     """Let fits of friction, mass and contact stiffness start from where gradients through Newton lead, where that is
@@ -76,7 +76,6 @@ def run(arguments: Arguments) -> Diagnosis:
     """Diagnose, and print or write what was asked for."""
     recording = given_recording(arguments.recording, arguments.demonstrations, arguments.noise)
     model = given_model(arguments.model, recording)
-    _check_numbers(arguments)
     _check_effects(model, recording, arguments.effects)
     for path in (arguments.html, arguments.apply):
         if path is not None:
@@ -96,20 +95,6 @@ def run(arguments: Arguments) -> Diagnosis:
             if path is not None:
                 say_written(path)
     return found
-
-
-def _check_numbers(arguments: Arguments) -> None:
-    """Check the settings that are numbers.
-
-    Raises:
-        ConcentError: One of them makes no sense.
-    """
-    if arguments.jobs == 0:
-        raise ConcentError("no processes to work with", expected="--jobs -1 or at least 1", found=0)
-    if arguments.additions < 1:
-        raise ConcentError("too few additions", expected="--additions at least 1", found=arguments.additions)
-    if arguments.window is not None and not arguments.window > 0:
-        raise ConcentError("no length of a window", expected="--window above 0 s", found=arguments.window)
 
 
 def _check_effects(model: Model, recording: Recording, names: Sequence[str]) -> None:

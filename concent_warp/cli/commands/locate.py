@@ -16,7 +16,6 @@ from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
-from concent_warp.errors import RecordingError
 from concent_warp.files import all_or_none
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
@@ -48,8 +47,6 @@ class Arguments:
 
 def run(arguments: Arguments) -> UnexplainedForces:
     """Locate, and print or write what was asked for."""
-    if arguments.window is not None and not arguments.window > 0:
-        raise RecordingError("a window must have a length", expected="--window above 0 s", found=arguments.window)
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     model = given_model(arguments.model, recording)
     for path in (arguments.html, arguments.png):
