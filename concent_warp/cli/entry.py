@@ -125,18 +125,19 @@ def _run(command: str, arguments: Sequence[str]) -> None:
     import tyro
 
     from concent_warp.checks import check_settings, named_as
+    from concent_warp.cli.help_text import ALL, readable_help
     from concent_warp.cli.option_names import option_namer
     from concent_warp.files import claimed_files
     from concent_warp.run_folder import INVOCATION
 
     INVOCATION.set((command, *arguments))
-    with _loading(command, help_only=bool({"-h", "--help"} & set(arguments))):
+    with _loading(command, help_only=bool({"-h", "--help", ALL} & set(arguments))):
         module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
         with named_as(option_namer(module.Arguments)):
-            with _one_sentence(command):
+            with _one_sentence(command), readable_help(command, everything=ALL in arguments):
                 settings = tyro.cli(
                     module.Arguments,
-                    args=arguments,
+                    args=["--help" if one == ALL else one for one in arguments],
                     prog=f"concent {command}",
                     description=f"{_summary(module.Arguments)}\n\nExample: {EXAMPLES[command]}",
                     config=(tyro.conf.HelptextFromCommentsOff,),

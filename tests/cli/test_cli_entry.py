@@ -10,6 +10,8 @@ import tyro
 
 from concent_warp.cli import entry, main
 from concent_warp.cli.entry import COMMANDS, EXAMPLES
+from concent_warp.cli.help_text import ALL, main_help
+from concent_warp.cli.option_names import options_of
 
 HEAVY = ("numpy", "mujoco", "warp", "torch", "matplotlib", "rich", "tyro", "trimesh", "scipy")
 
@@ -36,6 +38,34 @@ def test_nothing_heavy_is_imported_before_it_is_needed(code):
 def test_every_command_explains_its_options(command, capsys):
     assert main([command, "--help"]) == 0
     assert f"usage: concent {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_the_main_options_and_help_all_the_advanced_ones_as_well(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    texts = []
+    for option in ("--help", ALL):
+        assert main([command, option]) == 0
+        texts.append(capsys.readouterr().out)
+        assert max(len(line) for line in texts[-1].splitlines() if not line.startswith("Example: ")) <= 80
+    names = {option for _, option in options_of(import_module(module_name(command)).Arguments) if option[0] == "-"}
+    assert all(name in texts[1] for name in names)
+    advanced = {name for name in names if "." in name and not name.startswith("--robot.")}
+    assert not any(f"\n│ {name} " in texts[0] or f"\n  {name} " in texts[0] for name in advanced)
+    assert ("advanced settings, shown by" in texts[0]) == bool(advanced or command == "geometry")
+    assert len(texts[0].splitlines()) < 80
+    assert "advanced settings, shown by" not in texts[1]
+
+
+def test_help_without_frames_is_cut_as_well():
+    text = "usage\n\n options   \n -------\n  --a INT\n\n fit.b options  \n -------\n  --fit.b.c INT\n"
+    shown = text[: text.index(" fit.b")]
+    assert main_help(text, "fit") == f"{shown}\nadvanced settings, shown by concent fit --help-all:\n  fit.b\n"
+    assert main_help(shown, "fit") == shown
+
+
+def module_name(command):
+    return f"concent_warp.cli.commands.{command.replace('-', '_')}"
 
 
 def test_no_arguments_show_the_help_and_version_the_version(capsys):
