@@ -10,10 +10,19 @@ import pytest
 
 from concent_warp import run_folder as module
 from concent_warp.errors import ConcentError
+from concent_warp.files import not_written
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.render.dataset.robomimic import RobomimicWriter
-from concent_warp.run_folder import INVOCATION, SETTINGS, UNFINISHED, claim_file, run_folder, write_settings
+from concent_warp.run_folder import (
+    INVOCATION,
+    SETTINGS,
+    UNFINISHED,
+    claim_file,
+    lock_folder,
+    run_folder,
+    write_settings,
+)
 
 COMMAND = ("fit", "demo.h5", "--overwrite")
 CONTINUE = "concent fit demo.h5 --resume"
@@ -278,3 +287,32 @@ def test_devices_are_no_files_to_write(tmp_path):
     claim_file(tmp_path / "a", overwrite=False)
     with pytest.raises(ConcentError, match="not a file"):
         claim_file(Path(os.devnull), overwrite=True)
+
+
+@pytest.mark.parametrize("state", [True, False])
+@pytest.mark.parametrize("error", [not_written(Path("a"), OSError(28, "full")), OSError(28, "full", "a")])
+def test_full_disk_says_how_to_continue_where_there_is_a_state(tmp_path, state, error):
+    def work() -> None:
+        with run_folder(tmp_path / "run", overwrite=False) as claimed:
+            write(claimed.path, "new", state=state)
+            raise error
+
+    with pytest.raises(ConcentError) as raised:
+        work()
+    said = "a: the file cannot be written; found full; make room on the disk, or choose another place"
+    assert str(raised.value) == (f"{said}; the state is saved, continue with `{CONTINUE}`." if state else f"{said}.")
+    assert (tmp_path / "run").exists() == state
+
+
+def test_other_errors_of_the_system_pass(tmp_path):
+    error = stopped(tmp_path / "run", "new", FileNotFoundError, state=True)
+    assert str(error) == "early"
+
+
+def test_folder_is_kept_for_one_process(tmp_path):
+    folder = tmp_path / "pieces"
+    match = "another command is writing to this folder"
+    with lock_folder(folder), pytest.raises(ConcentError, match=match), lock_folder(folder):
+        pass
+    with lock_folder(folder):
+        assert folder.is_dir()

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.errors import RecordingError
+from concent_warp.errors import ConcentError, RecordingError
 from concent_warp.perception.point_tracking import _chosen_stream
 from concent_warp.reality.record import RealityCfg
 from concent_warp.reality.sensors.footage import FootageCfg, apply_tone_curve, footage
@@ -82,3 +82,23 @@ def test_tone_curve_keeps_black_and_order():
     levels = apply_tone_curve(np.linspace(0, 1, 20)[:, None].repeat(3, axis=1), FootageCfg())
     assert np.allclose(levels[0], 0)
     assert (np.diff(levels, axis=0) >= 0).all()
+
+
+def test_a_video_that_lacks_frames_is_an_error(tmp_path, monkeypatch):
+    from concent_warp.reality.sensors import video
+
+    frames = np.random.default_rng(0).integers(0, 255, (8, 64, 64, 3), dtype=np.uint8)
+    (tmp_path / "a.mp4").write_text("earlier")
+    grab = video._check_video
+    monkeypatch.setattr(
+        video, "_check_video", lambda path, count, to: (path.write_bytes(b"cut"), grab(path, count, to))
+    )
+    with pytest.raises(
+        ConcentError, match=r"a\.mp4: the video cannot be written; expected 8 frames, found 0; make room"
+    ):
+        video.write_video(tmp_path / "a.mp4", frames, 10.0)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.mp4", "earlier")]
+    monkeypatch.undo()
+    video.write_video(tmp_path / "a.mp4", frames, 10.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+    video._check_video(tmp_path / "a.mp4", 8, tmp_path)

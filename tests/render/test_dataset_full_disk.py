@@ -55,3 +55,48 @@ def test_a_full_disk_ends_in_an_error_and_the_data_set_can_be_continued(tmp_path
     write(continued, [key for key in range(4) if not continued.has(key)])
     assert continued.finish() == 4
     assert not list(tmp_path.rglob("*partial*"))
+
+
+VIDEO = """
+    import resource, signal, sys
+    from pathlib import Path
+    import numpy as np
+    from concent_warp.render.dataset.video import VideoWriter, join_videos
+    folder, what, size = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 255, (60, 64, 64, 3), dtype=np.uint8)
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size,) * 2)
+
+    def film(path):
+        video = VideoWriter(path, 10, (64, 64))
+        try:
+            for image in images:
+                video.add(image)
+            video.close()
+        finally:
+            video.abandon()
+
+    try:
+        if what == "film":
+            limit()
+            film(folder / "film.mp4")
+        else:
+            film(folder / "part.mp4")
+            limit()
+            join_videos([folder / "part.mp4"] * 2, [60, 60], 10, folder / "film.mp4")
+    except OSError as error:
+        print(error)
+        sys.exit(2)
+"""
+
+
+@pytest.mark.parametrize("size", [0, 1_000, 100_000])
+@pytest.mark.parametrize("what", ["film", "join"])
+def test_a_video_on_a_full_disk_is_an_error_and_no_crash(tmp_path, what, size):
+    command = [sys.executable, "-c", textwrap.dedent(VIDEO), str(tmp_path), what, str(size)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "")
+    assert done.stdout == f"[Errno 27] File too large: '{tmp_path}/film.mp4'\n"
