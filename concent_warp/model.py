@@ -19,6 +19,8 @@ from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none, write_text
 from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.shapes.objects import load_object
+from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
 FORMAT = "concent-model"
@@ -288,3 +290,42 @@ def load_model(path: str | Path) -> Model:
         ()
     """
     return Model.load(path)
+
+
+def model_with_spheres(
+    source: Path,
+    cfg: ContactGeometryCfg | None = None,
+    *,
+    objects: Sequence[str] = (),
+    added: Mapping[str, Path] | None = None,
+    scale: float = 1.0,
+) -> Model:
+    """Return the model of a scene with contact spheres on its objects; that of a model file as it is.
+
+    Args:
+        source: MJCF scene (.xml), recording, or model file (.toml).
+        cfg: How spheres are laid.
+        objects: Bodies to lay spheres on; by default those that the scene names, else those with a free joint.
+        added: Files of objects that are added to the scene first, by name: meshes, point clouds or Gaussian splats.
+        scale: Factor from the unit of these files to metres.
+
+    Raises:
+        ConcentError: A file cannot be read, or no spheres can be laid.
+    """
+    if source.suffix == ".toml":
+        return Model.load(source)
+    if source.suffix == ".xml":
+        scene = Scene.from_mjcf(source)
+    else:
+        from concent_warp.recording.load import load_recording
+
+        scene = Scene(load_recording(source).scene, source=str(source))
+    surfaces = {}
+    if added:
+        spec = scene.spec()
+        for name, file in added.items():
+            found = load_object(file, name, scale=scale)
+            found.add_to(spec)
+            surfaces[name] = found.surface
+        scene = Scene.from_spec(spec, source=scene.source)
+    return Model(scene, (cfg or ContactGeometryCfg()).build(scene, objects or None, surfaces=surfaces))

@@ -119,6 +119,11 @@ class RenderTraining:
         """Return a network on the device, channels last, which convolutions are quicker with."""
         return network.to(self.device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
+    @property
+    def steps(self) -> int:
+        """Steps of all networks together."""
+        return sum(one.cfg.steps for one in self.trainings.values())
+
     def learn(self, report: Report | None = None) -> None:
         """Train until every network has had its steps; a checkpoint is left when interrupted."""
         saved = time.monotonic()

@@ -14,10 +14,8 @@ from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.errors import SceneError
 from concent_warp.files import all_or_none
-from concent_warp.model import Model
+from concent_warp.model import Model, model_with_spheres
 from concent_warp.run_folder import claim_file, make_folder
-from concent_warp.scene.scene import Scene
-from concent_warp.scene.shapes.objects import load_object
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.scene.spheres.export import save_mjcf
 
@@ -50,7 +48,9 @@ def run(arguments: Arguments) -> Model:
     for path in (arguments.out, arguments.export):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
-    model = _build(arguments)
+    model = model_with_spheres(
+        arguments.scene, arguments.geometry, objects=arguments.objects, added=arguments.add, scale=arguments.scale
+    )
     with all_or_none():
         if arguments.out is not None:
             make_folder(arguments.out.parent)
@@ -68,26 +68,3 @@ def run(arguments: Arguments) -> Model:
         radius = geometry.radius[rows] * 1e3
         say(f"{body}: {len(rows)} spheres, radius {radius.min():.1f} to {radius.max():.1f} mm")
     return model
-
-
-def _build(arguments: Arguments) -> Model:
-    """Return the model of a scene, a recording or a model file."""
-    path = arguments.scene
-    if path.suffix == ".toml":
-        return Model.load(path)
-    if path.suffix == ".xml":
-        scene = Scene.from_mjcf(path)
-    else:
-        from concent_warp.recording.load import load_recording
-
-        scene = Scene(load_recording(path).scene, source=str(path))
-    surfaces = {}
-    if arguments.add:
-        spec = scene.spec()
-        for name, file in arguments.add.items():
-            found = load_object(file, name, scale=arguments.scale)
-            found.add_to(spec)
-            surfaces[name] = found.surface
-        scene = Scene.from_spec(spec, source=scene.source)
-    objects = arguments.objects or None
-    return Model(scene, arguments.geometry.build(scene, objects, surfaces=surfaces))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +13,7 @@ import tyro
 
 from concent_warp.checks import Count
 from concent_warp.cli.options import DeviceOption, OutPath
-from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written, status_bar
+from concent_warp.cli.terminal import quiet_warp, say, say_written, status_bar
 from concent_warp.recording.load import load_recording
 from concent_warp.render.networks.cfg import RenderTrainCfg
 from concent_warp.run_folder import check_run_folder, run_folder, write_settings
@@ -55,31 +58,33 @@ def run(arguments: Arguments) -> RenderTraining:
     check_run_folder(arguments.out, overwrite=arguments.overwrite, resume=arguments.resume)
     recording = load_recording(arguments.recording)
     quiet_warp()
-    import warp as wp
+    from concent_warp.render.networks.train import CHECKPOINT
+    from concent_warp.render.networks.train_networks import train_networks
 
-    from concent_warp.render.networks.pairs import pairs_of
-    from concent_warp.render.networks.train import CHECKPOINT, RenderTraining
-    from concent_warp.simulate.warp_engine import preferred_device
+    folder = arguments.out
+    with (
+        run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed,
+        ExitStack() as bars,
+    ):
+        shown: dict[str, Callable[[float, str, float | None], None]] = {}
 
-    device = arguments.device or preferred_device()
-    cfg, folder = arguments.cfg(), arguments.out
-    with run_folder(folder, overwrite=arguments.overwrite, resume=arguments.resume) as claimed:
-        with progress_bar("simulation's images") as progress:
-            pairs = pairs_of(recording, arguments.cameras, device=device, progress=progress)
-        training = RenderTraining(pairs, cfg, claimed.path, device=str(wp.device_to_torch(wp.get_device(device))))
-        if arguments.resume and (claimed.path / CHECKPOINT).exists():
-            training.resume()
-        write_settings(claimed.path, arguments)
-        names = list(training.trainings)
-        total = sum(one.cfg.steps for one in training.trainings.values())
-        with status_bar("training") as update:
+        def progress(work: str, share: float, text: str) -> None:
+            if work not in shown:
+                bars.close()
+                shown[work] = bars.enter_context(status_bar(work))
+            shown[work](share, text, None)
 
-            def show(name: str, loss: float) -> None:
-                done = sum(one.done for one in training.trainings.values())
-                update(done / total, f"{name} ({names.index(name) + 1} of {len(names)}), loss {loss:.4f}", None)
-
-            training.learn(show)
-    frames = ", ".join(f"{one.camera.name} {len(one)}" for one in pairs)
-    say(f"trained on frames: {frames}; {total} steps of {len(names)} networks")
+        training = train_networks(
+            recording,
+            claimed.path,
+            arguments.cfg(),
+            cameras=arguments.cameras,
+            device=arguments.device,
+            resume=arguments.resume,
+            started=partial(write_settings, claimed.path, arguments),
+            progress=progress,
+        )
+    frames = ", ".join(f"{one.camera.name} {len(one)}" for one in training.pairs)
+    say(f"trained on frames: {frames}; {training.steps} steps of {len(training.trainings)} networks")
     say_written(folder / CHECKPOINT)
     return training
