@@ -34,7 +34,7 @@ class Args:
     rows: Path = ROOT / "runs" / "robustness" / "at_once.jsonl"
     """File of the measurements, from which an interrupted run goes on."""
     inputs: Path = ROOT / "runs" / "robustness" / "inputs"
-    """Folder of the commands' inputs, kept for the next run."""
+    """Folder of the commands' inputs, kept for the next run; to be deleted where formats of files have changed."""
     only: tuple[str, ...] = ()
     """Commands; all by default."""
     table: bool = False

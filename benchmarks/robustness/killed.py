@@ -80,7 +80,7 @@ class Args:
     rows: Path = ROOT / "runs" / "robustness" / "killed.jsonl"
     """File of the measurements, from which an interrupted run goes on."""
     inputs: Path = ROOT / "runs" / "robustness" / "inputs"
-    """Folder of the commands' inputs, kept for the next run."""
+    """Folder of the commands' inputs, kept for the next run; to be deleted where formats of files have changed."""
     only: tuple[str, ...] = ()
     """Commands; all by default."""
     table: bool = False
@@ -144,7 +144,7 @@ def trial(
             "share": round(after / seconds, 3),
             "files": len(left),
             "unfinished": len(unfinished(folder / "out")),
-            "corrupt": corrupt,
+            "corrupt": corrupt + (unreadable(folder / "out") if done.code == 0 else []),
             "resumed": done.code == 0,
             "said": [] if done.code == 0 else done.said,
             "left": unfinished(folder / "out") if done.code == 0 else [],

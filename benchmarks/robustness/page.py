@@ -41,7 +41,7 @@ def killed(data: dict[str, Any]) -> str:
     for command, trials in data["trials"].items():
         done = [t for t in trials if "error" not in t]
         counts = [sum(t["resumed"] for t in done), sum(len(t["corrupt"]) for t in done)]
-        counts += [sum(t["resumed"] and not (t["differs"] or t["left"]) for t in done)]
+        counts += [sum(t["resumed"] and not (_without_videos(t["differs"]) or t["left"]) for t in done)]
         begun = sum(t["files"] > 0 for t in done)
         moments = f"{min(t['after'] for t in done):.1f} to {max(t['after'] for t in done):.1f}"
         cells = [f"{data['seconds'][command]:.0f}", moments, f"{begun} of {len(done)}", f"{counts[0]} of {len(done)}"]
@@ -59,8 +59,9 @@ def killed(data: dict[str, Any]) -> str:
 no measure of speed.
 
 **{resumed} of {count} runs were resumed, {corrupt} files were corrupt, {same} of {count} results are the same.**
-*Same*: all files byte by byte, except times, paths and TensorBoard's log; checkpoints of trainings to the last bit of
-weights, optimiser, worlds and random generators; of `diagnose` the JSON that it prints.
+*Same*: all files byte by byte, except times, paths, TensorBoard's log and encoded videos, which differ between two
+uninterrupted runs as well; checkpoints of trainings to the last bit of weights, optimiser, worlds and random
+generators; of `diagnose` the JSON that it prints.
 
 {table(head, rows)}
 [Killed while writing, and interrupted](resume.md): a fit.
@@ -123,6 +124,11 @@ all files are of the one that succeeded, and none is unfinished.
 {table(head, rows)}
 Sentences, such as: `{said[0]}`
 """
+
+
+def _without_videos(names: Sequence[str]) -> list[str]:
+    """Return the names of files that are no videos."""
+    return [name for name in names if not name.endswith(".mp4")]
 
 
 def _listed(words: Sequence[str]) -> str:
