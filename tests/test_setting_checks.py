@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import concent_warp as cw
-from concent_warp.checks import check_at_least, check_device, check_seed, check_settings
+from concent_warp.checks import Bounds, check_at_least, check_device, check_seed, check_settings
 from concent_warp.cli import main
 from concent_warp.cli.entry import COMMANDS
 from concent_warp.errors import ConcentError
@@ -114,3 +114,50 @@ def test_mujoco_refuses_no_threads_and_no_memory(option):
     model = cw.load_policy("shape_sorter").run.model
     with pytest.raises(cw.EngineError, match=f"{option} is out of bounds"):
         partial(MujocoEngine, model, **{option: 0})()
+
+
+@pytest.mark.parametrize(
+    ("function", "cfg", "said"),
+    [
+        ("fit_geometry", cw.FitCfg(held_out=1.0), "held_out is out of bounds; expected at least 0 and below 1"),
+        ("fit_geometry", cw.FitCfg(generations=-1), "generations is out of bounds"),
+        ("fit_effects", cw.FitEffectsCfg(window=0.0), "window is out of bounds; expected above 0"),
+        ("compare", cw.CompareCfg(seed=-1), "seed is out of bounds; expected 0 to 4294967295"),
+        ("diagnose", cw.DiagnoseCfg(jobs=0), "jobs is out of bounds; expected at least -1 and at most 4096, but not 0"),
+        ("diagnose", cw.DiagnoseCfg(significance_level=float("nan")), "significance_level is not a number"),
+        ("locate_forces", cw.LocateForcesCfg(length=-0.1), "length is out of bounds"),
+        ("suggest_experiment", cw.SuggestExperimentCfg(finalists=0), "finalists is out of bounds; expected at least 1"),
+        ("ground", cw.GroundCfg(fit=cw.FitCfg(block=0.0)), "fit.block is out of bounds; expected above 0"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_functions_of_the_library_refuse_settings_out_of_bounds(function, cfg, said, tmp_path):
+    recording = cw.load_recording(cw.example("servo"))
+    model = cw.Model.from_recording(recording)
+    first = {
+        "compare": ({"model": model}, recording),
+        "suggest_experiment": ({"model": model}, recording),
+        "ground": (recording, tmp_path / "run"),
+    }
+    with pytest.raises(ConcentError, match=f"^{said}"):
+        getattr(cw, function)(*first.get(function, (model, recording)), cfg)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("function", ["evaluate", "play", "render"])
+def test_functions_of_policies_refuse_settings_out_of_bounds(function, tmp_path):
+    policy = cw.load_policy("shape_sorter")
+    cfg = {"evaluate": cw.EvaluateCfg(action_scale=1.5), "play": cw.PlayCfg(port=-1), "render": cw.RenderCfg(size=0)}
+    out = (tmp_path / "run",) if function == "render" else ()
+    with pytest.raises(ConcentError, match=r"^(action_scale|port|size) is out of bounds; expected"):
+        getattr(cw, function)(policy, *out, cfg[function])
+    assert not (tmp_path / "run").exists()
+
+
+def test_bounds_are_said_in_words():
+    assert Bounds(0, 1, above_low=True).sentence() == "above 0 and at most 1"
+    assert Bounds(-1, 4, below_high=True, excluded=0).sentence() == "at least -1 and below 4, but not 0"
+    inside = [Bounds(0, 1, above_low=True).include(value) for value in (0, 0.5, 1, 2)]
+    assert inside == [False, True, True, False]
+    assert [Bounds(0, 1, below_high=True).include(value) for value in (-1, 0, 1)] == [False, True, False]
+    assert not Bounds(-1, 4, excluded=0).include(0)

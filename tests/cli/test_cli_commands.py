@@ -146,3 +146,23 @@ def test_a_model_with_more_bodies_than_were_recorded_is_refused(bench, tmp_path,
     more.write_text(text)
     assert main(["compare", str(bench / "demo.h5"), "--model", str(more)]) == 2
     assert "8 positions in the state, found 15" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare demo.h5 --model inset.toml --baseline surface.toml --every-phase",
+        "compare demo.h5 --model inset.toml",
+        "add --list",
+        "add --list --model inset.toml",
+        "add joint_damping --model inset.toml --fit demo.h5 --demonstrations demo_0 -o {out}/damped.toml",
+        "diagnose demo.h5 --model inset.toml --effects joint_damping --jobs 1",
+    ],
+)
+def test_tables_fit_80_columns(line, bench, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(bench)
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert main(line.format(out=tmp_path).split()) == 0
+    rows = [row for row in capsys.readouterr().out.splitlines() if set(row) & set("│┃━─")]
+    assert rows
+    assert max(map(len, rows)) <= 80
