@@ -1,11 +1,14 @@
 """Commands that are killed, that find the disk full, and that are started twice: a few of each benchmark."""
 
+import signal
+import tempfile
+import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks.robustness import at_once, disk_full, killed
-from benchmarks.robustness.commands import SERVO_MODEL, WRITING, Ended, prepare
+from benchmarks.robustness.commands import SERVO_MODEL, WRITING, Ended, ended, launch, prepare
 from benchmarks.robustness.contents import hashes, unfinished, unreadable
 from benchmarks.robustness.page import page
 
@@ -48,6 +51,32 @@ def test_a_diagnosis_killed_at_a_late_moment_gives_the_same_result(inputs, tmp_p
     assert {name: row[name] for name in ("resumed", "corrupt", "left", "differs")} == {
         "resumed": True, "corrupt": [], "left": [], "differs": [],
     }  # fmt: skip
+
+
+def test_a_terminated_diagnosis_leaves_neither_processes_nor_shared_memory(inputs, tmp_path):
+    words = killed.KILLABLE["diagnose"].writing.words(inputs, tmp_path / "out")
+    process = launch(words, tmp_path, "last")
+    begun = time.monotonic()
+    while not list(tmp_path.glob("out/*.npz")) and time.monotonic() - begun < 120:
+        time.sleep(0.05)
+    started = killed.descendants(process.pid)
+    assert len(started) > 2
+    process.send_signal(signal.SIGTERM)
+    done = ended(process, tmp_path, "last", begun)
+    assert done.code == 143
+    assert done.said[-1].startswith("concent diagnose: terminated. Finished parts are kept; continue with: concent ")
+    until = time.monotonic() + 30
+    while left(process.pid, started) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert left(process.pid, started) == []
+    assert not list(tmp_path.glob("MUJOCO_LOG.TXT"))
+
+
+def left(pid: int, started: list[int]) -> list[str]:
+    """Return what is left of a process: those that it started, and temporary files that bear its number."""
+    alive = [str(one) for one in started if one != pid and Path(f"/proc/{one}/exe").exists()]
+    places = (Path("/dev/shm"), Path(tempfile.gettempdir()))
+    return alive + [path.name for place in places for path in place.glob(f"*[-_]{pid}[-_]*")]
 
 
 def result(out: Path, code: int, *said: str) -> Ended:
