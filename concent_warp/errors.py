@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import unicodedata
 
-UNPRINTABLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Unicode categories of characters that steer a terminal or are not seen: control, format, surrogate, separators."""
+UNPRINTABLE = ("Cc", "Cf", "Cs", "Zl", "Zp", "Cn", "Co")
+"""Unicode categories of characters that steer a terminal or are not seen: control, format, surrogate, separators, those
+without a meaning."""
 LONGEST_MESSAGE = 2000
 """Characters of a message; of a longer one the middle is left out."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import time
@@ -86,6 +87,36 @@ def quiet_warp() -> None:
     cache = Path(warp.config.kernel_cache_dir or Path.home() / ".cache" / "warp" / warp.__version__)
     if not (cache.is_dir() and any(cache.iterdir())):
         _console(stderr=True).print("compiling kernels: once for this version of Warp, kept for later runs")
+    if not _has_cuda_driver():
+        with _no_native_output():
+            warp.init()
+
+
+def _has_cuda_driver() -> bool:
+    """Return whether there is a CUDA driver; where there is none, Warp says so on standard error."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def _no_native_output() -> Iterator[None]:
+    """Drop what libraries that are not Python write to standard error, as Warp does where there is no CUDA driver."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # there is no standard error
+        yield
+        return
+    try:
+        sys.stderr.flush()
+        with open(os.devnull, "wb") as null:
+            os.dup2(null.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
 
 
 @contextmanager

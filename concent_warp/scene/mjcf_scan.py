@@ -28,6 +28,8 @@ FILE_FOLDERS = {"meshdir", "texturedir", "assetdir"}
 """Attributes of <compiler> that name folders of files."""
 PICTURES = ("texture", "hfield")
 """Elements whose files are pictures, or grids with a header of two sizes."""
+OFFSCREEN = ("offwidth", "offheight")
+"""Attributes of <global> that are the size of an image."""
 UNIT_BYTES = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40, "P": 1 << 50, "E": 1 << 60}
 PNG = b"\x89PNG\r\n\x1a\n"
 UNUSUAL_COUNT = 10_000
@@ -164,13 +166,18 @@ class _Scanner:
         if tag not in REPEATING:
             return 1
         try:
-            return math.prod(max(int(n), 1) for n in attributes.get("count", "1").split())
+            counts = [int(n) for n in attributes.get("count", "1").split()]
         except ValueError:
             raise self.error(f"<{tag}> has no whole count", found=attributes["count"][:40]) from None
+        if min(counts, default=1) < 0:
+            raise self.error(f"<{tag}> has a negative count", expected="at least 0", found=attributes["count"][:40])
+        return math.prod(max(n, 1) for n in counts)
 
     def check_sizes(self, tag: str, attributes: dict[str, str]) -> None:
         """Refuse sizes above the limits, and mark large ones as unusual."""
         for name, value in attributes.items():
+            if name.endswith("range"):
+                self.check_range(tag, name, value)
             if not COUNTS.fullmatch(name):
                 continue
             largest = max((abs(n) for n in _numbers(value)), default=0.0)
@@ -185,6 +192,8 @@ class _Scanner:
         if tag in PICTURES:
             sides = [attributes.get(n, "1") for n in (("width", "height") if tag == "texture" else ("nrow", "ncol"))]
             self.check_cells(tag, math.prod(max(_numbers(side), default=1.0) for side in sides))
+        if tag == "global":
+            self.check_cells(tag, math.prod(max(_numbers(attributes.get(n, "1")), default=1.0) for n in OFFSCREEN))
         if tag == "size" and (memory := attributes.get("memory", "").strip()):
             unit = UNIT_BYTES.get(memory[-1].upper(), 1)
             asked = max(_numbers(memory.rstrip("KMGTPEkmgtpe")), default=0.0) * unit
@@ -195,6 +204,12 @@ class _Scanner:
                     expected=_most(self.limits.scene_arena_bytes, "bytes"),
                     found=memory[:40],
                 )
+
+    def check_range(self, tag: str, name: str, value: str) -> None:
+        """Refuse a range whose ends are reversed, which MuJoCo takes for none."""
+        ends = _numbers(value)
+        if len(ends) == 2 and ends[0] > ends[1]:
+            raise self.error(f"<{tag} {name}> is reversed", expected="its lower end first", found=value[:40])
 
     def check_cells(self, tag: str, cells: float) -> None:
         """Refuse a picture or a grid that is too large."""

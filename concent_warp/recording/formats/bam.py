@@ -39,8 +39,9 @@ RESISTANCE = 4.0
 TIMESTEP = 0.002
 """[s]."""
 JOINT, DRIVE, SENSOR = "servo", "servo", "servo_position"
-SETUP = ("mass", "length", "kp", "vin")
-"""What all logs of a recording share, for it is part of the scene."""
+SETUP = {"mass": 1e3, "length": 1e2, "kp": 1e6, "vin": 1e3}
+"""What all logs of a recording share, for it is part of the scene, and the largest value of each, in the log's units:
+far beyond what a servo moves, and small enough for MuJoCo."""
 
 
 @dataclass(frozen=True)
@@ -192,11 +193,12 @@ def _read_document(path: Path) -> dict[str, Any]:
 def _setup_of(document: dict[str, Any], path: Path) -> Setup:
     """Return payload and controller of a log."""
     values = []
-    for key in SETUP:
+    for key, largest in SETUP.items():
         value = document.get(key)
-        if not is_number(value) or value <= 0:
+        if not is_number(value) or not 0 < value <= largest:
+            expected = f"above 0 and at most {largest:g}"
             raise RecordingError(
-                f"{key} of the set-up is not right", where=path, expected="> 0", found=repr(value)[:80]
+                f"{key} of the set-up is not right", where=path, expected=expected, found=repr(value)[:80]
             )
         values.append(float(value))
     return Setup(*values)

@@ -94,7 +94,8 @@ def _check_size(folder: Path) -> None:
             raise RecordingError(
                 "the CSV files are too large",
                 where=path,
-                expected=f"{limits().file_bytes} bytes a file",
+                expected=f"at most {limits().file_bytes} bytes a file and {limits().recording_bytes} in all",
+                found=f"{size} and {total}",
                 fix=raising("file_bytes"),
             )
 

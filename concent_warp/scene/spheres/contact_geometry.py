@@ -18,6 +18,8 @@ from concent_warp.errors import ModelError
 
 SPHERE_GEOM_GROUP = 3
 """MuJoCo geom group of the spheres (3: collision geoms, by convention hidden in the viewer)."""
+LARGEST = {"position": 1e3, "radius": 1e3, "mass": 1e9, "friction": 1e9}
+"""Largest magnitudes of a sphere's numbers, in SI units: far beyond what a scene holds."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +63,18 @@ class ContactGeometry:
             found = np.shape(getattr(self, name))
             if found != shape:
                 raise ModelError(f"contact geometry: wrong shape of {name}", expected=shape, found=found)
-        for name in ("position", "radius", "mass", "friction"):
-            if not np.isfinite(getattr(self, name)).all():
+        for name, largest in LARGEST.items():
+            values = getattr(self, name)
+            if not np.isfinite(values).all():
                 raise ModelError(
                     f"contact geometry: {name} holds values that are not finite", expected="finite numbers"
+                )
+            if count and np.abs(values).max() > largest:
+                raise ModelError(
+                    f"contact geometry: {name} is too large",
+                    expected=f"at most {largest:g}",
+                    found=f"{np.abs(values).max():g}",
+                    fix="check the units, which are m and kg",
                 )
         if count and (self.radius <= 0).any():
             worst = int(np.argmin(self.radius))

@@ -1,0 +1,1 @@
+"""Bad input for every command: what is refused, how, and what must be accepted."""
