@@ -53,6 +53,7 @@ def read_checkpoint(
     if not path.is_file():
         raise error("no such checkpoint", where=path, expected="a checkpoint file")
     _check_size(path, error)
+    _check_sums(path, error)
     document = _load(path, error)
     if not isinstance(document, dict) or not set(keys) <= set(document):
         found = sorted(map(str, document)) if isinstance(document, dict) else type(document).__name__
@@ -78,6 +79,22 @@ def _check_size(path: Path, error: type[ConcentError]) -> None:
     if size > most:
         fix = raising("checkpoint_bytes")
         raise error("the checkpoint is too large", where=path, expected=f"at most {most} bytes", found=size, fix=fix)
+
+
+def _check_sums(path: Path, error: type[ConcentError]) -> None:
+    """Raise an error unless all parts of an archive have their checksums, which torch does not compare."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except Exception as reason:  # zipfile and its decompressors raise whatever they do
+        raise error("not a checkpoint", where=path, found=" ".join(str(reason).split())[:200]) from None
+    if damaged is not None:
+        raise error(
+            "the checkpoint is damaged",
+            where=path,
+            found=f"another checksum of {damaged}",
+            fix="take an earlier checkpoint or another copy",
+        )
 
 
 def _load(path: Path, error: type[ConcentError]) -> Any:

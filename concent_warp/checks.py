@@ -119,6 +119,8 @@ Duration = Annotated[float, Bounds(0, 1e6)]
 """A time that may be 0 [s]."""
 PositiveDuration = Annotated[float, Bounds(0, 1e6, above_low=True)]
 """A time [s]."""
+WindowLength = Annotated[float, Bounds(1e-3, 1e6)]
+"""Length of pieces of a demonstration that are simulated or averaged on their own [s]."""
 TimeStep = Annotated[float, Bounds(1e-6, 1)]
 """Time step of a simulation [s]."""
 Rate = Annotated[float, Bounds(0.001, 1e5)]

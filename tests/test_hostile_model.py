@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recording.bad_input_cases import write_good
+from benchmarks.bad_input.sound_inputs import write_recording_and_model
 from concent_warp.errors import ConcentError, ModelError
 from concent_warp.model import ContactParameters, Model
 from concent_warp.recording.formats.bam import read_bam
@@ -17,7 +17,7 @@ EFFECT = '\n[[effect]]\nname = "joint_friction"\ntarget = ["elbow"]\nvalues = [{
 
 @pytest.fixture
 def model(tmp_path) -> Path:
-    return write_good(tmp_path)[1]
+    return write_recording_and_model(tmp_path)[1]
 
 
 def refusal(path: Path) -> str:
@@ -80,6 +80,12 @@ def test_senseless_effects_are_refused(model, value, interval, message):
     ("name", "value", "message"),
     [
         ("mass", np.array([0.03, -0.03]), "a mass is negative; expected >= 0 kg, found -0.03 at sphere 1"),
+        (
+            "radius",
+            np.array([0.01, 1e300]),
+            "radius is too large; expected at most 1000, found 1e+300; check the units",
+        ),
+        ("position", np.full((2, 3), -1e300), "position is too large; expected at most 1000, found 1e+300"),
         ("friction", np.array([-0.5, 0.5]), "a friction is negative; expected >= 0, found -0.5 at sphere 0"),
         ("radius", np.array([0.01, np.nan]), "radius holds values that are not finite"),
         ("radius", np.array(0.01), "wrong shape of body; expected (-1,)"),

@@ -386,7 +386,9 @@ class PpoCfg:
     """Mini-batches per pass."""
     hidden: tuple[Annotated[int, Bounds(1, 100_000)], ...] = (256, 256, 256)
     """Sizes of the hidden layers of policy and value function."""
-    activation: str = "swish"
+    activation: Literal[
+        "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
+    ] = "swish"
     """Activation function of both networks."""
     std: Positive = 0.6
     """Initial standard deviation of the Gaussian before squashing [-]."""
@@ -476,7 +478,10 @@ class TrainCfg:
         if not path.is_file():
             raise TrainError("the configuration of a training is missing", where=path)
         try:
-            return decode(TrainCfg, read_toml(path, TrainError), str(path))
+            settings = read_toml(path, TrainError)
+            if not settings:
+                raise TrainError("the configuration of a training is empty", where=path, fix="restore the run folder")
+            return decode(TrainCfg, settings, str(path))
         except TrainError:
             raise
         except ConcentError as error:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from concent_warp.errors import TrainError
+from concent_warp.errors import EventsError, TrainError
 from concent_warp.events.extract import extract
 from concent_warp.events.sequence import ContactEventSequence
 from concent_warp.model import Model
@@ -38,6 +38,37 @@ class TrainingRun:
     """Holds one demonstration."""
     events: ContactEventSequence
     cfg: TrainCfg
+
+    def __post_init__(self) -> None:
+        self._check_events()
+
+    def _check_events(self) -> None:
+        """Check that the events are of this demonstration and this model.
+
+        Raises:
+            EventsError: They name another demonstration, body or sphere.
+        """
+        events, name = self.events, self.recording[0].name
+        if events.demonstration != name:
+            raise EventsError(
+                "the contact events are of another demonstration",
+                expected=name,
+                found=events.demonstration,
+                fix="extract them with concent events",
+            )
+        m, geometry = self.model.scene.model, self.model.geometry
+        bodies = {m.body(i).name for i in range(m.nbody)}
+        for entity in events.entities:
+            sphere_of = None
+            if entity.sphere is not None and geometry is not None and 0 <= entity.sphere < len(geometry):
+                sphere_of = geometry.bodies[geometry.body[entity.sphere]]
+            if entity.body not in bodies or (entity.sphere is not None and entity.body != sphere_of):
+                number = "" if entity.sphere is None else f", sphere {entity.sphere}"
+                raise EventsError(
+                    f"the contact events name {entity.name!r}, which the model does not have",
+                    found=f"body {entity.body}{number}",
+                    fix="extract them from this model with concent events",
+                )
 
     @staticmethod
     def new(

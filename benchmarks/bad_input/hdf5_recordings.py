@@ -195,7 +195,7 @@ def values() -> Iterator[Named]:
     yield data("wrong size of qpos", "initial/qpos", lambda q: q[:-1])
     yield data("NaN in qpos", "initial/qpos", put(0, np.nan))
     yield data("qpos with a quaternion of length 0", "initial/qpos", put(4, 0.0))
-    yield data("wrong size of qvel", "initial/qvel", lambda q: np.zeros(99))
+    yield data("wrong size of qvel", "initial/qvel", lambda _: np.zeros(99))
     yield data("infinite qvel", "initial/qvel", put(0, np.inf))
     yield data("points of a wrong shape", "points/block/value", lambda p: p[..., :2])
     yield data("visible of a wrong shape", "points/block/visible", lambda v: v[:, :1])
@@ -240,6 +240,6 @@ def broken_files() -> Iterator[tuple[str, str, Callable[[Path], object]]]:
 
 def cases() -> Iterator[Case]:
     """Yield broken HDF5 recordings for all commands that read one."""
-    rotation = Rotation({name: line for name, line in READERS.items()})
+    rotation = Rotation(READERS)
     inputs = [(name, FILE, change) for make in (structures, values, sizes) for name, change in make()]
     yield from crossed("recordings (HDF5)", rotation, [*inputs, *broken_files()])

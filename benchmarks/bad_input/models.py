@@ -143,7 +143,8 @@ def geometries() -> Iterator[tuple[str, Change]]:
     arrays: dict[str, dict[str, object]] = {
         "a pickle in the geometry": {"radius": np.array([Code(), Code()], dtype=object)},
         "no spheres": {
-            "body": np.zeros(0, int), "position": np.zeros((0, 3)), "radius": two[:0], "mass": two[:0], "friction": two[:0]
+            "body": np.zeros(0, int), "position": np.zeros((0, 3)),
+            "radius": two[:0], "mass": two[:0], "friction": two[:0],
         },
         "no radii": {"radius": two[:0]},
         "radii missing": {"radius": None},
@@ -175,7 +176,8 @@ def sequences() -> Iterator[tuple[str, Change]]:
     yield "missing file", lambda folder: (folder / EVENTS).unlink()
     yield "a pipe", lambda folder: ((folder / EVENTS).unlink(), os.mkfifo(folder / EVENTS))
     contents = {"empty": "", "a list": "[]", "a number": "3", "100,000 brackets": "[" * 100_000, "null": "null",
-                "a number of 5,000 digits": '{"version": ' + "9" * 5000 + "}", "no more than a format": '{"format": "concent-events"}'}  # fmt: skip
+                "a number of 5,000 digits": '{"version": ' + "9" * 5000 + "}",
+                "no more than a format": '{"format": "concent-events"}'}  # fmt: skip
     for name, content in contents.items():
         yield name, write(EVENTS, content)
     yield "truncated", truncate(EVENTS)

@@ -39,31 +39,65 @@ SIGNED = (
 SENSELESS = {"FLOAT": ("nan", "-1", "inf", "1e300"), "INT": ("-1", "9" * 300, "1.5", "nan", "-1")}
 """Values that are tried in turn, by the kind of the option."""
 WRONG = {
-    "compare": ("--engine drake", "--phases some", "--places many", "--demonstrations demo_9", "--nothing", "--model"),
-    "fit": ("--method magic", "--fit.evolution.noise pink", "--fit.generatons 3", "--model", "--counts block",
-            "--fit.window 1e-9", "--counts brick 5", "--demonstrations demo_9", "--resume --overwrite"),
-    "diagnose": ("--effects magic", "--effects", "--window 0", "--jobs 0", "--demonstrations", "--additions 0"),
-    "locate": ("--window 0", "--png out.what", "--html scene.xml"),
-    "add": ("--target knee", "--set values=1", "--set magic", "--window 0"),
-    "geometry": ("--objects brick", "--add block gone.stl", "--scale 0", "--thin fat", "--count 0", "--export scene.xml"),
-    "replay": ("--demonstrations demo_9", "--engine", "-o scene.xml", "-o out.what"),
-    "events": ("--demonstrations demo_9", "--staging.target never", "-o scene.xml"),
-    "train": ("--stage dance", "--reward much", "--collision none", "--device cuda:7", "--device tpu", "--worlds 0",
-              "--worlds 1000000000", "--demonstration demo_9", "--events gone.json", "--begin-with gone", "--ppo.hidden 0",
-              "--environment.action.gripper-actuators hand", "--environment.action.tool-site gone", "--iterations 0",
-              "--environment.randomisation.mass 2 1", "--ppo.activation wish"),
-    "evaluate": ("--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",
-                 "--pretrained nobody", "-o scene.xml", "--pretrained a b"),
-    "play": ("--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0", "--checkpoint gone"),
-    "export": ("--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what"),
-    "splat-fit": ("--points gone.ply", "--longest 0", "--device cuda:7", "--fit.degree 9", "--scale 0"),
-    "render-train": ("--cameras nobody", "--device cuda:7", "--steps 0", "--network.size 63", "--network.factors",
-                     "--flow.ema 1"),
-    "render": ("--format mp4", "--keep none", "--splats block=gone.ply", "--splats block", "--codec h999", "--size 0",
-               "--networks gone", "--cameras nobody", "--pretrained", "--rate 0", "--lights.elevation 80 35"),
-    "demo": ("--seeds -1", "--seeds one", "--engine drake", "--unseen-seeds 99999999999", "--count 0", "--fit.held-out 1"),
-    "record": ("--seeds -1", "--robot gone.xml", "--robot.tcp-site gone", "--robot.gripper-actuators gone",
-               "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1"),
+    "compare": (
+        "--engine drake", "--phases some", "--places many", "--demonstrations demo_9", "--nothing", "--model",
+    ),
+    "fit": (
+        "--method magic", "--fit.evolution.noise pink", "--fit.generatons 3", "--model", "--counts block",
+        "--fit.window 1e-9", "--counts brick 5", "--demonstrations demo_9",
+    ),
+    "diagnose": (
+        "--effects magic", "--window 0", "--jobs 0", "--additions 0",
+    ),
+    "locate": (
+        "--window 0", "--png out.what", "--html scene.xml",
+    ),
+    "add": (
+        "--target knee", "--set values=1", "--set magic", "--window 0",
+    ),
+    "geometry": (
+        "--objects brick", "--add block gone.stl", "--scale 0", "--thin fat", "--count 0", "--export scene.xml",
+    ),
+    "replay": (
+        "--demonstrations demo_9", "--engine", "-o scene.xml",
+    ),
+    "events": (
+        "--demonstrations demo_9", "--staging.target never", "-o scene.xml",
+    ),
+    "train": (
+        "--stage dance", "--reward much", "--collision none", "--device cuda:7", "--device tpu", "--worlds 0",
+        "--worlds 1000000000", "--demonstration demo_9", "--events gone.json", "--begin-with gone", "--ppo.hidden 0",
+        "--environment.action.gripper-actuators hand", "--environment.action.tool-site gone", "--iterations 0",
+        "--environment.randomisation.mass 2 1", "--ppo.activation wish",
+    ),
+    "evaluate": (
+        "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",
+        "--pretrained nobody", "-o scene.xml", "--pretrained a b",
+    ),
+    "play": (
+        "--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0",
+        "--checkpoint gone",
+    ),
+    "export": (
+        "--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what",
+    ),
+    "splat-fit": (
+        "--points gone.ply", "--longest 0", "--device cuda:7", "--fit.degree 9", "--scale 0",
+    ),
+    "render-train": (
+        "--cameras nobody", "--device cuda:7", "--steps 0", "--network.size 63", "--network.factors", "--flow.ema 1",
+    ),
+    "render": (
+        "--format mp4", "--keep none", "--splats block=gone.ply", "--splats block", "--codec h999", "--size 0",
+        "--networks gone", "--cameras nobody", "--pretrained", "--rate 0", "--lights.elevation 80 35",
+    ),
+    "demo": (
+        "--seeds -1", "--seeds one", "--engine drake", "--unseen-seeds 99999999999", "--count 0", "--fit.held-out 1",
+    ),
+    "record": (
+        "--seeds -1", "--robot gone.xml", "--robot.tcp-site gone", "--robot.gripper-actuators gone",
+        "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1",
+    ),
 }  # fmt: skip
 """Options that are wrong in other ways."""
 

@@ -12,15 +12,15 @@ LONGEST = 200
 """Characters of a message that are shown."""
 INTRODUCTION = """# Bad input
 
-`python -m benchmarks.bad_input`: {count} inputs for the commands of `concent`, one command each, in a folder of sound inputs of which
-one is broken. {passed} of {count} are treated as required.
+`python -m benchmarks.bad_input`: {count} inputs for the commands of `concent`, one command each, in a folder of sound
+inputs of which one is broken. {passed} of {count} are treated as required.
 
-- A bad input is refused: an exit status other than 0 and no signal, one sentence on stderr, no file that is new, gone or changed, at
-  most {seconds:g} s and {memory:g} GiB of memory, libraries included.
+- A bad input is refused: an exit status other than 0 and no signal, one sentence on stderr, no file that is new, gone
+  or changed, at most {seconds:g} s and {memory:g} GiB of memory, libraries included.
 - A sound but unusual input is accepted: exit status 0.
 
-Each command runs in a process forked from one that has imported all libraries; the memory of these, about 0.4 GiB, is counted. Two
-commands run at a time. Faults that are not in the list are not tested.
+Each command runs in a process forked from one that has imported all libraries; the memory of these, about 0.4 GiB, is
+counted. Two commands run at a time. Faults that are not in the list are not tested.
 
 {machine}
 """

@@ -29,8 +29,10 @@ from concent_warp.scene.scene import Scene
 
 NUMBERS = ("0", "-1", "1", "0.5", "1e-9", "1e9", "1e300", "-1e300", "1e400", "nan", "inf", "-inf", "-0.0", "9" * 400)
 """Numbers that are often wrong."""
-WORDS = (*NUMBERS, "", " ", "x", "true", "[]", "{}", "''", '"', "\x00", "\x1b[31m", "\u202e", "\ud7ff", "é", "0x10", "1_0",
-         "1,5", "../..", "/dev/zero", "a b c", "1 2 3", "0 0 0 0", "%s", "$(id)")  # fmt: skip
+WORDS = (
+    *NUMBERS, "", " ", "x", "true", "[]", "{}", "''", '"', "\x00", "\x1b[31m", "\u202e", "\ud7ff", "é", "0x10", "1_0",
+    "1,5", "../..", "/dev/zero", "a b c", "1 2 3", "0 0 0 0", "%s", "$(id)",
+)  # fmt: skip
 """Texts in place of a value."""
 LINE = re.compile(r"[^\n]+[.?]")
 

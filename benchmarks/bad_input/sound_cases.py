@@ -29,7 +29,11 @@ def falling(start: float = 47.0) -> np.ndarray:
 def drop(values: np.ndarray, geom: str = "") -> Callable[[Path], None]:
     """Return a change that writes a recording of a falling ball."""
     demonstration = Demonstration(
-        "demo_0", "", np.array([0, 0, 47, 1, 0, 0, 0.0]), np.zeros(6), {}, {"position": Channel(DROP, values)}
+        name="demo_0",
+        task="",
+        qpos=np.array([0, 0, 47, 1, 0, 0, 0.0]),
+        qvel=np.zeros(6),
+        measured={"position": Channel(DROP, values)},
     )
     return lambda folder: write_hdf5(Recording(BALL.format(geom), (demonstration,)), folder / "drop.h5")
 
@@ -54,9 +58,9 @@ def recordings() -> Iterator[tuple[str, str, Callable[[Path], object]]]:
         "components missing here and there": drop(missing),
         "a free body whose geoms do not collide": drop(falling(), ' contype="0" conaffinity="0"'),
     }.items():
-        for line in ("compare drop.h5", "locate drop.h5", "replay drop.h5 --model scene.xml -o out.npz"):
-            if not line.startswith("replay"):
-                yield name, line, build
+        yield name, "compare drop.h5", build
+        if name != "height alone was measured":
+            yield name, "locate drop.h5", build
     free = drop(falling(), ' contype="0" conaffinity="0"')
     yield "a free body whose geoms do not collide", "diagnose drop.h5 --jobs 1 --effects air_drag", free
     still = np.ones((len(TIME), 1))
@@ -99,15 +103,20 @@ def scenes() -> Iterator[tuple[str, str, Callable[[Path], object]]]:
         "accents in a name": SCENE.replace('name="arm"', 'name="bras_\u00e9"'),
         "blanks in a name": SCENE.replace('name="arm"', 'name="my arm"'),
         "a comment with dashes": with_top("<!-- - arm - -->"),
-        "a texture of 512 x 512": with_top('<asset><texture name="t" type="2d" builtin="checker" width="512" height="512"/></asset>'),
+        "a texture of 512 x 512": with_top(
+            '<asset><texture name="t" type="2d" builtin="checker" width="512" height="512"/></asset>'
+        ),
         "100 bodies": with_body(
-            '<replicate count="100" offset="0 0.2 0"><body pos="2 0 1"><joint type="slide"/><geom size="0.05"/></body></replicate>'
+            '<replicate count="100" offset="0 0.2 0"><body pos="2 0 1"><joint type="slide"/><geom size="0.05"/></body>'
+            "</replicate>"
         ),
         "bodies 60 deep": with_body(
             '<body pos="3 0 3">' + '<body pos="0 0.1 0"><joint damping="1"/><geom size=".01"/>' * 60 + "</body>" * 61
         ),
         "defaults": with_top('<default><geom friction="0.4"/><default class="a"/></default>'),
-        "key frames": with_top("").replace("</mujoco>", '<keyframe><key qpos="0 0.4 0 0.02 1 0 0 0"/></keyframe></mujoco>'),
+        "key frames": with_top("").replace(
+            "</mujoco>", '<keyframe><key qpos="0 0.4 0 0.02 1 0 0 0"/></keyframe></mujoco>'
+        ),
         "a tendon": with_top("").replace(
             "<actuator>", '<tendon><fixed name="f"><joint joint="elbow" coef="1"/></fixed></tendon><actuator>'
         ),

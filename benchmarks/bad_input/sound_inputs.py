@@ -53,7 +53,7 @@ def sound_recording() -> Recording:
         qvel=np.zeros(7),
         action={"elbow": Channel(TIME, ANGLE)},
         measured={
-            "elbow_angle": Channel(TIME, ANGLE[:, None]),
+            "elbow_angle": Channel(TIME, ANGLE[:, None].copy()),
             "block_position": Channel(TIME, position),
             "block_orientation": Channel(TIME, np.tile([1.0, 0, 0, 0], (len(TIME), 1))),
         },

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Count, OpenShare, Positive, PositiveDuration, PositiveShare, Share
+from concent_warp.checks import Bounds, Count, OpenShare, Positive, PositiveDuration, PositiveShare, Share, WindowLength
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -205,7 +205,7 @@ class DiagnoseCfg:
     p-value is 1 / (null_samples + 1)."""
     effects: tuple[str, ...] = ()
     """Names of the effects to consider; all where empty."""
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Length of a window [s]; by default as long as the motion allows."""
     jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time; -1: one per CPU. `joblib.parallel_config` selects another backend."""

@@ -137,6 +137,7 @@ def test_reversed_ranges_are_refused():
 
 LINES = [
     ("fit demo.h5 --fit.generations -1", "--fit.generations is out of bounds; expected at least 0"),
+    ("fit demo.h5 --fit.window 1e-9", "--fit.window is out of bounds; expected at least 0.001"),
     ("fit demo.h5 --fit.held-out 1", "--fit.held-out is out of bounds; expected at least 0 and below 1"),
     ("fit demo.h5 --fit.evolution.elite-share 1.5", "--fit.evolution.elite-share is out of bounds"),
     ("fit demo.h5 --count 0", "--count is out of bounds; expected at least 1"),
@@ -147,13 +148,13 @@ LINES = [
     ("demo --reality.task.timestep 1e-9", "--reality.task.timestep is out of bounds"),
     ("record --reality.expert.offset 0.02 0.01", "--reality.expert.offset is out of bounds; expected a smallest and"),
     ("record --reality.sensing.image-size 0 128", "--reality.sensing.image-size is out of bounds"),
-    ("diagnose demo.h5 --window 0", "--window is out of bounds; expected above 0"),
+    ("diagnose demo.h5 --window 0", "--window is out of bounds; expected at least 0.001"),
     ("diagnose demo.h5 --jobs -2", "--jobs is out of bounds; expected at least -1"),
     (
         "diagnose demo.h5 --jobs 0",
         "--jobs is out of bounds; expected at least -1 and at most 4096, but not 0",
     ),
-    ("locate demo.h5 --window -1", "--window is out of bounds; expected above 0"),
+    ("locate demo.h5 --window -1", "--window is out of bounds; expected at least 0.001"),
     ("add joint_friction --model m.toml --fit demo.h5 --window nan -o x.toml", "--window is not a number"),
     ("compare demo.h5 --places -1", "--places is out of bounds"),
     ("events demo.h5 --model m.toml --staging.min-touch-share 1.5", "--staging.min-touch-share is out of bounds"),

@@ -166,3 +166,11 @@ def test_tables_fit_80_columns(line, bench, tmp_path, monkeypatch, capsys):
     rows = [row for row in capsys.readouterr().out.splitlines() if set(row) & set("│┃━─")]
     assert rows
     assert max(map(len, rows)) <= 80
+
+
+@pytest.mark.parametrize("option", ["--robot.tcp-site", "--robot.gripper-actuators"])
+def test_record_refuses_names_of_a_robot_that_is_not_given(tmp_path, monkeypatch, capsys, option):
+    monkeypatch.chdir(tmp_path)
+    assert main(["record", option, "gone"]) == 2
+    assert "are given without the robot; add --robot" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

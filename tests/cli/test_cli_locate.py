@@ -35,4 +35,11 @@ def test_locate_prints_one_json_object_and_nothing_else(tmp_path, capsys):
 def test_locate_refuses_windows_without_length(tmp_path, capsys):
     write_hdf5(swing(lambda _: 0.0, duration=0.5), tmp_path / "swing.h5")
     assert main(["locate", str(tmp_path / "swing.h5"), "--window", "0"]) == 2
-    assert "--window is out of bounds; expected above 0" in capsys.readouterr().err
+    assert "--window is out of bounds; expected at least 0.001" in capsys.readouterr().err
+
+
+def test_locate_refuses_pictures_of_unknown_kinds_before_it_works(tmp_path, capsys):
+    write_hdf5(swing(lambda _: 0.0, duration=0.5), tmp_path / "swing.h5")
+    assert main(["locate", str(tmp_path / "swing.h5"), "--png", str(tmp_path / "forces.what")]) == 2
+    assert "forces.what: unknown kind of picture; expected one of .png, .pdf" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["swing.h5"]

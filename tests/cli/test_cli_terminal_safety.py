@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from benchmarks.recording.bad_input_cases import SCENE, write_good
+from benchmarks.bad_input.sound_inputs import SCENE, write_recording_and_model
 from concent_warp.cli import main
 from concent_warp.cli.terminal import say, say_written
 
@@ -22,7 +22,7 @@ def lines(text: str) -> list[str]:
 
 @pytest.mark.parametrize("escape", ESCAPES)
 def test_names_in_files_and_paths_are_shown_with_escapes(tmp_path, monkeypatch, capsys, escape):
-    recording, _ = write_good(tmp_path)
+    recording, _ = write_recording_and_model(tmp_path)
     with h5py.File(recording, "r+") as file:
         file.move("data/demo_0", f"data/demo_0{escape}")
     monkeypatch.chdir(tmp_path)
@@ -35,7 +35,7 @@ def test_names_in_files_and_paths_are_shown_with_escapes(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize("escape", ESCAPES)
 def test_a_task_that_steers_the_terminal_is_refused(tmp_path, capsys, escape):
-    recording, _ = write_good(tmp_path)
+    recording, _ = write_recording_and_model(tmp_path)
     with h5py.File(recording, "r+") as file:
         file["data/demo_0"].attrs["task"] = f"push{escape}!"
     code = main(["compare", str(recording)])
@@ -50,7 +50,7 @@ def test_remarks_and_written_paths_are_printable(capsys):
 
 
 def test_a_warning_is_one_line_without_a_place_in_the_code(tmp_path):
-    recording, _ = write_good(tmp_path)
+    recording, _ = write_recording_and_model(tmp_path)
     with h5py.File(recording, "r+") as file:
         file["data/demo_0"].attrs["operator"] = "Ada"
     command = [sys.executable, "-m", "concent_warp", "compare", str(recording)]

@@ -141,3 +141,15 @@ def test_measured_logs_are_read_at_each_gain(kp):
         lasts = 2.0 if demonstration.task == "lift_and_drop" else 6.0
         assert channel.time[-1] == pytest.approx(lasts, abs=0.02)
         assert 0.003 < np.median(np.diff(channel.time)) < 0.007
+
+
+@pytest.mark.parametrize(("key", "value"), [("mass", 1e300), ("length", 1e3), ("kp", 1e7), ("vin", 1e4)])
+def test_a_set_up_beyond_what_a_servo_moves_is_refused(tmp_path, key, value):
+    entries = [{"timestamp": t / 100, "position": 0.0, "goal_position": 0.0} for t in range(9)]
+    log = {"mass": 0.1, "length": 0.1, "kp": 32, "vin": 7.5, "entries": entries}
+    path = tmp_path / "log.json"
+    path.write_text(json.dumps(log))
+    assert len(read_bam(path).demonstrations) == 1
+    path.write_text(json.dumps({**log, key: value}))
+    with pytest.raises(RecordingError, match=f"{key} of the set-up is not right; expected above 0 and at most"):
+        read_bam(path)

@@ -59,6 +59,18 @@ HOSTILE = {
         mjcf(world='<worldbody><replicate count="99999"><replicate count="99999"/></replicate></worldbody>'),
         "too many copies; expected at most 100000, found 9999800001; .*CONCENT_MAX_SCENE_COPIES",
     ),
+    "huge image off screen": (
+        mjcf('<visual><global offwidth="1000000" offheight="1000000"/></visual>'),
+        "a <global> is too large",
+    ),
+    "negative count": (
+        mjcf(world=f'<worldbody><replicate count="-5"><body/></replicate>{WORLD[11:]}'),
+        "<replicate> has a negative count; expected at least 0, found -5",
+    ),
+    "reversed range": (
+        mjcf(world='<worldbody><body><joint range="1 -1"/><geom size="0.1"/></body></worldbody>'),
+        "<joint range> is reversed; expected its lower end first, found 1 -1",
+    ),
     "escape sequence": (mjcf(world=WORLD.replace("ball", "&#27;[31m")), "control character"),
     "entities": ("<!DOCTYPE x [<!ENTITY a 'b'>]>" + mjcf(), "XML entities"),
 }

@@ -292,3 +292,51 @@ def test_policy_begins_with_the_file_that_was_named(trained, tmp_path):
     )
     found = dict(trainer.algorithm.actor.named_parameters())["mlp.0.bias"]
     assert torch.allclose(found, policy.weights[ACTOR]["mlp.0.bias"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("command", ["export", "evaluate"])
+def test_a_flipped_bit_in_the_weights_is_refused(trained, tmp_path, capsys, command):
+    run = copied(trained, tmp_path)
+    content = bytearray((run / CHECKPOINT).read_bytes())
+    weight = torch.load(run / CHECKPOINT, weights_only=True)[ACTOR]["mlp.0.weight"].numpy().tobytes()
+    content[content.index(weight)] ^= 1
+    (run / CHECKPOINT).write_bytes(content)
+    assert called(command, run) == 2
+    assert "the checkpoint is damaged; found another checksum of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("*", "", "the configuration of a training is empty"),
+        ('activation = "swish"', 'activation = "wish"', "activation"),
+    ],
+)
+def test_damaged_settings_of_a_training_are_refused(trained, tmp_path, capsys, old, new, message):
+    run = copied(trained, tmp_path)
+    text = (run / "train.toml").read_text()
+    (run / "train.toml").write_text("" if old == "*" else text.replace(old, new))
+    assert called("export", run) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"demonstration": "demo_9"}, "the contact events are of another demonstration; expected demo_0, found demo_9"),
+        ({"body": "brick"}, "which the model does not have; found body brick"),
+        ({"sphere": -1}, "which the model does not have; found body .*, sphere -1"),
+        ({"sphere": 10**9}, "which the model does not have; found body .*, sphere 1000000000"),
+    ],
+)
+def test_events_of_something_else_are_refused(change, message):
+    run = make_run()
+    if "demonstration" in change:
+        events = replace(run.events, **change)
+    else:
+        number = next(k for k, entity in enumerate(run.events.entities) if entity.sphere is not None)
+        entities = list(run.events.entities)
+        entities[number] = replace(entities[number], **change)
+        events = replace(run.events, entities=tuple(entities))
+    with pytest.raises(ConcentError, match=message):
+        TrainingRun(run.model, run.recording, events, run.cfg)

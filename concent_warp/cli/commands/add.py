@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 from rich.markup import escape
 
-from concent_warp.checks import PositiveDuration
+from concent_warp.checks import WindowLength
 from concent_warp.cli.fitted_effects import say_added, say_fitted, work_progress
 from concent_warp.cli.given_recording import given_recording
 from concent_warp.cli.options import EngineOption, NoiseOption, OptionalOutPath
@@ -46,7 +46,7 @@ class Arguments:
     demonstrations: tuple[str, ...] = ()
     """Demonstrations of it; all by default."""
     noise: NoiseOption = ()
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     engine: EngineOption = "mujoco"
     out: OptionalOutPath = None

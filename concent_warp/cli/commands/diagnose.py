@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.markup import escape
 
-from concent_warp.checks import Bounds, PositiveDuration
+from concent_warp.checks import Bounds, WindowLength
 from concent_warp.cli.fitted_effects import value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.given_recording import given_recording
@@ -53,7 +53,7 @@ class Arguments:
     """Write a report with the diagnosis, charts, replay and 3D views to this file."""
     apply: Path | None = None
     """Save the model with all accepted effects, fitted together with intervals, to this file (.toml)."""
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     additions: Annotated[int, Bounds(1, 1000)] = 3
     """Most effects that are added."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 from rich.markup import escape
 
-from concent_warp.checks import PositiveDuration
+from concent_warp.checks import WindowLength
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.options import EngineOption
 from concent_warp.cli.terminal import say, say_written
@@ -19,6 +19,9 @@ from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.files import all_or_none
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
+
+PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
+"""Suffixes of the pictures that --png writes."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Arguments:
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
     engine: EngineOption = "mujoco"
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Time over which forces are averaged [s]; 0.1 s for joints, 0.12 s with objects, more where readings are rare, by
     default."""
     json: bool = False
@@ -49,6 +52,9 @@ def run(arguments: Arguments) -> UnexplainedForces:
     """Locate, and print or write what was asked for."""
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     model = given_model(arguments.model, recording)
+    if arguments.png is not None and arguments.png.suffix not in PICTURES:
+        expected = f"one of {', '.join(PICTURES)}"
+        raise RecordingError("unknown kind of picture", where=arguments.png, expected=expected, fix="change its suffix")
     for path in (arguments.html, arguments.png):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)

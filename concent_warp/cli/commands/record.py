@@ -10,6 +10,7 @@ import tyro
 
 from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
+from concent_warp.errors import SceneError
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
@@ -47,6 +48,10 @@ class Arguments:
 
 def run(arguments: Arguments) -> Recording:
     """Record and write the file."""
+    if arguments.robot is None and (
+        arguments.tcp_site != RobotCfg.tcp_site or arguments.gripper_actuators != RobotCfg.gripper_actuators
+    ):
+        raise SceneError("names of another robot's parts are given without the robot", fix="add --robot ROBOT.xml")
     claim_file(arguments.out, overwrite=arguments.overwrite)
     if arguments.reality.sensing.images or arguments.reality.footage.cameras:
         quiet_warp()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import MAX_COUNT, Bounds, Count, OpenShare, Positive, PositiveDuration, Share
+from concent_warp.checks import MAX_COUNT, Bounds, Count, OpenShare, Positive, PositiveDuration, Share, WindowLength
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class LocateForcesCfg:
         0.1
     """
 
-    length: PositiveDuration | None = None
+    length: WindowLength | None = None
     """Length of a window [s]; by default 0.1 s for joints alone, 0.12 s with free bodies, whose readings are coarser,
     and up to 0.3 s where readings are rare. Errors of forces fall with its square; changes within it are averaged, and
     a body that starts or stops within it is left out."""

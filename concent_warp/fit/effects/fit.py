@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from concent_warp.checks import PositiveDuration, Share, check_settings
+from concent_warp.checks import Share, WindowLength, check_settings
 from concent_warp.errors import ModelError
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -77,7 +77,7 @@ class FitEffectsCfg(EffectSolverCfg):
         0.5
     """
 
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Length of the windows that are simulated in one go [s]; by default as long as the motion allows."""
     seed: int = 0
     """Seed of the disturbances that determine how long windows may be."""

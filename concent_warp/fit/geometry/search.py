@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import mujoco
 import numpy as np
 
-from concent_warp.checks import Bounds, Count, PositiveDuration, Share, SmallShare
+from concent_warp.checks import Bounds, Count, Share, SmallShare, WindowLength
 from concent_warp.estimation.object_tracks import Segment, observed_states
 from concent_warp.fit.geometry.checkpoint import Checkpoint
 from concent_warp.fit.geometry.evolution import Evolution, EvolutionCfg
@@ -39,12 +39,12 @@ class GeometrySearchCfg:
     """Relative fall of the distance that counts as progress [-], measured from its value at the last progress."""
     held_out: SmallShare = 0.2
     """Share of the frames that choose the best estimate and do not move it."""
-    block: PositiveDuration = 0.2
+    block: WindowLength = 0.2
     """Length of the held-out blocks [s]."""
-    window: PositiveDuration | None = None
+    window: WindowLength | None = None
     """Length of windows to simulate on their own [s], each from the measured state at its start; None simulates whole
     demonstrations. Motion with impacts or tumbling asks for 0.1-0.3 s."""
-    window_stride: PositiveDuration | None = None
+    window_stride: WindowLength | None = None
     """Time from the start of one window to that of the next [s]; None takes the length."""
     batch: Count | None = None
     """Segments that a generation tries its candidates on, sampled anew each time; None takes all. With hundreds of
