@@ -16,6 +16,7 @@ from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.diagnosis.forces.result import UnexplainedForces
+from concent_warp.errors import ConcentError
 from concent_warp.files import all_or_none
 from concent_warp.recording.load import load_recording
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
@@ -54,7 +55,7 @@ def run(arguments: Arguments) -> UnexplainedForces:
     model = given_model(arguments.model, recording)
     if arguments.png is not None and arguments.png.suffix not in PICTURES:
         expected = f"one of {', '.join(PICTURES)}"
-        raise RecordingError("unknown kind of picture", where=arguments.png, expected=expected, fix="change its suffix")
+        raise ConcentError("unknown kind of picture", where=arguments.png, expected=expected, fix="change its suffix")
     for path in (arguments.html, arguments.png):
         if path is not None:
             claim_file(path, overwrite=arguments.overwrite)
