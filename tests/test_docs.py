@@ -83,7 +83,7 @@ def test_command_in_the_pages_is_understood(line):
         assert command in ("--help", "--version")
         return
     assert command in COMMANDS
-    if arguments and "--help" not in arguments:
+    if arguments and not {"--help", "--help-all"} & set(arguments):
         module = import_module(f"concent_warp.cli.commands.{command.replace('-', '_')}")
         tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.HelptextFromCommentsOff,))
 
