@@ -71,15 +71,15 @@ class Noise:
     a component of the quaternion. NaN where the readings do not determine it."""
     source: Source
     """Where it is from."""
-    low: float = np.nan
+    low: float = -np.inf
     """Lower end of a 95 % interval; `std` where it is stated, 0 where the readings show no noise beside the motion."""
-    high: float = np.nan
+    high: float = np.inf
     """Upper end: noise that is slow against the sampling may be as large, and not larger."""
 
     def __post_init__(self) -> None:
         """Fill in the interval of a value that is exact."""
         for name in ("low", "high"):
-            if np.isnan(getattr(self, name)):
+            if np.isinf(getattr(self, name)):
                 object.__setattr__(self, name, self.std)
 
     @property
