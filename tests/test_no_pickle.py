@@ -28,7 +28,8 @@ def unsafe(source: str) -> list[str]:
             found.append(name)
         elif name in SAFE:
             argument, value = SAFE[name]
-            if not (isinstance(given.get(argument), ast.Constant) and given[argument].value is value):
+            stated = given.get(argument)
+            if not (isinstance(stated, ast.Constant) and stated.value is value):
                 found.append(f"{name} without {argument}={value}")
     return found
 

@@ -64,9 +64,9 @@ def tried(kind: Kind, examples: int, folder: Path) -> Tried:
     found = Tried()
     folder.mkdir(exist_ok=True)
 
-    @settings(
-        max_examples=examples, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
-    )
+    checks = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
+
+    @settings(max_examples=examples, deadline=None, derandomize=True, database=None, suppress_health_check=checks)
     @given(kind.examples)
     def run(example: Any) -> None:
         try:
