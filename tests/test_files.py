@@ -144,7 +144,8 @@ def test_file_is_kept_for_the_command_that_claims_it(tmp_path, ended):
             claim_file(path, overwrite=False)
     if ended == "killed":
         process.kill()
-    end.set()
+    else:
+        end.set()
     process.join()
     with claimed_files():
         claim_file(path, overwrite=False)

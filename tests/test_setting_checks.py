@@ -121,13 +121,13 @@ def test_mujoco_refuses_no_threads_and_no_memory(option):
     [
         ("fit_geometry", cw.FitCfg(held_out=1.0), "held_out is out of bounds; expected at least 0 and below 1"),
         ("fit_geometry", cw.FitCfg(generations=-1), "generations is out of bounds"),
-        ("fit_effects", cw.FitEffectsCfg(window=0.0), "window is out of bounds; expected above 0"),
+        ("fit_effects", cw.FitEffectsCfg(window=0.0), "window is out of bounds; expected at least 0.001"),
         ("compare", cw.CompareCfg(seed=-1), "seed is out of bounds; expected 0 to 4294967295"),
         ("diagnose", cw.DiagnoseCfg(jobs=0), "jobs is out of bounds; expected at least -1 and at most 4096, but not 0"),
         ("diagnose", cw.DiagnoseCfg(significance_level=float("nan")), "significance_level is not a number"),
         ("locate_forces", cw.LocateForcesCfg(length=-0.1), "length is out of bounds"),
         ("suggest_experiment", cw.SuggestExperimentCfg(finalists=0), "finalists is out of bounds; expected at least 1"),
-        ("ground", cw.GroundCfg(fit=cw.FitCfg(block=0.0)), "fit.block is out of bounds; expected above 0"),
+        ("ground", cw.GroundCfg(fit=cw.FitCfg(block=0.0)), "fit.block is out of bounds; expected at least 0.001"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,
 )

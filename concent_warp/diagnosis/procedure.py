@@ -96,7 +96,7 @@ class Procedure:
         fitted, detectable = [self.baseline()], ()
         if (coarse := self.coarse_baseline(fitted[0])) is not None:
             found, detectable = self.add_effects([coarse], detectable)
-            fitted += [self._refitted(one.model, fitted[0].windows) for one in found[1:]]
+            fitted = self.carry_over(fitted[0], found[1:])
         fitted, smallest = self.add_effects(fitted, detectable)
         detectable = detectable or smallest
         fitted = self.final_values(self.remove_superfluous(fitted))
@@ -123,6 +123,30 @@ class Procedure:
                 break
             fitted.append(add_candidate(fitted[-1], best))
         return fitted, detectable
+
+    def carry_over(self, base: FittedModel, coarse: Sequence[FittedModel]) -> list[FittedModel]:
+        """Return the model as given and after each addition over short windows, fitted again to its own windows.
+
+        The first addition that explains too little there is taken back, with those after it.
+
+        Args:
+            base: The model as given.
+            coarse: The models after each addition, over short windows.
+        """
+        fitted = [base]
+        for step, one in enumerate(coarse):
+            after = self._refitted(one.model, base.windows)
+            if 1 - after.errors.sum() / max(fitted[-1].errors.sum(), 1e-12) < self.cfg.min_gain:
+                self.groups, self.hypotheses = self.groups[:step], self.hypotheses[:step]
+                self.findings = [
+                    replace(f, accepted=False, reason="explains nothing more over longer windows")
+                    if f.accepted and f.step >= step
+                    else f
+                    for f in self.findings
+                ]
+                break
+            fitted.append(after)
+        return fitted
 
     def coarse_baseline(self, base: FittedModel) -> FittedModel | None:
         """Return the model as given over shorter windows where it is far off over its own, None where it is not."""

@@ -5,7 +5,7 @@ import pytest
 
 from concent_warp.diagnosis import procedure
 from concent_warp.diagnosis import tasks as task_module
-from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
 from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search.candidate import ScreenedCandidate
@@ -14,7 +14,7 @@ from concent_warp.errors import ConcentError
 from tests.diagnosis.same_results import assert_same
 from tests.scenes.swinging import drawing, swung
 
-CFG = DiagnoseCfg(effects=("joint_damping", "armature"), jobs=1, explain=False)
+CFG = DiagnoseCfg(effects=("joint_damping", "armature"), jobs=1, explain=False, search=SearchCfg(far_ratio=1e6))
 
 
 @pytest.fixture(scope="module")

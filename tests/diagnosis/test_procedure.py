@@ -171,6 +171,25 @@ def test_shorter_windows_are_taken_where_the_model_is_far_off(monkeypatch):
         assert (None if found is None else found.ratio) == left
 
 
+def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monkeypatch):
+    made = procedure()
+    made.groups, made.hypotheses = [("a",), ("b",), ("c",)], [{"a": 1}, {"b": 2}, {"c": 3}]
+    made.findings = [finding("a", 0.5), finding("b", 0.4, step=1), finding("c", 0.3, step=2)]
+    made.findings.append(finding("x", 0.1, accepted=False, reason="no better than chance"))
+    errors = {"after a": 10.0, "after b": 9.6, "after c": 1.0}
+    monkeypatch.setattr(made, "_refitted", lambda model, _: node(1.0, errors[model.name], name=model.name))
+    base = node(30.0, 100.0, name="given")
+    after = made.carry_over(base, [node(1.0, name=name) for name in errors])
+    assert [one.model.name for one in after] == ["given", "after a"]
+    assert (made.groups, made.hypotheses) == ([("a",)], [{"a": 1}])
+    reason = "explains nothing more over longer windows"
+    assert [(f.name, f.accepted, f.reason) for f in made.findings] == [
+        ("a", True, ""), ("b", False, reason), ("c", False, reason), ("x", False, "no better than chance"),
+    ]  # fmt: skip
+    errors["after b"] = 9.4
+    assert len(made.carry_over(base, [node(1.0, name=name) for name in errors])) == 4
+
+
 @pytest.mark.parametrize(
     ("ratios", "groups", "unknown", "verdict", "unexplained"),
     [

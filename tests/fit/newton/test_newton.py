@@ -128,7 +128,7 @@ def test_an_interrupted_descent_resumes_to_the_same_result(pushed, thick, tmp_pa
 
 
 def test_without_help_from_gradients_the_strategy_goes_on_alone(pushed, thick):
-    cfg = FitCfg(gradient=replace(SMALL, gain=0.999), generations=2)
+    cfg = FitCfg(gradient=replace(SMALL, min_gain=0.999), generations=2)
     alone = fit_geometry(thick, pushed, cfg, engine="mujoco")
     found = fit_geometry(thick, pushed, cfg, method="gradient", engine="mujoco")
     assert not found.gradients.helped
