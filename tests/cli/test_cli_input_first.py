@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from concent_warp.cli import main
 from concent_warp.cli.entry import COMMANDS
 
 PROBE = """
@@ -72,3 +73,11 @@ def test_all_commands_that_import_torch_are_tried():
     heavy = {"evaluate", "export", "play", "render", "splat-fit", "render-train", "train"}
     assert {line.split()[0] for line, _ in CASES} == heavy
     assert heavy < set(COMMANDS)
+
+
+def test_videos_that_cannot_be_written_are_refused_before_the_episodes(capsys):
+    line = "evaluate --pretrained --world reality --episodes 1 --videos 1 --device cpu --out /proc/nothing/videos"
+    assert main(line.split()) == 2
+    said = [one for one in capsys.readouterr().err.splitlines() if "loading" not in one]
+    assert len(said) == 1
+    assert "/proc/nothing/videos: the folder cannot be made" in said[0]

@@ -15,7 +15,7 @@ from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check_evaluation
 from concent_warp.reality.hidden.in_task import parse_effects
-from concent_warp.run_folder import check_folder
+from concent_warp.run_folder import check_folder, make_folder
 
 if TYPE_CHECKING:
     from concent_warp.train.policy.evaluate import Evaluation
@@ -56,6 +56,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     if arguments.out is not None:
         check_folder(arguments.out)
     policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    if arguments.out is not None and cfg.videos:
+        make_folder(arguments.out)
     from concent_warp.deploy.evaluate import evaluate, without_reality
 
     found: dict[str, Evaluation] = {}
