@@ -1,0 +1,6 @@
+"""Benchmark of the diagnosis on data of simulated worlds whose physics share nothing with the library.
+
+`data_set` defines a data set and what making it returns, `worlds` lists all sets and makes them, `split` locks a part
+of them. The world on MuJoCo is in the modules `mujoco_*`, that on Drake in `drake_*`. `python -m
+benchmarks.independent` diagnoses, `scoring` judges the results and `page` writes them down.
+"""
