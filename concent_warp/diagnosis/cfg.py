@@ -163,6 +163,18 @@ class UnknownForceCfg:
 
 
 @dataclass(frozen=True)
+class TimeStepCfg:
+    """Settings of the test for errors of the model's own time step."""
+
+    max_error: Positive = 0.2
+    """Error of the time step over the noise that is left after a division of the step [-]: in squares, a few percent
+    of what the noise itself leaves."""
+    max_division: Annotated[int, Bounds(1, 1000)] = 8
+    """Most parts that a step is divided into; 1 leaves the model's time step as it is. The search takes as many times
+    longer."""
+
+
+@dataclass(frozen=True)
 class FailureCfg:
     """Settings of the list of spans and forces in which the model as given fails."""
 
@@ -225,6 +237,8 @@ class DiagnoseCfg:
     """Profile likelihood of accepted parameters."""
     unknown_force: UnknownForceCfg = field(default_factory=UnknownForceCfg)
     """Test for a force of no known form."""
+    time_step: TimeStepCfg = field(default_factory=TimeStepCfg)
+    """Test for errors of the model's own time step."""
     failures: FailureCfg = field(default_factory=FailureCfg)
     """Where the model as given fails."""
     experiment: SuggestExperimentCfg = field(default_factory=SuggestExperimentCfg)

@@ -19,7 +19,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
-from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, Verdict
+from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, FinerTimeStep, Verdict
 from concent_warp.diagnosis.search.adequacy import is_adequate
 from concent_warp.diagnosis.search.baseline import (
     add_candidate,
@@ -41,6 +41,8 @@ from concent_warp.diagnosis.search.joint_fit import (
 )
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.search.time_step import finding as time_step_finding
+from concent_warp.diagnosis.search.time_step import finer_time_step
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.effects.effect import Effect
@@ -81,6 +83,7 @@ class Procedure:
         self.widening: dict[int, np.ndarray] = {}
         self.noise: dict[str, float] = {}
         self.noise_factors: dict[str, float] = {}
+        self.time_step: FinerTimeStep | None = None
 
     def run(self) -> Diagnosis:
         """Return the diagnosis."""
@@ -93,15 +96,16 @@ class Procedure:
         self.noise_factors = {channel: noise.factor for channel, noise in noises.items()}
         issues = [*check_data(self.recording, cfg.data), *noise_remarks(self.model.compile(), noises)]
         runner.progress(0.0, "cutting windows")
-        fitted, detectable = [self.baseline()], ()
-        if (coarse := self.coarse_baseline(fitted[0])) is not None:
+        given, detectable = self.baseline(), ()
+        fitted = [given]
+        if (coarse := self.coarse_baseline(given)) is not None:
             found, detectable = self.add_effects([coarse], detectable)
-            fitted = self.carry_over(fitted[0], found[1:])
+            fitted = self.carry_over(given, found)
         fitted, smallest = self.add_effects(fitted, detectable)
         detectable = detectable or smallest
         fitted = self.final_values(self.remove_superfluous(fitted))
         runner.progress(1.0, "done")
-        return self.conclude(fitted, detectable, issues)
+        return self.conclude(given, fitted, detectable, issues)
 
     def add_effects(
         self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
@@ -113,16 +117,50 @@ class Procedure:
             detectable: Smallest detectable sizes as far as they are known.
         """
         cfg, runner, fitted = self.cfg, self.runner, list(fitted)
-        for step in range(len(fitted) - 1, cfg.max_additions):
-            if step and fitted[-1].ratio ** 2 < 1 + cfg.min_gain:
-                break  # the residual beyond the noise is less than an effect must remove
+        while True:
+            step = len(fitted) - 1
+            if step and not self._is_lacking(fitted[-1]):
+                break
+            finer = self._finer(fitted[-1])
+            if finer is not None and not self._is_lacking(finer):
+                fitted = self._adopt(fitted, finer)
+                break
+            if step >= cfg.max_additions:
+                return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
+            recorded = len(self.findings), len(self.groups)
             best, smallest = self.find_addition(fitted[-1], step)
             detectable = detectable or smallest
+            equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
+            if finer is not None and finer.errors.sum() <= equal:
+                self._forget(*recorded)
+                fitted = self._adopt(fitted, finer)
+                continue
             if best is None:
                 break
             fitted.append(add_candidate(fitted[-1], best))
         return fitted, detectable
+
+    def _is_lacking(self, one: FittedModel) -> bool:
+        """Return whether the residual beyond the noise is as much as an effect must remove."""
+        return one.ratio**2 >= 1 + self.cfg.min_gain
+
+    def _finer(self, one: FittedModel) -> FittedModel | None:
+        """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
+        if self.time_step is not None or not self._is_lacking(one):
+            return None
+        self.runner.progress(self.runner.share, "halving the time step")
+        return finer_time_step(one, self.cfg)
+
+    def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
+        """Return the fitted models with the last one replaced by that with a shorter time step."""
+        self.time_step = time_step_finding(fitted[-1], finer, self.cfg.seed)
+        return [*fitted[:-1], finer]
+
+    def _forget(self, findings: int, groups: int) -> None:
+        """Drop what was recorded after so many findings and groups."""
+        self.findings, self.groups = self.findings[:findings], self.groups[:groups]
+        self.hypotheses = self.hypotheses[:groups]
 
     def carry_over(self, base: FittedModel, coarse: Sequence[FittedModel]) -> list[FittedModel]:
         """Return the model as given and after each addition over short windows, fitted again to its own windows.
@@ -131,10 +169,12 @@ class Procedure:
 
         Args:
             base: The model as given.
-            coarse: The models after each addition, over short windows.
+            coarse: The model as given and after each addition, over short windows.
         """
         fitted = [base]
-        for step, one in enumerate(coarse):
+        if coarse[0].model.scene != base.model.scene:
+            fitted = [self._refitted(coarse[0].model, base.windows)]
+        for step, one in enumerate(coarse[1:]):
             after = self._refitted(one.model, base.windows)
             if 1 - after.errors.sum() / max(fitted[-1].errors.sum(), 1e-12) < self.cfg.min_gain:
                 self.groups, self.hypotheses = self.groups[:step], self.hypotheses[:step]
@@ -244,11 +284,13 @@ class Procedure:
         The last one added has just been tested beside all others.
         """
         steps = list(range(len(fitted) - 1))
-        while len(steps) > 1:
+        # A shorter time step may have made the last one superfluous too.
+        untested = 0 if _is_finer(fitted) else 1
+        while len(steps) > untested:
             last = fitted[-1]
             owned = len(last.model.effects) - len(steps)
             self.runner.progress(self.runner.share, "removing one effect at a time")
-            tasks = [(last, owned + k) for k in range(len(steps) - 1)]
+            tasks = [(last, owned + k) for k in range(len(steps) - untested)]
             reduced = list(run_tasks(refit_without_effect, tasks, self.cfg.jobs))
             shares = [1 - last.errors.sum() / max(one.errors.sum(), 1e-12) for one in reduced]
             least = int(np.argmin(shares))
@@ -280,22 +322,28 @@ class Procedure:
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         parameters = joint_parameters(last, widening)
         for k, f in enumerate(accepted):
-            without = fitted[0] if len(accepted) == 1 else refit_without_effect(last, owned + k)
+            alone = len(accepted) == 1 and not _is_finer(fitted)
+            without = fitted[0] if alone else refit_without_effect(last, owned + k)
             final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
         return [*fitted[:-1], with_intervals(last, parameters)]
 
     def conclude(
-        self, fitted: Sequence[FittedModel], detectable: tuple[Detectable, ...], issues: Sequence[str]
+        self,
+        given: FittedModel,
+        fitted: Sequence[FittedModel],
+        detectable: tuple[Detectable, ...],
+        issues: Sequence[str],
     ) -> Diagnosis:
         """Return the verdict.
 
         Args:
-            fitted: The model as given and after each addition or removal.
+            given: The model as given.
+            fitted: The same, with a shorter time step where that explains more, and after each addition or removal.
             detectable: Smallest detectable sizes.
             issues: Sentences on the data.
         """
-        cfg, first, last = self.cfg, fitted[0].ratio, fitted[-1].ratio
+        cfg, first, last = self.cfg, given.ratio, fitted[-1].ratio
         beyond = max(first**2 - 1.0, 1e-9)
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > cfg.adequate_ratio else 0.0
         adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
@@ -308,19 +356,21 @@ class Procedure:
         elif len(fitted) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
         explained = verdict == "none_needed" or not cfg.explain
+        after = fitted if fitted[0].model.scene != given.model.scene else fitted[1:]
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
             groups=tuple(self.groups),
-            where=() if explained else self._failures(fitted[0]),
+            where=() if explained else self._failures(given),
             unexplained=unexplained if unknown is None else max(unexplained, unknown.share),
-            ratio=tuple(one.noise_ratio for one in fitted),
+            ratio=(given.noise_ratio, *(one.noise_ratio for one in after)),
             detectable=detectable,
             next_experiment=None if explained else self._suggested_experiment(),
             issues=tuple(issues),
-            models=tuple(one.model for one in fitted),
+            models=(given.model, *(one.model for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
+            time_step=self.time_step,
         )
 
     def _suggested_experiment(self) -> SuggestedExperiment | None:
@@ -343,3 +393,8 @@ class Procedure:
                 offsets=given.fit.offsets,
             )
         )
+
+
+def _is_finer(fitted: Sequence[FittedModel]) -> bool:
+    """Return whether the last of some fitted models has a shorter time step than the first."""
+    return fitted[-1].model.scene != fitted[0].model.scene

@@ -124,6 +124,38 @@ class UnknownForceFound:
 
 
 @dataclass(frozen=True)
+class FinerTimeStep:
+    """A shorter time step with which the model explains more, before any effect."""
+
+    given: float
+    """Time step of the model as given [s]."""
+    used: float
+    """Time step of the diagnosis, and of the model that it returns [s]."""
+    change: float
+    """By how much it changes the predictions: root mean square over the noise, initial states fitted [-]."""
+    gain: float
+    """Share of the held-out error that it removes [-]."""
+    low: float
+    """Lower end of the 95 % interval of the gain."""
+    high: float
+    """Upper end."""
+
+    @property
+    def sentence(self) -> str:
+        """A sentence on the time step."""
+        return (
+            f"The model's time step of {1e3 * self.given:.3g} ms is too long for these data: with "
+            f"{1e3 * self.used:.3g} ms its predictions change by {self.change:.2g} x noise, and the held-out error "
+            f"falls by {100 * self.gain:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]; the diagnosis uses it."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the time step in plain types."""
+        gain = {"value": self.gain, "interval": [self.low, self.high]}
+        return {"given": self.given, "used": self.used, "change": self.change, "gain": gain}
+
+
+@dataclass(frozen=True)
 class Detectable:
     """The smallest size of an effect that this recording would reveal."""
 
@@ -170,6 +202,8 @@ class Diagnosis:
     seed: int = 0
     unknown_force: UnknownForceFound | None = None
     """A force of no known form that explains part of the last model's residual; None where there is none."""
+    time_step: FinerTimeStep | None = None
+    """A shorter time step that the data ask for; None where the model's own is short enough."""
 
     @property
     def model(self) -> Model:
@@ -180,6 +214,11 @@ class Diagnosis:
     def accepted(self) -> tuple[Finding, ...]:
         """The effects that were accepted, in the order of their addition."""
         return tuple(f for f in self.effects if f.accepted)
+
+    @property
+    def changes_model(self) -> bool:
+        """Whether `model` differs from the model as given by more than the values of its own parameters."""
+        return bool(self.accepted) or self.time_step is not None
 
     @property
     def headline(self) -> str:
@@ -197,6 +236,7 @@ class Diagnosis:
             "where": [dict(place) for place in self.where],
             "unexplained": self.unexplained,
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
+            "time_step": None if self.time_step is None else self.time_step.to_json(),
             "ratio": list(self.ratio),
             "detectable": [
                 {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
@@ -241,7 +281,8 @@ class Diagnosis:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:
             said.append(f"Next experiment: {self.next_experiment.sentence}")
-        return [*self.issues, *said]
+        numerical = [] if self.time_step is None else [self.time_step.sentence]
+        return [*self.issues, *numerical, *said]
 
 
 def _table_rows(finding: Finding) -> list[tuple[str, ...]]:

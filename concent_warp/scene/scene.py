@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -58,6 +59,18 @@ class Scene:
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh spec that the caller may edit."""
         return spec_from_text(self.xml, self.source)
+
+    def with_timestep(self, timestep: float) -> Scene:
+        """Return the scene with another time step [s]."""
+        root = ElementTree.fromstring(self.xml)
+        option = root.find("option")
+        for other in root.findall("option"):
+            other.attrib.pop("timestep", None)
+        if option is None:
+            option = ElementTree.Element("option")
+            root.insert(0, option)
+        option.set("timestep", repr(float(timestep)))
+        return Scene(ElementTree.tostring(root, encoding="unicode"), self.source)
 
     @cached_property
     def model(self) -> mujoco.MjModel:

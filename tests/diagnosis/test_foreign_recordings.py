@@ -62,6 +62,27 @@ def test_damping_and_delay_of_an_arm_are_found_where_noise_is_not_stated(tmp_pat
     check_saved(found, recording, tmp_path)
 
 
+def test_nothing_is_missing_from_an_arm_but_a_shorter_time_step(tmp_path):
+    recording = read_csv(write_csv(pusher(damping=0.05, delay=0.0), tmp_path / "arm"))
+    found = diagnosed(recording)
+    assert found.verdict == "none_needed"
+    assert not found.accepted
+    assert found.ratio[0] > 1.5
+    assert found.ratio[-1] == pytest.approx(1.0, abs=0.1)
+    assert found.time_step is not None
+    assert found.time_step.given == 0.002
+    assert found.time_step.used <= 0.0005
+    assert found.model.scene.model.opt.timestep == found.time_step.used
+    assert any("time step of 2 ms is too long" in sentence for sentence in found.sentences())
+    assert found.to_json()["time_step"]["gain"]["value"] > 0.5
+
+
+def test_nothing_is_missing_from_a_swung_up_pendulum_but_a_shorter_time_step(tmp_path):
+    found = diagnosed(read_csv(write_csv(swing_up(coulomb=0.0, viscous=0.0), tmp_path / "pendulum")))
+    assert found.verdict == "none_needed"
+    assert not found.accepted
+
+
 @pytest.mark.slow
 def test_friction_and_damping_of_a_swung_up_pendulum_are_found(tmp_path):
     recording = read(swing_up, tmp_path)
@@ -86,6 +107,7 @@ def test_no_drag_is_found_where_there_is_none(tmp_path):
     assert found.ratio[0] == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_heights_alone_tell_of_drag(tmp_path):
     found = diagnosed(read_csv(write_csv(thrown_ball(heights_only=True), tmp_path / "ball")), max_additions=1)
     assert any("air_drag" in group for group in found.groups)

@@ -30,9 +30,9 @@ def finding(name: str, gain: float, *, accepted: bool = True, step: int = 0, rea
     return Finding(name, (), "", (), gain, gain, gain, 0.0, 0.0, accepted, step, (), reason)
 
 
-def node(ratio: float, errors: float = 1.0, effects: int = 0, name: str = "") -> Any:
+def node(ratio: float, errors: float = 1.0, effects: int = 0, name: str = "", scene: str = "as given") -> Any:
     """Return a fitted model."""
-    model = SimpleNamespace(effects=[None] * effects, name=name)
+    model = SimpleNamespace(effects=[None] * effects, name=name, scene=scene)
     # Residuals of one size, beyond the limit of the robust loss nowhere.
     piece = SimpleNamespace(residual=np.full(4, float(ratio)))
     window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))])
@@ -68,12 +68,14 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         concluded = []
         monkeypatch.setattr(made, "baseline", lambda nodes=nodes: nodes[0])
         monkeypatch.setattr(made, "find_addition", find)
+        monkeypatch.setattr(module, "finer_time_step", lambda *_: None)
         monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
         monkeypatch.setattr(made, "remove_superfluous", lambda fitted: fitted)
         monkeypatch.setattr(made, "final_values", lambda fitted: fitted)
         monkeypatch.setattr(made, "conclude", lambda *args, concluded=concluded: concluded.append(args))
         made.run()
-        ((fitted, detectable, issues),) = concluded
+        ((given, fitted, detectable, issues),) = concluded
+        assert given is nodes[0]
         assert fitted == nodes[:count]
         assert detectable == ("size 0",)
         assert issues == []
@@ -81,6 +83,54 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         assert [a[2] for a in asked] == pytest.approx([0.1 + 0.85 * k / 3 for k in range(len(asked))])
         assert made.seen[0] == (0.0, "cutting windows")
         assert made.seen[-1] == (1.0, "done")
+
+
+def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
+    given, effect = node(3.0, 100.0), node(1.5, 40.0, effects=1)
+    for errors, ratio, asked, left in (
+        (35.0, 1.01, 0, ["finer"]),  # it leaves nothing to explain
+        (35.0, 1.4, 2, ["finer", "effect"]),  # more than the effect: the search goes on with it
+        (40.7, 1.6, 2, ["finer", "effect"]),  # nearly as much as the effect
+        (41.0, 1.6, 1, ["as given", "effect"]),  # less than the effect
+    ):
+        made, finer, calls = procedure(max_additions=1), node(ratio, errors, scene="finer"), []
+        rivals = {id(given): finer}
+
+        def find(base, step, calls=calls, made=made):
+            calls.append(base)
+            made.groups.append(("effect",))
+            made.findings.append(finding("effect", 0.6, step=step))
+            return effect, ()
+
+        monkeypatch.setattr(made, "find_addition", find)
+        monkeypatch.setattr(module, "finer_time_step", lambda one, _cfg, rivals=rivals: rivals.get(id(one)))
+        monkeypatch.setattr(module, "time_step_finding", lambda *_: "found")
+        monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
+        fitted, _ = made.add_effects([given], ())
+        assert len(calls) == asked
+        assert [("effect" if one is effect else one.model.scene) for one in fitted] == left
+        assert made.groups == [("effect",)] * (len(fitted) - 1)
+        assert len(made.findings) == len(fitted) - 1
+        assert made.time_step == ("found" if left[0] == "finer" else None)
+
+
+def test_a_shorter_time_step_after_an_effect_may_make_it_superfluous(monkeypatch):
+    made = procedure()
+    made.groups, made.hypotheses, made.findings = [("a",)], [{}], [finding("a", 0.5)]
+    monkeypatch.setattr(module, "refit_without_effect", lambda *_: node(1.0, 104.0, scene="finer"))
+    fitted = made.remove_superfluous([node(3), node(1.0, 100.0, effects=1, scene="finer")])
+    assert len(fitted) == 3
+    assert not made.groups
+    assert not made.findings[0].accepted
+
+
+def test_the_answer_starts_with_the_model_as_given(monkeypatch):
+    monkeypatch.setattr(module, "unknown_force", lambda *_: None)
+    given, finer, added = node(3.0), node(1.2, scene="finer"), node(1.0, scene="finer", effects=1)
+    found = procedure().conclude(given, [finer, added], (), ())
+    assert found.ratio == (30.0, 12.0, 10.0)
+    assert found.models == (given.model, finer.model, added.model)
+    assert procedure().conclude(given, [given], (), ()).ratio == (30.0,)
 
 
 def test_superfluous_effects_are_removed_the_least_needed_first(monkeypatch):
@@ -131,7 +181,7 @@ def test_noise_that_may_be_larger_than_its_estimate_leaves_a_model_adequate(monk
     for ratio, factor, verdict in ((1.8, 1.5, "none_needed"), (1.8, 1.4, "none_of_these"), (1.8, 1.0, "none_of_these")):
         made = procedure()
         made.noise_factors = {"angle": factor}
-        assert made.conclude([node(ratio)], (), ()).verdict == verdict
+        assert made.conclude(node(ratio), [node(ratio)], (), ()).verdict == verdict
 
 
 def test_one_channel_that_the_model_misses_is_not_outweighed_by_others():
@@ -179,7 +229,7 @@ def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monke
     errors = {"after a": 10.0, "after b": 9.6, "after c": 1.0}
     monkeypatch.setattr(made, "_refitted", lambda model, _: node(1.0, errors[model.name], name=model.name))
     base = node(30.0, 100.0, name="given")
-    after = made.carry_over(base, [node(1.0, name=name) for name in errors])
+    after = made.carry_over(base, [base, *(node(1.0, name=name) for name in errors)])
     assert [one.model.name for one in after] == ["given", "after a"]
     assert (made.groups, made.hypotheses) == ([("a",)], [{"a": 1}])
     reason = "explains nothing more over longer windows"
@@ -216,7 +266,7 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     force = None if unknown is None else SimpleNamespace(share=unknown)
     monkeypatch.setattr(module, "unknown_force", lambda nodes, _cfg, _results: force if len(nodes) else None)
     nodes = [node(r, name=str(r)) for r in ratios]
-    found = made.conclude(nodes, ("size",), ["a gap"])
+    found = made.conclude(nodes[0], nodes, ("size",), ["a gap"])
     assert found.verdict == verdict
     assert found.unexplained == pytest.approx(unexplained)
     assert found.ratio == tuple(10 * r for r in ratios)
@@ -237,7 +287,7 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     made = procedure(explain=True, seed=7)
     made.hypotheses = [{"a": MODEL}, {"b": MODEL, "c": MODEL}, {"d": MODEL, "e": MODEL}]
     given = node(3.0, name="given")
-    found = made.conclude([given, node(1.0)], (), ())
+    found = made.conclude(given, [given, node(1.0)], (), ())
     assert (found.where, found.next_experiment) == (({"span": 1},), "experiment")
     (model, recording, cfg), more = asked[0]
     assert (model.name, recording) == ("given", RECORDING)
@@ -248,9 +298,9 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
     asked.clear()
     lone = procedure(explain=True)
     lone.hypotheses = [{"a": MODEL}]
-    assert lone.conclude([node(3.0), node(1.0)], (), ()).next_experiment is None
+    assert lone.conclude(node(3.0), [node(3.0), node(1.0)], (), ()).next_experiment is None
     none = procedure(explain=True)
-    assert none.conclude([node(1.0)], (), ()).where == ()
+    assert none.conclude(node(1.0), [node(1.0)], (), ()).where == ()
     assert len(asked) == 1
 
 

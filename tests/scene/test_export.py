@@ -48,6 +48,26 @@ def test_export_keeps_names_and_inertia():
         np.testing.assert_allclose(exported.body(name).inertia, SCENE.model.body(name).inertia, rtol=1e-14)
 
 
+def test_another_time_step_changes_nothing_else():
+    finer = SCENE.with_timestep(0.0005)
+    assert finer.model.opt.timestep == 0.0005
+    assert SCENE.model.opt.timestep == 0.002
+    for name in ("body_mass", "body_inertia", "geom_size", "geom_friction", "geom_solref", "geom_quat"):
+        np.testing.assert_array_equal(getattr(finer.model, name), getattr(SCENE.model, name))
+
+
+def test_a_time_step_can_be_set_where_the_scene_has_none_or_several():
+    body = "<worldbody><body><freejoint/><geom size='.1'/></body></worldbody>"
+    for options in (
+        "",
+        "<option gravity='0 0 -1'/>",
+        "<option timestep='.01'/><option timestep='.02' gravity='0 0 -1'/>",
+    ):
+        scene = Scene(f"<mujoco>{options}{body}</mujoco>").with_timestep(1 / 3000)
+        assert scene.model.opt.timestep == 1 / 3000
+        assert scene.model.opt.gravity[2] == (-1.0 if "gravity" in options else -9.81)
+
+
 def test_scene_without_spheres_is_exported(tmp_path):
     save_mjcf(Model(SCENE), tmp_path / "scene.xml")
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")).ngeom == 3

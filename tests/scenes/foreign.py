@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -71,12 +72,29 @@ BALL = """
 
 
 def _integrated(
-    rates: Callable[[float, np.ndarray], np.ndarray], state: list[float], time: np.ndarray, step: float
+    rates: Callable[[float, np.ndarray], np.ndarray], state: list[float], time: np.ndarray, step: float, late: float = 0
 ) -> np.ndarray:
-    """Return the states at some times, shape (T, S), of an equation whose commands change at most every `step` [s]."""
-    found = solve_ivp(rates, (0.0, float(time[-1])), state, t_eval=time, rtol=1e-7, atol=1e-9, max_step=step)
-    assert found.success
-    return found.y.T
+    """Return the states at some times, shape (T, S), of an equation whose commands change every `step` [s].
+
+    Commands change at multiples of the step plus `late` [s]; each span between two changes is integrated by itself.
+    """
+    edges = np.concatenate([[0.0], np.arange(late % step or step, time[-1], step), [time[-1] + 1e-9]])
+    found, y = [], np.asarray(state)
+    for begin, end in pairwise(edges):
+        inside = time[(time >= begin - 1e-12) & (time < end - 1e-12)]
+        middle = (begin + end) / 2
+        span = solve_ivp(
+            lambda _, y, t=middle: rates(t, y),
+            (begin, end),
+            y,
+            t_eval=[*np.maximum(inside, begin), end],
+            rtol=1e-8,
+            atol=1e-10,
+        )
+        assert span.success
+        found.append(span.y[:, :-1])
+        y = span.y[:, -1]
+    return np.concatenate(found, axis=1).T
 
 
 def pusher(damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, seconds: float = 6.0) -> Recording:
@@ -121,7 +139,7 @@ def pusher(damping: float = 0.15, delay: float = 0.02, *, noise: float = 1e-3, s
         return np.concatenate([v, np.linalg.solve(mass, torque - coriolis)])
 
     time = np.arange(0.0, seconds - 0.02, 0.008)
-    angles = _integrated(rates, [0.0] * 4, time, period)[:, :2] + rng.normal(0, noise, (len(time), 2))
+    angles = _integrated(rates, [0.0] * 4, time, period, delay)[:, :2] + rng.normal(0, noise, (len(time), 2))
     demonstration = Demonstration(
         "demo_0",
         qpos=np.zeros(2),

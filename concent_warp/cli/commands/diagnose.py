@@ -91,7 +91,7 @@ def run(arguments: Arguments) -> Diagnosis:
         _save_accepted(arguments, found)
         _write_report(arguments, found, recording)
     if not arguments.json:
-        for path in (arguments.apply if found.accepted else None, arguments.html):
+        for path in (arguments.apply if found.changes_model else None, arguments.html):
             if path is not None:
                 say_written(path)
     return found
@@ -177,7 +177,7 @@ def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
     path = arguments.apply
     if path is None:
         return
-    if not found.accepted:
+    if not found.changes_model:
         if not arguments.json:
             say(escape(f"No effect was accepted: {path} was not written."))
         return
@@ -192,7 +192,7 @@ def _write_report(arguments: Arguments, found: Diagnosis, recording: Recording) 
     from concent_warp.report.report import write_report
 
     models = {"model": found.models[0]}
-    if found.accepted:
+    if found.changes_model:
         models = {"before": found.models[0], "after": found.model}
     comparison = compare_replays(models, recording, arguments.engine, seed=arguments.seed)
     settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}

@@ -99,7 +99,7 @@ def test_a_force_that_depends_on_place_is_seen_behind_an_effect_that_took_up_par
 
 def test_the_verdict_then_is_none_of_these_and_says_so(partly):
     recording = ridden(friction=FRICTION, force=bump)
-    said = Procedure(Model(Scene(rail())), recording, CFG).conclude(partly, (), ())
+    said = Procedure(Model(Scene(rail())), recording, CFG).conclude(partly[0], partly, (), ())
     assert said.verdict == "none_of_these"
     assert said.unknown_force is not None
     assert said.unexplained >= said.unknown_force.share

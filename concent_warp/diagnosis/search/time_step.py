@@ -1,0 +1,104 @@
+"""Error of the model's own time step, which must not be taken for a missing effect.
+
+To first order, a prediction is off by a term in proportion to the time step (Hairer, Noersett and Wanner, "Solving
+Ordinary Differential Equations I", 1993, section II.3), so that the difference to the prediction with half the step is
+half that term. Where it is not small beside the noise, the model with a step short enough is a rival of every effect;
+it has no parameters and therefore wins where both explain the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
+from concent_warp.diagnosis.result import FinerTimeStep
+from concent_warp.diagnosis.search.baseline import fitted_model
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.screening import robust_sum
+from concent_warp.estimation.noise_ratio import noise_ratio
+from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
+from concent_warp.fit.effects.robust import cauchy_weight
+
+
+def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
+    """Return a fitted model with a shorter time step where that explains significantly more, else None.
+
+    Args:
+        base: The fitted model.
+        cfg: Settings.
+    """
+    division = _division(base, cfg.time_step)
+    if division < 2:
+        return None
+    finer = _with_time_step(base, base.model.scene.model.opt.timestep / division)
+    before = robust_sum(base, [piece.residual for piece in base.pieces])
+    promised = 1 - robust_sum(base, _projected(base, _residuals(finer))) / max(before, 1e-12)
+    if promised < cfg.search.min_expected_gain * cfg.min_gain:
+        return None
+    solver = finer.solver()
+    fit = solver.fit(offsets=base.fit.offsets, starts=base.fit.starts)
+    fit = solver.improve_initial_states(fit, []) if not len(fit.values) else solver.polish(fit)
+    found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
+    return found if _explains_more(base, found, cfg) else None
+
+
+def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
+    """Return what a shorter time step changes.
+
+    Args:
+        base: The fitted model with its own time step.
+        finer: The same with the shorter one.
+        seed: Seed of the bootstrap.
+    """
+    gain = base.errors - finer.errors
+    low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
+    change = [a - b for a, b in zip(_residuals(finer), _residuals(base), strict=True)]
+    return FinerTimeStep(
+        given=float(base.model.scene.model.opt.timestep),
+        used=float(finer.model.scene.model.opt.timestep),
+        change=noise_ratio(np.concatenate(_projected(base, change))),
+        gain=float(gain.sum() / max(base.errors.sum(), 1e-12)),
+        low=low,
+        high=high,
+    )
+
+
+def _explains_more(base: FittedModel, finer: FittedModel, cfg: DiagnoseCfg) -> bool:
+    """Return whether the held-out error falls by a relevant and significant share."""
+    gain, rng = base.errors - finer.errors, np.random.default_rng(cfg.seed)
+    relevant = gain.sum() >= cfg.min_gain * base.errors.sum()
+    return bool(relevant and sign_flip_p(gain, rng) <= cfg.significance_level)
+
+
+def _division(base: FittedModel, cfg: TimeStepCfg) -> int:
+    """Return into how many parts to divide the time step, so that its error is small beside the noise."""
+    half = _residuals(_with_time_step(base, base.model.scene.model.opt.timestep / 2))
+    change = [a - piece.residual for a, piece in zip(half, base.fit.linear, strict=True)]
+    error = 2 * noise_ratio(np.concatenate(_projected(base, change)))
+    if not np.isfinite(error):
+        return 1
+    return int(np.clip(np.ceil(error / cfg.max_error), 1, cfg.max_division))
+
+
+def _with_time_step(base: FittedModel, timestep: float) -> FittedModel:
+    """Return the model with another time step, its residuals as they were."""
+    scene = base.model.scene.with_timestep(timestep)
+    return replace(base, model=replace(base.model, scene=scene))
+
+
+def _residuals(base: FittedModel) -> list[np.ndarray]:
+    """Return the residuals of each window at the fitted values and initial states, each (n,)."""
+    solver = base.solver()
+    return solver.p.residuals(solver.trials(base.fit.values, base.fit.offsets))
+
+
+def _projected(base: FittedModel, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return residuals without what changes of the initial states take up to first order, each (n,)."""
+    found = []
+    for r, a, o in zip(residuals, base.fit.starts, base.fit.offsets, strict=True):
+        near = cauchy_weight(o, base.cfg.least_squares.robust)
+        found.append(r - a @ np.linalg.solve(a.T @ a + np.diag(near), a.T @ r))
+    return found
