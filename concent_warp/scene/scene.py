@@ -93,6 +93,14 @@ class Scene:
                 raise SceneError(
                     f"<text name={OBJECTS_TEXT!r}> names bodies that do not exist", where=self.source, found=missing
                 )
+            if "world" in names:
+                raise SceneError(
+                    f"<text name={OBJECTS_TEXT!r}> names the world, which carries no contact geometry",
+                    where=self.source,
+                    expected="bodies that can be touched",
+                    found=names,
+                    fix="leave the world out",
+                )
             return tuple(names)
         free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         return tuple(m.body(m.jnt_bodyid[j]).name for j in free)

@@ -237,7 +237,7 @@ def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monke
         ("a", True, ""), ("b", False, reason), ("c", False, reason), ("x", False, "no better than chance"),
     ]  # fmt: skip
     errors["after b"] = 9.4
-    assert len(made.carry_over(base, [node(1.0, name=name) for name in errors])) == 4
+    assert len(made.carry_over(base, [base, *(node(1.0, name=name) for name in errors)])) == 4
 
 
 @pytest.mark.parametrize(

@@ -210,3 +210,9 @@ def _unscanned(folder: Path) -> Path:
     text = (folder / "a.xml").read_text()
     (folder / "b.xml").write_text(text.replace("<mujoco>", "<mujoco><!-- -- -->", 1).replace("a.xml", "b.xml"))
     return folder / "b.xml"
+
+
+def test_the_world_is_no_object():
+    text = '<mujoco><custom><text name="concent_objects" data="world"/></custom></mujoco>'
+    with pytest.raises(SceneError, match="names the world"):
+        Scene(text).objects()
