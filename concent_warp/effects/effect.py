@@ -259,7 +259,12 @@ def variant_fields(
 
     chosen = sorted({name for effect in effects for name in effect.fields(m)})
     found = {name: np.empty((len(values), *np.shape(_field(m, name)))) for name in chosen}
-    for n, row in enumerate(values):
+    first: dict[bytes, int] = {}
+    for n, row in enumerate(values if chosen else ()):
+        if (same := first.setdefault(row.tobytes(), n)) != n:
+            for name in chosen:
+                found[name][n] = found[name][same]
+            continue
         variant = copy.copy(m)
         for effect, part in zip(effects, split, strict=True):
             effect.write(variant, row[part])

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import queue
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -25,6 +25,7 @@ from concent_warp.simulate.inputs import (
     host_variants,
     with_force_models,
 )
+from concent_warp.simulate.mujoco_batch import BatchCfg, distinct, simulate_batch
 from concent_warp.simulate.mujoco_steps import (
     OVERFLOW,
     VariantResult,
@@ -37,6 +38,9 @@ from concent_warp.simulate.parallel import ProcessPoolCfg, in_processes, simulat
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
+
+S = TypeVar("S")
+T = TypeVar("T")
 
 
 class MujocoEngine:
@@ -51,6 +55,7 @@ class MujocoEngine:
         memory: int | None = None,
         max_memory: int = 2**30,
         processes: ProcessPoolCfg | None = None,
+        batches: BatchCfg | None = None,
     ) -> None:
         """Compile the model.
 
@@ -63,6 +68,7 @@ class MujocoEngine:
                 It grows when it overflows.
             max_memory: How far the arena may grow [bytes].
             processes: When simulations whose steps call Python are distributed over processes.
+            batches: How the others are distributed over calls of MuJoCo.
 
         Raises:
             EngineError: An argument is out of bounds.
@@ -74,8 +80,10 @@ class MujocoEngine:
         self._collidable = None if collidable is None else np.array(collidable)
         self._memory = memory
         self._processes = processes or ProcessPoolCfg()
+        self._batches = batches or BatchCfg()
         self._compiled, self._sphere_geom = compile_model(model, self._collidable)
         self._compilers: queue.SimpleQueue[VariantCompiler] = queue.SimpleQueue()
+        self._data: queue.SimpleQueue[mujoco.MjData] = queue.SimpleQueue()
         if memory is not None:
             self._resize(memory)
         self.repeats = 0
@@ -143,21 +151,37 @@ class MujocoEngine:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs."""
-        return {name: value for name, value in vars(self).items() if name != "_compilers"}
+        return {name: value for name, value in vars(self).items() if name not in ("_compilers", "_data")}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         """Restore the engine in another process."""
         vars(self).update(state)
-        self._compilers = queue.SimpleQueue()
+        self._compilers, self._data = queue.SimpleQueue(), queue.SimpleQueue()
 
     def _simulated(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants, `threads` at a time."""
         count = min(self.threads, len(rows))
         if run.variants.force_models and self._processes.suits(count, len(rows) * run.steps):
             return in_processes(self._in_turn, run, rows, self.threads)
-        # Force models are Python code, which runs in one thread at a time: more threads would only slow it down.
-        with ThreadPoolExecutor(1 if run.variants.force_models else count) as pool:
-            return list(pool.map(lambda n: self._simulate(run, n), rows))
+        if run.variants.force_models:  # Python code, which runs in one thread at a time: more would only slow it down
+            count = 1
+        elif records_states_only(self._compiled, run) and not self._varies_spheres(run.variants):
+            parts = self._batches.parts(rows, run.steps, count)
+            return [r for part in _in_threads(lambda part: self._batch(run, part), parts, count) for r in part]
+        return _in_threads(lambda n: self._simulate(run, n), rows, count)
+
+    def _batch(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
+        """Simulate some variants in one call, and those that raise a warning by themselves."""
+        fields = run.variants.fields
+        like = distinct(rows, [fields[name] for name in fields])
+        models = {n: self._variant_model(run.variants, n) for n in dict.fromkeys(like)}
+        try:
+            d = self._data.get_nowait()
+        except queue.Empty:
+            d = mujoco.MjData(self._compiled)
+        found = simulate_batch([models[n] for n in like], d, run, rows)
+        self._data.put(d)
+        return [self._simulate(run, n) if result is None else result for n, result in zip(rows, found, strict=True)]
 
     def _in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
         """Simulate all variants one after the other, in another process."""
@@ -187,9 +211,13 @@ class MujocoEngine:
             raise EngineError("MuJoCo stopped", where=f"variant {n}", found=error) from None
         return None if d.warning.number[OVERFLOW].any() else result
 
+    def _varies_spheres(self, variants: Variants) -> bool:
+        """Return whether spheres of the contact geometry vary."""
+        return bool(len(self._sphere_geom)) and any(getattr(variants, name) is not None for name in SPHERE_FIELDS)
+
     def _variant_model(self, variants: Variants, n: int) -> mujoco.MjModel:
         """Return the model of variant n, compiled anew where geometry varies: the mid-phase trees depend on it."""
-        if len(self._sphere_geom) and any(getattr(variants, name) is not None for name in SPHERE_FIELDS):
+        if self._varies_spheres(variants):
             try:
                 compiler = self._compilers.get_nowait()
             except queue.Empty:
@@ -220,10 +248,18 @@ class MujocoEngine:
     def _resize(self, size: int) -> None:
         """Compile anew with an arena of `size` bytes."""
         self._memory = size
-        self._compilers = queue.SimpleQueue()
+        self._compilers, self._data = queue.SimpleQueue(), queue.SimpleQueue()
         spec = self.model.spec(self._collidable)
         spec.memory = size
         self._compiled = self.model.finish(spec.compile())
+
+
+def _in_threads(work: Callable[[S], T], arguments: Sequence[S], count: int) -> list[T]:
+    """Return the results of some work, in `count` threads."""
+    if count == 1 or len(arguments) == 1:
+        return [work(each) for each in arguments]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(work, arguments))
 
 
 class VariantCompiler:

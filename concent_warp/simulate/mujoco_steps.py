@@ -110,7 +110,8 @@ def simulate_steps(
 
 def records_states_only(m: mujoco.MjModel, run: SimulationRun) -> bool:
     """Return whether only states and sensors are recorded, so that MuJoCo can step without interruption."""
-    plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and not m.na and not m.nmocap
+    state = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+    plain = m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and state == 1 + m.nq + m.nv and not m.nmocap
     return run.contacts == "none" and not len(run.body_ids) and run.steps > 0 and plain
 
 

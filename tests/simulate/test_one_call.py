@@ -6,6 +6,7 @@ import pytest
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.mujoco_batch import BatchCfg, distinct
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 
 SERVO = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
@@ -41,3 +42,35 @@ def test_a_run_that_diverges_says_so_and_keeps_what_was_sane(bodies):
     sane = np.isfinite(rollout.qpos).all(axis=2)
     assert sane[:, rollout.step <= 196].all()
     assert not sane[:, rollout.step >= 203].any()
+
+
+def test_variants_of_one_call_are_those_of_as_many_calls_also_beside_one_that_diverges():
+    engine = MujocoEngine(Model(Scene(SERVO)), threads=1)
+    rng, scales = np.random.default_rng(0), np.array([1.0, 1.5, 1.0, 2.0, 1.5])
+    ctrl = np.zeros((5, 300, 2))
+    ctrl[:, :, 0] = rng.normal(size=(5, 300))
+    ctrl[2, 100:, 1] = 1e9
+    qpos = np.tile(engine.compiled.qpos0, (5, 1))
+    qpos[:, 0] = rng.normal(size=5)
+    fields = {"body_mass": np.stack([engine.compiled.body_mass * scale for scale in scales])}
+    together = engine.run(Variants(5, fields=fields, qpos=qpos), ctrl, bodies=[])
+    assert together.diverged.tolist() == [False, False, True, False, False]
+    for n in range(5):
+        own = {name: value[n : n + 1] for name, value in fields.items()}
+        alone = engine.run(Variants(1, fields=own, qpos=qpos[n : n + 1]), ctrl[n], bodies=None)
+        for name in ("qpos", "qvel", "sensordata"):
+            np.testing.assert_array_equal(getattr(together, name)[n], getattr(alone, name)[0])
+
+
+def test_parts_of_a_run_are_small_enough_and_leave_no_thread_idle():
+    cfg = BatchCfg(max_variants=10, max_steps=1000, calls_per_thread=2)
+    assert cfg.parts(range(25), 50, 1) == [list(range(10)), list(range(10, 20)), list(range(20, 25))]
+    assert [len(part) for part in cfg.parts(range(25), 300, 1)] == [3] * 8 + [1]
+    assert [len(part) for part in cfg.parts(range(3), 5000, 1)] == [1, 1, 1]
+    assert [len(part) for part in cfg.parts(range(12), 50, 2)] == [3, 3, 3, 3]
+
+
+def test_equal_rows_share_the_first_of_them():
+    values = np.array([1.0, 2.0, 1.0, 2.0, 3.0])
+    assert distinct([1, 2, 3, 4], [values, np.ones(5)]) == [1, 2, 1, 4]
+    assert distinct([1, 2], []) == [1, 1]

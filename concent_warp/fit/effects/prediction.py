@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from concent_warp.checks import Bounds, Duration, Positive
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, variant_fields
@@ -299,9 +298,14 @@ class SensorReader:
 
 def turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the rotation vectors [rad] from `start` to `end`, quaternions wxyz (T, 4), shape (T, 3); NaN for NaN."""
-    vector = np.full((len(start), 3), np.nan)
-    valid = np.isfinite(start).all(axis=1)
-    if valid.any():
-        first = Rotation.from_quat(start[valid], scalar_first=True)
-        vector[valid] = (first.inv() * Rotation.from_quat(end[valid], scalar_first=True)).as_rotvec()
-    return vector
+    w1, w2 = start[:, :1], end[:, :1]
+    v1, v2 = start[:, 1:], end[:, 1:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axis = w1 * v2 - w2 * v1 - np.cross(v1, v2)
+        cosine = w1 * w2 + (v1 * v2).sum(axis=1, keepdims=True)
+        axis, cosine = np.where(cosine < 0, -axis, axis), np.abs(cosine)
+        sine = np.sqrt((axis**2).sum(axis=1, keepdims=True))
+        length = np.hypot(sine, cosine)
+        # The angle over its half's sine; quaternions need not have unit length.
+        factor = np.where(sine < 1e-6 * length, 2.0 / length, 2.0 * np.arctan2(sine, cosine) / sine)
+    return axis * factor
