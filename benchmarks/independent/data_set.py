@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import Literal
 
 from concent_warp.recording.recording import Recording
@@ -19,6 +20,11 @@ Size = Literal["small", "middle", "large"]
 SIZES: tuple[Size, ...] = ("small", "middle", "large")
 TOLERANCE = 0.01
 """Largest relative error of nominal masses, lengths and gains [-], in all data sets."""
+
+
+def number(text: str) -> float:
+    """Return a number between 0 and 1 that depends on nothing but a text, by SHA-256."""
+    return int(sha256(text.encode()).hexdigest()[:12], 16) / 16**12
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 python -m benchmarks.independent.split  # writes split.json by the rule
 
-The rule sees names only: SHA-256 of a text, as a number between 0 and 1. Locked are, in the world on MuJoCo, the
+The rule sees names only: a number between 0 and 1 from the SHA-256 of a text. Locked are, in the world on MuJoCo, the
 `LOCKED_RIGS` rigs whose names have the smallest numbers, and of the others every key (rig and effects) whose number is
 below `LOCKED_SHARE`; in the world on Drake every key whose number is below `LOCKED_DRAKE`. Whether a set is locked
 does not depend on which others there are.
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from hashlib import sha256
 from pathlib import Path
 
-from benchmarks.independent.data_set import DataSet
+from benchmarks.independent.data_set import DataSet, number
 from benchmarks.independent.worlds import all_sets
 from concent_warp.files import write_text
 from concent_warp.reality.rigs.registry import RIGS
@@ -24,11 +23,6 @@ PATH = Path(__file__).with_name("split.json")
 LOCKED_RIGS = 2
 LOCKED_SHARE = 0.25
 LOCKED_DRAKE = 0.5
-
-
-def number(text: str) -> float:
-    """Return a number between 0 and 1 that depends on nothing but a text."""
-    return int(sha256(text.encode()).hexdigest()[:12], 16) / 16**12
 
 
 def locked_rigs() -> list[str]:
