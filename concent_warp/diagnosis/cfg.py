@@ -175,6 +175,19 @@ class TimeStepCfg:
 
 
 @dataclass(frozen=True)
+class NominalCfg:
+    """Settings of the fit of nominal values within their tolerance, see `concent_warp.effects.library.nominal`."""
+
+    enabled: bool = True
+    """Whether masses, lengths and gains may differ from their nominal values within the tolerance."""
+    min_change: Positive = 0.1
+    """Change of the predictions within the tolerance from which on a value is fitted: RMS over the noise, initial
+    states fitted [-]. In squares, 1 % of what the noise itself leaves."""
+    max_values: Count = 8
+    """Most values that are fitted, the most visible ones. Empirical."""
+
+
+@dataclass(frozen=True)
 class FailureCfg:
     """Settings of the list of spans and forces in which the model as given fails."""
 
@@ -239,6 +252,8 @@ class DiagnoseCfg:
     """Test for a force of no known form."""
     time_step: TimeStepCfg = field(default_factory=TimeStepCfg)
     """Test for errors of the model's own time step."""
+    nominal: NominalCfg = field(default_factory=NominalCfg)
+    """Nominal values within their tolerance."""
     failures: FailureCfg = field(default_factory=FailureCfg)
     """Where the model as given fails."""
     experiment: SuggestExperimentCfg = field(default_factory=SuggestExperimentCfg)

@@ -39,6 +39,11 @@ from concent_warp.diagnosis.search.joint_fit import (
     refit_jointly,
     with_intervals,
 )
+from concent_warp.diagnosis.search.nominal_values import (
+    nominal_effects,
+    with_nominal_values,
+    without_nominal_values,
+)
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
@@ -48,6 +53,7 @@ from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
+from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import channel_noises, observe
 from concent_warp.fit.effects.prediction import Prediction
@@ -84,6 +90,7 @@ class Procedure:
         self.noise: dict[str, float] = {}
         self.noise_factors: dict[str, float] = {}
         self.time_step: FinerTimeStep | None = None
+        self.nominal_values: tuple[FittedParameter, ...] = ()
 
     def run(self) -> Diagnosis:
         """Return the diagnosis."""
@@ -103,7 +110,7 @@ class Procedure:
             fitted = self.carry_over(given, found)
         fitted, smallest = self.add_effects(fitted, detectable)
         detectable = detectable or smallest
-        fitted = self.final_values(self.remove_superfluous(fitted))
+        fitted = self.final_values(self.remove_nominal(self.remove_superfluous(fitted)))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
 
@@ -119,12 +126,18 @@ class Procedure:
         cfg, runner, fitted = self.cfg, self.runner, list(fitted)
         while True:
             step = len(fitted) - 1
-            if step and not self._is_lacking(fitted[-1]):
+            if (step or nominal_effects(fitted[-1].model)) and not self._is_lacking(fitted[-1]):
                 break
             finer = self._finer(fitted[-1])
             if finer is not None and not self._is_lacking(finer):
                 fitted = self._adopt(fitted, finer)
                 break
+            if (nominal := self._nominal(fitted[-1])) is not None:
+                both = None if finer is None else self._nominal(finer)
+                if both is not None and both.errors.sum() <= (1 + cfg.search.equal_error) * nominal.errors.sum():
+                    fitted, nominal = self._adopt(fitted, finer or nominal), both
+                fitted = [*fitted[:-1], nominal]
+                continue
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
@@ -152,6 +165,13 @@ class Procedure:
         self.runner.progress(self.runner.share, "halving the time step")
         return finer_time_step(one, self.cfg)
 
+    def _nominal(self, one: FittedModel) -> FittedModel | None:
+        """Return a fitted model with nominal values within their tolerance, None where that explains nothing more."""
+        if not self.cfg.nominal.enabled or nominal_effects(one.model) or not self._is_lacking(one):
+            return None
+        self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
+        return with_nominal_values(one, self.cfg.nominal)
+
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""
         self.time_step = time_step_finding(fitted[-1], finer, self.cfg.seed)
@@ -172,7 +192,7 @@ class Procedure:
             coarse: The model as given and after each addition, over short windows.
         """
         fitted = [base]
-        if coarse[0].model.scene != base.model.scene:
+        if coarse[0].model.scene != base.model.scene or nominal_effects(coarse[0].model):
             fitted = [self._refitted(coarse[0].model, base.windows)]
         for step, one in enumerate(coarse[1:]):
             after = self._refitted(one.model, base.windows)
@@ -284,8 +304,8 @@ class Procedure:
         The last one added has just been tested beside all others.
         """
         steps = list(range(len(fitted) - 1))
-        # A shorter time step may have made the last one superfluous too.
-        untested = 0 if _is_finer(fitted) else 1
+        # A shorter time step, or nominal values, may have made the last one superfluous too.
+        untested = 0 if _is_other(fitted) else 1
         while len(steps) > untested:
             last = fitted[-1]
             owned = len(last.model.effects) - len(steps)
@@ -308,21 +328,33 @@ class Procedure:
         self.groups = [group for group in self.groups if group]
         return fitted
 
+    def remove_nominal(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, the last with nominal values as given where fitted ones explain too little more."""
+        last = fitted[-1]
+        if not nominal_effects(last.model):
+            return fitted
+        self.runner.progress(self.runner.share, "removing nominal values")
+        reduced = without_nominal_values(last)
+        if 1 - last.errors.sum() / max(reduced.errors.sum(), 1e-12) >= self.cfg.min_gain:
+            return fitted
+        return [*fitted[:-1], reduced]
+
     def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
 
         The gain of each effect is then that over the same model without it.
         """
         accepted = sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
-        if not accepted:
+        if not accepted and not nominal_effects(fitted[-1].model):
             return fitted
         self.runner.progress(self.runner.share, "fitting all effects together")
         last = refit_jointly(fitted[-1])
         owned = len(last.model.effects) - len(accepted)
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         parameters = joint_parameters(last, widening)
+        self.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
-            alone = len(accepted) == 1 and not _is_finer(fitted)
+            alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
             without = fitted[0] if alone else refit_without_effect(last, owned + k)
             final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
@@ -349,14 +381,15 @@ class Procedure:
         adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
         unknown = None
         if adequate:
-            unknown = unknown_force(fitted, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs))
+            nodes = [given, *(fitted[1:] or fitted)]
+            unknown = unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs))
         verdict: Verdict = "none_needed"
         if not adequate or unknown is not None:
             verdict = "none_of_these"
         elif len(fitted) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
         explained = verdict == "none_needed" or not cfg.explain
-        after = fitted if fitted[0].model.scene != given.model.scene else fitted[1:]
+        after = fitted[1:] if fitted[0] is given else fitted
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
@@ -371,6 +404,7 @@ class Procedure:
             seed=cfg.seed,
             unknown_force=unknown,
             time_step=self.time_step,
+            nominal_values=self.nominal_values,
         )
 
     def _suggested_experiment(self) -> SuggestedExperiment | None:
@@ -395,6 +429,7 @@ class Procedure:
         )
 
 
-def _is_finer(fitted: Sequence[FittedModel]) -> bool:
-    """Return whether the last of some fitted models has a shorter time step than the first."""
-    return fitted[-1].model.scene != fitted[0].model.scene
+def _is_other(fitted: Sequence[FittedModel]) -> bool:
+    """Return whether the last of some fitted models has another time step, or other nominal values, than the first."""
+    first, last = fitted[0].model, fitted[-1].model
+    return first.scene != last.scene or len(nominal_effects(first)) != len(nominal_effects(last))

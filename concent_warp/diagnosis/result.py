@@ -72,16 +72,7 @@ class Finding:
             "name": self.name,
             "target": list(self.target),
             "family": self.family,
-            "parameters": [
-                {
-                    "name": p.name,
-                    "value": _number(p.value),
-                    "interval": [_number(p.low), _number(p.high)],
-                    "unit": p.unit,
-                    "null": _number(p.null),
-                }
-                for p in self.parameters
-            ],
+            "parameters": [_parameter(p) for p in self.parameters],
             "gain": {"value": self.gain, "interval": [self.low, self.high]},
             "p": self.p,
             "p_smallest": self.smallest_p,
@@ -204,6 +195,8 @@ class Diagnosis:
     """A force of no known form that explains part of the last model's residual; None where there is none."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
+    nominal_values: tuple[FittedParameter, ...] = ()
+    """Masses, lengths and gains that the data ask for within their tolerance, as factors on the nominal values."""
 
     @property
     def model(self) -> Model:
@@ -218,7 +211,7 @@ class Diagnosis:
     @property
     def changes_model(self) -> bool:
         """Whether `model` differs from the model as given by more than the values of its own parameters."""
-        return bool(self.accepted) or self.time_step is not None
+        return bool(self.accepted or self.nominal_values) or self.time_step is not None
 
     @property
     def headline(self) -> str:
@@ -237,6 +230,7 @@ class Diagnosis:
             "unexplained": self.unexplained,
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
             "time_step": None if self.time_step is None else self.time_step.to_json(),
+            "nominal_values": [_parameter(p) for p in self.nominal_values],
             "ratio": list(self.ratio),
             "detectable": [
                 {"name": d.name, "parameter": d.parameter, "size": _number(d.size), "unit": d.unit}
@@ -282,6 +276,9 @@ class Diagnosis:
         if self.next_experiment:
             said.append(f"Next experiment: {self.next_experiment.sentence}")
         numerical = [] if self.time_step is None else [self.time_step.sentence]
+        if self.nominal_values:
+            values = ", ".join(f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]" for p in self.nominal_values)
+            numerical.append(f"Nominal values were fitted within their tolerance of 1 %: {values}.")
         return [*self.issues, *numerical, *said]
 
 
@@ -300,6 +297,12 @@ def _table_rows(finding: Finding) -> list[tuple[str, ...]]:
         )
         for k, p in enumerate(finding.parameters)
     ]
+
+
+def _parameter(p: FittedParameter) -> dict[str, Any]:
+    """Return a fitted parameter in plain types."""
+    interval = [_number(p.low), _number(p.high)]
+    return {"name": p.name, "value": _number(p.value), "interval": interval, "unit": p.unit, "null": _number(p.null)}
 
 
 def _number(value: float) -> float | None:

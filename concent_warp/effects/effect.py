@@ -99,6 +99,8 @@ class Effect:
     not distinguish."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
+    nominal: ClassVar[bool] = False
+    """Whether it stands for a nominal value of the model within its tolerance, which no diagnosis calls missing."""
     history: ClassVar[float] = 0.0
     """Length [s] of the history of commands on which the present command depends."""
 

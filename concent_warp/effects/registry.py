@@ -9,7 +9,7 @@ from functools import cache
 from importlib.metadata import entry_points
 
 from concent_warp.effects.effect import Effect
-from concent_warp.effects.library import contact, drives, geometry, joints, measurement, objects, world
+from concent_warp.effects.library import contact, drives, geometry, joints, measurement, nominal, objects, world
 from concent_warp.errors import ModelError
 
 GROUP = "concent_warp.effects"
@@ -51,6 +51,14 @@ OURS: tuple[type[Effect], ...] = (
     measurement.SensorGain,
 )
 
+NOMINAL: tuple[type[Effect], ...] = (
+    nominal.NominalMass,
+    nominal.NominalLength,
+    nominal.NominalSize,
+    nominal.NominalGain,
+)
+"""Nominal values within their tolerance, which a model may have and no diagnosis calls missing."""
+
 
 @cache
 def effect_classes() -> dict[str, type[Effect]]:
@@ -76,7 +84,7 @@ def effect_classes() -> dict[str, type[Effect]]:
             raise ModelError(
                 "not an effect", where=f"entry point {entry.name} = {entry.value}", expected="a subclass of Effect"
             )
-        if loaded.name in found:
+        if loaded.name in found or loaded.name in {kind.name for kind in NOMINAL}:
             raise ModelError("the name of an effect is taken", where=f"entry point {entry.value}", found=loaded.name)
         found[loaded.name] = loaded
     return found
@@ -95,7 +103,7 @@ def effect_class(name: str) -> type[Effect]:
     """
     import difflib
 
-    known = effect_classes()
+    known = effect_classes() | {kind.name: kind for kind in NOMINAL}
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)

@@ -32,7 +32,8 @@ def finding(name: str, gain: float, *, accepted: bool = True, step: int = 0, rea
 
 def node(ratio: float, errors: float = 1.0, effects: int = 0, name: str = "", scene: str = "as given") -> Any:
     """Return a fitted model."""
-    model = SimpleNamespace(effects=[None] * effects, name=name, scene=scene)
+    added = SimpleNamespace(effect=SimpleNamespace(nominal=False))
+    model = SimpleNamespace(effects=[added] * effects, name=name, scene=scene)
     # Residuals of one size, beyond the limit of the robust loss nowhere.
     piece = SimpleNamespace(residual=np.full(4, float(ratio)))
     window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))])
@@ -69,6 +70,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         monkeypatch.setattr(made, "baseline", lambda nodes=nodes: nodes[0])
         monkeypatch.setattr(made, "find_addition", find)
         monkeypatch.setattr(module, "finer_time_step", lambda *_: None)
+        monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
         monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
         monkeypatch.setattr(made, "remove_superfluous", lambda fitted: fitted)
         monkeypatch.setattr(made, "final_values", lambda fitted: fitted)
@@ -104,6 +106,7 @@ def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
 
         monkeypatch.setattr(made, "find_addition", find)
         monkeypatch.setattr(module, "finer_time_step", lambda one, _cfg, rivals=rivals: rivals.get(id(one)))
+        monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
         monkeypatch.setattr(module, "time_step_finding", lambda *_: "found")
         monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
         fitted, _ = made.add_effects([given], ())

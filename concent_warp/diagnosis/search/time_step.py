@@ -35,7 +35,7 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
         return None
     finer = _with_time_step(base, base.model.scene.model.opt.timestep / division)
     before = robust_sum(base, [piece.residual for piece in base.pieces])
-    promised = 1 - robust_sum(base, _projected(base, _residuals(finer))) / max(before, 1e-12)
+    promised = 1 - robust_sum(base, _without_own(base, _projected(base, _residuals(finer)))) / max(before, 1e-12)
     if promised < cfg.search.min_expected_gain * cfg.min_gain:
         return None
     solver = finer.solver()
@@ -77,7 +77,7 @@ def _division(base: FittedModel, cfg: TimeStepCfg) -> int:
     """Return into how many parts to divide the time step, so that its error is small beside the noise."""
     half = _residuals(_with_time_step(base, base.model.scene.model.opt.timestep / 2))
     change = [a - piece.residual for a, piece in zip(half, base.fit.linear, strict=True)]
-    error = 2 * noise_ratio(np.concatenate(_projected(base, change)))
+    error = 2 * noise_ratio(np.concatenate(_without_own(base, _projected(base, change))))
     if not np.isfinite(error):
         return 1
     return int(np.clip(np.ceil(error / cfg.max_error), 1, cfg.max_division))
@@ -102,3 +102,12 @@ def _projected(base: FittedModel, residuals: Sequence[np.ndarray]) -> list[np.nd
         near = cauchy_weight(o, base.cfg.least_squares.robust)
         found.append(r - a @ np.linalg.solve(a.T @ a + np.diag(near), a.T @ r))
     return found
+
+
+def _without_own(base: FittedModel, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return projected residuals without what changes of the model's own parameters take up to first order."""
+    jacobians, prior = [piece.jacobian for piece in base.pieces], base.cfg.least_squares.prior
+    normal = sum((j.T @ j for j in jacobians), np.eye(jacobians[0].shape[1]) / prior**2)
+    slope = sum((j.T @ r for j, r in zip(jacobians, residuals, strict=True)), np.zeros(len(normal)))
+    move = np.linalg.solve(normal, slope) if len(normal) else slope
+    return [r - j @ move for j, r in zip(jacobians, residuals, strict=True)]

@@ -441,10 +441,10 @@ class Solver:
         return np.where(np.isinf(values), values, np.clip(values, self.low, self.high))
 
     def prior(self, values: np.ndarray) -> np.ndarray:
-        """Return the parameters' distances from where the fit started, in units of their weak prior."""
-        start = np.where(np.isfinite(self.p.start), self.p.start, values)
+        """Return the parameters' distances from the mean of their prior, in units of its standard deviation."""
+        mean = np.where(np.isfinite(self.p.prior_mean), self.p.prior_mean, values)
         finite = np.isfinite(values)
-        return np.where(finite, (values - start) / (self.cfg.prior * self.scale), 0.0)
+        return np.where(finite, (values - mean) / (self.cfg.prior * self.scale), 0.0)
 
     def cost(self, residuals: Sequence[np.ndarray], offsets: Sequence[np.ndarray], values: np.ndarray) -> float:
         """Return half the robust sum of squares, with the priors."""

@@ -104,6 +104,10 @@ class Prediction:
             [v for a in model.effects for v in a.values] + [p.null for group in fresh for p in group], dtype=float
         )
         self.owned = sum(len(group) for group in owned)
+        self.prior_mean = self.start.copy()
+        for e, part in zip(self.effects, self.split, strict=True):
+            if e.nominal:
+                self.prior_mean[part] = [p.null for p in self.parameters[part]]
         self._engine_name: EngineName = engine
         self._threads = threads
         self._engines: dict[tuple[float, ...], tuple[Engine, mujoco.MjModel]] = {}

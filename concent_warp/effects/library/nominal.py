@@ -1,0 +1,136 @@
+"""Nominal values of a model within their tolerance: masses, lengths and gains that are known to about one percent.
+
+They are no effects that a model lacks: data sheets and rulers are no better. A diagnosis fits them before it looks for
+an effect, each with a normal prior about the nominal value, so that small errors of several are not taken for one.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.library.drives import ActuatorGain
+from concent_warp.effects.library.objects import Size
+from concent_warp.effects.select import element_name, free_bodies
+
+TOLERANCE = 0.01
+"""Standard deviation of a nominal value over the value [-]: what scales, rulers and data sheets state as a rule."""
+BOUND = 2.0
+"""Bounds, in standard deviations: 95 % of a normal distribution."""
+PRIOR_SCALES = 10.0
+"""Standard deviations of a parameter's prior over its scale (`LeastSquaresCfg.prior`)."""
+
+
+def nominal_parameters(name: str, targets: tuple[str, ...]) -> tuple[Parameter, ...]:
+    """Return one factor a target, 1 by default, within the tolerance."""
+    low, high, scale = 1 - BOUND * TOLERANCE, 1 + BOUND * TOLERANCE, TOLERANCE / PRIOR_SCALES
+    return tuple(Parameter(f"{name}[{t}]", "-", 1.0, low, high, scale) for t in targets)
+
+
+class NominalBodyValue(Effect):
+    """A nominal value of bodies that move."""
+
+    family = "objects"
+    kind = "body"
+    nominal = True
+    source = "tolerance of nominal values"
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all bodies that move and have a mass and a name."""
+        found = tuple(
+            n
+            for b in range(1, m.nbody)
+            if m.body_weldid[b] and m.body_mass[b] > 0 and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b))
+        )
+        return (found,) if found else ()
+
+
+class NominalMass(NominalBodyValue):
+    """Mass and inertia of bodies within their tolerance."""
+
+    name = "nominal_mass"
+    summary = "Mass and inertia are the model's times a factor within the tolerance of nominal values."
+    signature = "residual force in proportion to acceleration and gravity"
+    confusions = ("mass",)
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a body."""
+        return nominal_parameters("mass", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Mass and inertia."""
+        return ("body_mass", "body_inertia")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale both."""
+        ids = self.ids(m)
+        m.body_mass[ids] *= values
+        m.body_inertia[ids] *= values[:, None]
+
+
+class NominalLength(NominalBodyValue):
+    """Lengths of links within their tolerance."""
+
+    name = "nominal_length"
+    summary = (
+        "What a link carries (centre of mass, sites, further links) lies at the model's place in its frame times a "
+        "factor within the tolerance of nominal values."
+    )
+    signature = "residuals in proportion to distances from the joint"
+    confusions = ("length_scale", "mass")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the bodies that hang on others by joints."""
+        free = {element_name(m, mujoco.mjtObj.mjOBJ_BODY, b) for b in free_bodies(m)}
+        found = tuple(n for names in super().targets(m) for n in names if n not in free)
+        return (found,) if found else ()
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Let the compiled bodies have a centre of mass off their origin."""
+        for n in self.target:
+            spec.body(n).simple = False
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor a link."""
+        return nominal_parameters("length", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Positions in bodies."""
+        return ("body_ipos", "body_pos", "site_pos")
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale them."""
+        for b, factor in zip(self.ids(m), values, strict=True):
+            m.body_ipos[b] *= factor
+            m.body_pos[m.body_parentid == b] *= factor
+            m.site_pos[m.site_bodyid == b] *= factor
+
+
+class NominalSize(Size):
+    """Size of a free body within its tolerance."""
+
+    name = "nominal_size"
+    nominal = True
+    summary = "The geoms of the body are the model's times a factor within the tolerance of nominal values."
+    source = "tolerance of nominal values"
+    confusions = ("size", "length_scale")
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor."""
+        return nominal_parameters("size", self.target)
+
+
+class NominalGain(ActuatorGain):
+    """Gains of actuators within their tolerance."""
+
+    name = "nominal_gain"
+    nominal = True
+    summary = "The drive's force is the model's times a factor within the tolerance of nominal values."
+    confusions = ("actuator_gain",)
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor an actuator."""
+        return nominal_parameters("gain", self.target)

@@ -1,0 +1,44 @@
+"""Nominal values within their tolerance are fitted before effects are searched for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import concent_warp as cw
+from concent_warp.diagnosis.cfg import NominalCfg
+from concent_warp.diagnosis.search.nominal_values import _independent
+from tests.scenes.foreign import PUSHER, pusher
+
+
+def test_columns_that_others_can_produce_are_left_out():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 400))
+    columns = np.stack([0.5 * a, a + 0.05 * b, 0.3 * b, 0.01 * rng.normal(size=400)], axis=1)
+    assert list(_independent(columns, NominalCfg())) == [1, 2]
+    assert list(_independent(columns, NominalCfg(max_values=1))) == [1]
+    assert not _independent(columns, NominalCfg(min_change=2.0))
+
+
+def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
+    wrong = PUSHER.replace('mass="0.8"', 'mass="0.806"').replace('kp="12"', 'kp="11.9"')
+    wrong = wrong.replace('"0.12 0 0" mass', '"0.121 0 0" mass')
+    model, recording = cw.Model(cw.Scene(wrong)), pusher(damping=0.05, delay=0.0)
+    found = cw.diagnose(model, recording, cw.DiagnoseCfg(jobs=1, explain=False))
+    assert found.verdict == "none_needed"
+    assert not found.accepted
+    assert found.ratio[-1] == pytest.approx(1.0, abs=0.05)
+    assert found.nominal_values
+    assert all(0.98 <= p.value <= 1.02 and p.low < p.value < p.high for p in found.nominal_values)
+    assert any("within their tolerance" in sentence for sentence in found.sentences())
+    assert found.to_json()["nominal_values"][0]["null"] == 1.0
+    kept = [a for a in found.model.effects if a.effect.nominal]
+    assert [v for a in kept for v in a.values] == pytest.approx([p.value for p in found.nominal_values])
+
+
+def test_nominal_values_stay_as_given_where_that_is_asked_for():
+    wrong = cw.Model(cw.Scene(PUSHER.replace('kp="12"', 'kp="11.8"')))
+    cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=("actuator_gain",), nominal=NominalCfg(enabled=False))
+    found = cw.diagnose(wrong, pusher(damping=0.05, delay=0.0), cfg)
+    assert not found.nominal_values
+    assert found.groups == (("actuator_gain",),)
