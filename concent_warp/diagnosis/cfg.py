@@ -234,6 +234,9 @@ class DiagnoseCfg:
     """Length of a window [s]; by default as long as the motion allows."""
     jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time; -1: one per CPU. `joblib.parallel_config` selects another backend."""
+    seconds: PositiveDuration | None = None
+    """Wall time after which the answer is given with what is known by then and what is unsettled [s]; None: as long as
+    it takes. The model as given is always fitted."""
     seed: int = 0
     """Seed of all random numbers."""
     explain: bool = True

@@ -63,7 +63,7 @@ class CheckpointedRunner(TaskRunner):
         super().__init__(jobs, progress)
         self.model, self.folder, self.key = model, folder, key
 
-    def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T]:
+    def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T | None]:
         """Yield results in order: those in the folder from there, others as they are known."""
         paths = [self.folder / f"{self.name(task, each)}.npz" for each in arguments]
         known = {i: found for i, path in enumerate(paths) if (found := _load(path, self.model)) is not None}
@@ -73,7 +73,8 @@ class CheckpointedRunner(TaskRunner):
                 yield known[i]
                 continue
             result = next(fresh)
-            _save(path, result)
+            if result is not None:
+                _save(path, result)
             yield result
 
     def name(self, task: Callable[..., Any], arguments: Sequence[Any]) -> str:
@@ -87,7 +88,7 @@ class CheckpointedRunner(TaskRunner):
 def _fingerprint(model: Model, recording: Recording, cfg: DiagnoseCfg, versions: Mapping[str, str]) -> str:
     """Return a hash of a model, a recording, the settings that results depend on, and versions."""
     digest = hashlib.sha256(json.dumps(dict(versions), sort_keys=True).encode())
-    _add(digest, replace(cfg, jobs=1))
+    _add(digest, replace(cfg, jobs=1, seconds=None))
     digest.update(model.scene.xml.encode())
     if model.geometry is not None:
         _add(digest, model.geometry)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from concent_warp.diagnosis.search.baseline import (
     refit_without_effect,
 )
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import candidates
+from concent_warp.diagnosis.search.candidates import candidates, label
 from concent_warp.diagnosis.search.evidence import assess, detectable_size, profile_widening
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
 from concent_warp.diagnosis.search.gradient_start import GradientStarts
@@ -50,6 +51,7 @@ from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
+from concent_warp.diagnosis.time_budget import SEARCH_SHARE, TOGETHER_SHARE, TimeBudget, in_words
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
@@ -61,6 +63,7 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.parallel import limit_simulations
 from concent_warp.simulate.select import EngineName
+from concent_warp.simulate.time_limit import TimeUpError
 
 BASELINE_SPAN, ADDITIONS_SPAN = 0.1, 0.85
 """Shares of a diagnosis that the baseline and the additions take, for the progress."""
@@ -91,6 +94,7 @@ class Procedure:
         self.noise_factors: dict[str, float] = {}
         self.time_step: FinerTimeStep | None = None
         self.nominal_values: tuple[FittedParameter, ...] = ()
+        self.budget = TimeBudget(cfg.seconds)
 
     def run(self) -> Diagnosis:
         """Return the diagnosis."""
@@ -103,16 +107,29 @@ class Procedure:
         self.noise_factors = {channel: noise.factor for channel, noise in noises.items()}
         issues = [*check_data(self.recording, cfg.data), *noise_remarks(self.model.compile(), noises)]
         runner.progress(0.0, "cutting windows")
-        given, detectable = self.baseline(), ()
-        fitted = [given]
-        if (coarse := self.coarse_baseline(given)) is not None:
-            found, detectable = self.add_effects([coarse], detectable)
-            fitted = self.carry_over(given, found)
-        fitted, smallest = self.add_effects(fitted, detectable)
-        detectable = detectable or smallest
+        given = self.baseline()
+        with self.budget.until(SEARCH_SHARE):
+            fitted, detectable = self.search(given)
         fitted = self.final_values(self.remove_nominal(self.remove_superfluous(fitted)))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
+
+    def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
+        """Return the model as given and after each addition, and the detectable sizes of all effects."""
+        attempt, detectable, fitted = self.budget.attempt, (), [given]
+        far = "Open: how far the model as given is off over short windows."
+        if (coarse := attempt(lambda: self.coarse_baseline(given), None, far)) is not None:
+            found, detectable = self.add_effects([coarse], detectable)
+            fitted = attempt(
+                lambda: self.carry_over(given, found),
+                [],
+                "Not refitted: values over windows as long as the motion allows.",
+            )
+            if not fitted:
+                self.budget.cut |= set(range(len(found)))
+                return found, detectable
+        fitted, smallest = self.add_effects(fitted, detectable)
+        return fitted, detectable or smallest
 
     def add_effects(
         self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
@@ -142,7 +159,11 @@ class Procedure:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
             recorded = len(self.findings), len(self.groups)
-            best, smallest = self.find_addition(fitted[-1], step)
+            try:
+                best, smallest = self.find_addition(fitted[-1], step)
+            except TimeUpError:
+                self.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
+                break
             detectable = detectable or smallest
             equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
             if finer is not None and finer.errors.sum() <= equal:
@@ -163,14 +184,16 @@ class Procedure:
         if self.time_step is not None or not self._is_lacking(one):
             return None
         self.runner.progress(self.runner.share, "halving the time step")
-        return finer_time_step(one, self.cfg)
+        unsettled = "Open: whether the model's time step is too long."
+        return self.budget.attempt(lambda: finer_time_step(one, self.cfg), None, unsettled)
 
     def _nominal(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more."""
         if not self.cfg.nominal.enabled or nominal_effects(one.model) or not self._is_lacking(one):
             return None
         self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
-        return with_nominal_values(one, self.cfg.nominal)
+        unsettled = "Open: whether nominal values are off within their tolerance."
+        return self.budget.attempt(lambda: with_nominal_values(one, self.cfg.nominal), None, unsettled)
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""
@@ -252,7 +275,7 @@ class Procedure:
         """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all."""
         cfg = self.cfg
         effects = candidates(base.model, self.channels, cfg.effects)
-        screened = self._screened(base, effects)
+        screened = self._screened(base, effects, step)
         null = max_gain_under_null(base, screened, cfg.null_samples, cfg.seed)
         critical = float(np.quantile(null, 1 - cfg.significance_level))
         needed = max(critical, cfg.min_gain)
@@ -263,23 +286,35 @@ class Procedure:
 
         fits = CandidateFits(base, cfg, self.runner)
         fitted = fits.fit(screened, critical, lambda: self._windows(base.model, cfg.search.shooting_window))
+        for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
+            self.budget.note(sentence, step if decides else None)
+        if not fitted and fits.left:
+            raise TimeUpError
         findings = [finding(c) for c in fitted]
         rivals = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if rivals and max(c.share(base) for c in rivals) < cfg.search.doubtful_gain:
-            base = refit_from_rivals(base, sorted(rivals, key=lambda c: -c.share(base))[: cfg.search.rivals])
+            leading = sorted(rivals, key=lambda c: -c.share(base))[: cfg.search.rivals]
+            unsettled = "Open: whether other initial states let the model explain more without an effect."
+            base = self.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
         accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not accepted:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
-        group = group_indistinguishable(base, accepted, finding, self.runner, cfg)
+        group = group_indistinguishable(base, accepted, finding, self.runner, cfg, self.budget)
         self._record(base, group, findings)
         return group[0][0], smallest
 
-    def _screened(self, base: FittedModel, effects: Sequence[Effect]) -> list[ScreenedCandidate]:
+    def _screened(self, base: FittedModel, effects: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return all candidates with their expected gains."""
         span = 0.5 * ADDITIONS_SPAN / self.cfg.max_additions
-        screened = self.runner.run(screen, [(base, e, self.cfg.search) for e in effects], "screening", span)
+        found = self.runner.run_in_time(screen, [(base, e, self.cfg.search) for e in effects], "screening", span)
+        screened = [s for s in found if s is not None]
+        if len(screened) < len(effects):
+            missed = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is None]
+            self.budget.note(f"Not screened: {in_words(missed)}.", step)
+            if not screened:
+                raise TimeUpError
         return self.gradient.apply(base, screened, self.runner) if self.gradient else screened
 
     def _record(
@@ -311,7 +346,10 @@ class Procedure:
             owned = len(last.model.effects) - len(steps)
             self.runner.progress(self.runner.share, "removing one effect at a time")
             tasks = [(last, owned + k) for k in range(len(steps) - untested)]
-            reduced = list(run_tasks(refit_without_effect, tasks, self.cfg.jobs))
+            unsettled = "Open: whether an effect is superfluous beside the others."
+            refit = partial(lambda given: list(run_tasks(refit_without_effect, given, self.cfg.jobs)), tasks)
+            if (reduced := self.budget.attempt(refit, None, unsettled)) is None:
+                break
             shares = [1 - last.errors.sum() / max(one.errors.sum(), 1e-12) for one in reduced]
             least = int(np.argmin(shares))
             if shares[least] >= self.cfg.min_gain:
@@ -334,8 +372,9 @@ class Procedure:
         if not nominal_effects(last.model):
             return fitted
         self.runner.progress(self.runner.share, "removing nominal values")
-        reduced = without_nominal_values(last)
-        if 1 - last.errors.sum() / max(reduced.errors.sum(), 1e-12) >= self.cfg.min_gain:
+        unsettled = "Open: whether nominal values are needed beside the effects."
+        reduced = self.budget.attempt(lambda: without_nominal_values(last), None, unsettled)
+        if reduced is None or 1 - last.errors.sum() / max(reduced.errors.sum(), 1e-12) >= self.cfg.min_gain:
             return fitted
         return [*fitted[:-1], reduced]
 
@@ -348,15 +387,22 @@ class Procedure:
         if not accepted and not nominal_effects(fitted[-1].model):
             return fitted
         self.runner.progress(self.runner.share, "fitting all effects together")
-        last = refit_jointly(fitted[-1])
+        attempt = self.budget.attempt
+        unsettled = "Not refitted: all effects together."
+        last = attempt(lambda: refit_jointly(fitted[-1]), fitted[-1], unsettled, TOGETHER_SHARE)
         owned = len(last.model.effects) - len(accepted)
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         parameters = joint_parameters(last, widening)
         self.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
-            without = fitted[0] if alone else refit_without_effect(last, owned + k)
-            final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
+            final = replace(f, parameters=parameters[owned + k])
+            unsettled = f"Not refitted: the model without {f.name}, for its gain beside the other effects."
+            without = fitted[0]
+            if not alone:
+                without = attempt(partial(refit_without_effect, last, owned + k), None, unsettled)
+            if without is not None:
+                final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
         return [*fitted[:-1], with_intervals(last, parameters)]
 
@@ -382,29 +428,38 @@ class Procedure:
         unknown = None
         if adequate:
             nodes = [given, *(fitted[1:] or fitted)]
-            unknown = unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs))
+            unknown = self.budget.attempt(
+                lambda: unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs)),
+                None,
+                "Open: whether a force of unknown form explains more.",
+            )
         verdict: Verdict = "none_needed"
         if not adequate or unknown is not None:
             verdict = "none_of_these"
         elif len(fitted) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
         explained = verdict == "none_needed" or not cfg.explain
+        verdict = self.budget.verdict(verdict, [f.step for f in self.findings if f.accepted])
+        unsettled = "Left out: where the model fails, and the next experiment."
+        where = self.budget.attempt(lambda: () if explained else self._failures(given), (), unsettled)
+        experiment = self.budget.attempt(lambda: None if explained else self._suggested_experiment(), None, unsettled)
         after = fitted[1:] if fitted[0] is given else fitted
         return Diagnosis(
             verdict=verdict,
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
             groups=tuple(self.groups),
-            where=() if explained else self._failures(given),
+            where=where,
             unexplained=unexplained if unknown is None else max(unexplained, unknown.share),
             ratio=(given.noise_ratio, *(one.noise_ratio for one in after)),
             detectable=detectable,
-            next_experiment=None if explained else self._suggested_experiment(),
+            next_experiment=experiment,
             issues=tuple(issues),
             models=(given.model, *(one.model for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
             time_step=self.time_step,
             nominal_values=self.nominal_values,
+            unsettled=tuple(self.budget.unsettled),
         )
 
     def _suggested_experiment(self) -> SuggestedExperiment | None:
@@ -417,11 +472,12 @@ class Procedure:
 
     def _failures(self, given: FittedModel) -> tuple[Mapping[str, Any], ...]:
         """Return where the model as given fails."""
+        cfg = self.cfg.failures
         return tuple(
             locate_failures(
                 given.model,
                 self.recording,
-                self.cfg.failures,
+                replace(cfg, max_seconds=min(cfg.max_seconds, self.budget.left())),
                 engine=self.engine,
                 windows=given.windows,
                 offsets=given.fit.offsets,

@@ -14,12 +14,13 @@ from concent_warp.diagnosis.result_html import diagnosis_html
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
-Verdict = Literal["effect", "group", "none_needed", "none_of_these"]
+Verdict = Literal["effect", "group", "none_needed", "none_of_these", "unsettled"]
 VERDICTS: dict[Verdict, str] = {
     "effect": "an effect is missing, and the data identify it",
     "group": "an effect is missing; the data cannot distinguish between a few",
     "none_needed": "no discrepancy detected",
     "none_of_these": "something is missing that no effect in the library explains",
+    "unsettled": "the time did not suffice for a verdict",
 }
 """Verdicts in words."""
 
@@ -197,6 +198,8 @@ class Diagnosis:
     """A shorter time step that the data ask for; None where the model's own is short enough."""
     nominal_values: tuple[FittedParameter, ...] = ()
     """Masses, lengths and gains that the data ask for within their tolerance, as factors on the nominal values."""
+    unsettled: tuple[str, ...] = ()
+    """Sentences on what there was no time for, see `DiagnoseCfg.seconds`."""
 
     @property
     def model(self) -> Model:
@@ -238,6 +241,7 @@ class Diagnosis:
             ],
             "next_experiment": None if self.next_experiment is None else self.next_experiment.summary(),
             "issues": list(self.issues),
+            "unsettled": list(self.unsettled),
             "versions": dict(self.versions),
             "seed": self.seed,
         }
@@ -261,6 +265,7 @@ class Diagnosis:
                 f"{p.name} {p.value:.3g} [{p.low:.3g}, {p.high:.3g}] {p.unit}" for p in finding.parameters[:4]
             )
             lead = "Missing" if k == 0 else "Then missing"
+            lead = "The best so far" if self.verdict == "unsettled" else lead
             said.append(
                 f"{lead}: {finding.name} ({values}). Held-out error falls by {100 * finding.gain:.0f} % "
                 f"[{100 * finding.low:.0f}, {100 * finding.high:.0f}], {finding.p_text}."
@@ -279,7 +284,7 @@ class Diagnosis:
         if self.nominal_values:
             values = ", ".join(f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]" for p in self.nominal_values)
             numerical.append(f"Nominal values were fitted within their tolerance of 1 %: {values}.")
-        return [*self.issues, *numerical, *said]
+        return [*self.issues, *numerical, *said, *self.unsettled]
 
 
 def _table_rows(finding: Finding) -> list[tuple[str, ...]]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, cast
 
 from concent_warp.simulate.parallel import limit_simulations
+from concent_warp.simulate.time_limit import TimeUpError, deadline, stop_at
 
 T = TypeVar("T")
 
@@ -37,34 +38,77 @@ class TaskRunner:
             arguments: One tuple a task.
             text: What is being done, for the progress.
             span: Share of the whole diagnosis that these tasks take.
+
+        Raises:
+            TimeUpError: There was no time for one of them.
         """
-        results: list[T] = []
+        results = self.run_in_time(task, arguments, text, span)
+        finished = [result for result in results if result is not None]
+        if len(finished) < len(results):
+            raise TimeUpError("a task was not finished in the time given")
+        return finished
+
+    def run_in_time(
+        self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], text: str, span: float = 0.0
+    ) -> list[T | None]:
+        """Return the results as `run` does, None for those that there was no time for."""
+        results: list[T | None] = []
         for i, result in enumerate(self.results(task, arguments)):
             results.append(result)
             self.progress(self.share + span * (i + 1) / max(len(arguments), 1), f"{text}, {i + 1} of {len(arguments)}")
         self.share += span
         return results
 
-    def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T]:
-        """Yield the results in order, as they are known."""
-        return run_tasks(task, arguments, self.jobs)
+    def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T | None]:
+        """Yield the results in order, as they are known; None for those that there was no time for."""
+        return run_tasks_in_time(task, arguments, self.jobs)
 
 
 def run_tasks(task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T]:
+    """Yield the results of independent tasks in order, see `run_tasks_in_time`.
+
+    Raises:
+        TimeUpError: There was no time for one of them.
+    """
+    for found in _outcomes(task, arguments, jobs):
+        if not found:
+            raise TimeUpError("a task was not finished in the time given")
+        yield found[0]
+
+
+def run_tasks_in_time(task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], jobs: int) -> Iterable[T | None]:
     """Yield the results of independent tasks in order, by joblib where several may run at a time.
 
-    Where there are fewer tasks than processes, each task runs several simulations at a time.
+    Where there are fewer tasks than processes, each task runs several simulations at a time. Of those that the time
+    does not suffice for (`concent_warp.simulate.time_limit`) the result is None.
     """
+    return (found[0] if found else None for found in _outcomes(task, arguments, jobs))
+
+
+def _outcomes(
+    task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], jobs: int
+) -> Iterable[tuple[T] | tuple[()]]:
+    """Yield the results in order, empty where the time did not suffice."""
+    end = deadline()
     if jobs == 1 or len(arguments) < 2:
-        return (task(*each) for each in arguments)
+        return (_until(end, task, *each) for each in arguments)
     from joblib import Parallel, delayed, effective_n_jobs
 
     threads = effective_n_jobs(jobs) // len(arguments)
-    calls = (delayed(_with_threads)(threads, task, *each) for each in arguments)
-    return cast("Iterable[T]", Parallel(n_jobs=jobs, return_as="generator")(calls))
+    calls = (delayed(_with_threads)(threads, end, task, *each) for each in arguments)
+    return cast("Iterable[tuple[T] | tuple[()]]", Parallel(n_jobs=jobs, return_as="generator")(calls))
 
 
-def _with_threads(threads: int, task: Callable[..., T], *arguments: Any) -> T:
-    """Run a task with at most so many simulations at a time, at least one."""
+def _with_threads(threads: int, end: float | None, task: Callable[..., T], *arguments: Any) -> tuple[T] | tuple[()]:
+    """Run a task with at most so many simulations at a time, at least one, until a time."""
     with limit_simulations(threads):
-        return task(*arguments)
+        return _until(end, task, *arguments)
+
+
+def _until(end: float | None, task: Callable[..., T], *arguments: Any) -> tuple[T] | tuple[()]:
+    """Run a task; return nothing if it is not done at a time [s since the epoch]."""
+    try:
+        with stop_at(end):
+            return (task(*arguments),)
+    except TimeUpError:
+        return ()

@@ -14,7 +14,13 @@ from concent_warp.report.tables import Row, table
 
 MOST_EFFECTS = 10
 """Effects in the chart; further ones are folded away."""
-ANSWER_CLASSES = {"effect": "named", "group": "open", "none_needed": "fine", "none_of_these": "lost"}
+ANSWER_CLASSES = {
+    "effect": "named",
+    "group": "open",
+    "none_needed": "fine",
+    "none_of_these": "lost",
+    "unsettled": "open",
+}
 """Style of the headline by verdict."""
 FAMILIES = {
     "joints": "joints and drives",
@@ -33,6 +39,8 @@ def diagnosis_section(diagnosis: Mapping[str, Any] | None) -> str:
     found = ['<section id="diagnosis">', "<h2>What is missing</h2>"]
     found.append(f'<p class="answer {ANSWER_CLASSES[verdict]}">{escape(_headline(diagnosis))}</p>')
     found += [f"<p>{escape(_group_sentence(group))}</p>" for group in diagnosis.get("groups", ()) if len(group) > 1]
+    if unsettled := diagnosis.get("unsettled"):
+        found += ["<h3>Not settled in the time given</h3>", bullet_list(unsettled)]
     if effects:
         found += ["<h3>Held-out error that each effect removes</h3>", _bars(effects)]
     if parameters := _parameter_rows(effects):
@@ -59,6 +67,9 @@ def _headline(diagnosis: Mapping[str, Any]) -> str:
     left = f" {_share(diagnosis['unexplained'])} of the error stays unexplained." if "unexplained" in diagnosis else ""
     if diagnosis["verdict"] == "none_needed":
         return "No discrepancy was detected: the model explains the measurements down to their noise."
+    if diagnosis["verdict"] == "unsettled":
+        best = f" The best so far: {_gain_sentence(accepted)}" if accepted else ""
+        return f"The time did not suffice for a verdict.{best}"
     if diagnosis["verdict"] == "group":
         group = next(g for g in groups if len(g) > 1)
         names = _listed([channel_text(name) for name in group])

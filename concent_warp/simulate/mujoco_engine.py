@@ -35,6 +35,7 @@ from concent_warp.simulate.mujoco_steps import (
     simulate_with_force_models,
 )
 from concent_warp.simulate.parallel import ProcessPoolCfg, in_processes, simulations_at_a_time
+from concent_warp.simulate.time_limit import time_check
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -121,6 +122,9 @@ class MujocoEngine:
         """Simulate all variants, see `Engine.run`; arrays of the rollout are float64.
 
         A variant that MuJoCo finds unstable is `diverged`, and its records are NaN from then on.
+
+        Raises:
+            TimeUpError: See `concent_warp.simulate.time_limit`.
         """
         run = check_run(self._compiled, len(self._sphere_geom), variants, ctrl, record, bodies, contacts)
         variants = with_force_models(self.model, self._compiled, host_variants(variants))
@@ -162,6 +166,7 @@ class MujocoEngine:
         """Simulate some variants, `threads` at a time."""
         count = min(self.threads, len(rows))
         if run.variants.force_models and self._processes.suits(count, len(rows) * run.steps):
+            time_check()
             return in_processes(self._in_turn, run, rows, self.threads)
         if run.variants.force_models:  # Python code, which runs in one thread at a time: more would only slow it down
             count = 1
@@ -255,11 +260,17 @@ class MujocoEngine:
 
 
 def _in_threads(work: Callable[[S], T], arguments: Sequence[S], count: int) -> list[T]:
-    """Return the results of some work, in `count` threads."""
+    """Return the results of some work, in `count` threads; see `concent_warp.simulate.time_limit`."""
+    check = time_check()
+
+    def in_time(argument: S) -> T:
+        check()
+        return work(argument)
+
     if count == 1 or len(arguments) == 1:
-        return [work(each) for each in arguments]
+        return [in_time(each) for each in arguments]
     with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(work, arguments))
+        return list(pool.map(in_time, arguments))
 
 
 class VariantCompiler:

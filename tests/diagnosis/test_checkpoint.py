@@ -31,13 +31,13 @@ def done(recording, tmp_path_factory):
 def counted(monkeypatch):
     """Count the pieces of work that are done and not read."""
     tasks = []
-    run_tasks = task_module.run_tasks
+    run_tasks = task_module.run_tasks_in_time
 
     def watched(work, given, jobs):
         tasks.extend(work.__name__ for _ in given)
         return run_tasks(work, given, jobs)
 
-    monkeypatch.setattr(task_module, "run_tasks", watched)
+    monkeypatch.setattr(task_module, "run_tasks_in_time", watched)
     monkeypatch.setattr(procedure, "run_tasks", watched)
     return tasks
 

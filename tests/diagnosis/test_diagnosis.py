@@ -124,7 +124,7 @@ def test_html_shows_verdict_and_accepted_effects_and_escapes_them():
 
 
 def test_every_verdict_has_words():
-    assert set(VERDICTS) == {"effect", "group", "none_needed", "none_of_these"}
+    assert set(VERDICTS) == {"effect", "group", "none_needed", "none_of_these", "unsettled"}
 
 
 def test_an_interval_that_holds_the_null_value_does_not_exclude_it():

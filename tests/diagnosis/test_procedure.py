@@ -331,8 +331,13 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
         return finding(c.name, c.share(base), accepted=gains[c.name][1], step=step)
 
     class Fits:
+        left = ()
+
         def __init__(self, *_):
             pass
+
+        def unsettled(self, _name):
+            return []
 
         def fit(self, _screened, critical, _windows):
             notes["critical"] = critical
@@ -394,10 +399,10 @@ def test_where_nothing_is_accepted_findings_are_kept_by_gain(monkeypatch):
 def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
     made = procedure()
     monkeypatch.setattr(module, "screen", lambda _base, effect, _cfg: effect.upper())
-    assert made._screened(node(2.0), ["a", "b"]) == ["A", "B"]
+    assert made._screened(node(2.0), ["a", "b"], 0) == ["A", "B"]
     assert made.runner.share == pytest.approx(0.5 * 0.85 / 3)
     made.gradient = SimpleNamespace(apply=lambda _base, screened, _runner: screened[::-1])
-    assert made._screened(node(2.0), ["a", "b"]) == ["B", "A"]
+    assert made._screened(node(2.0), ["a", "b"], 0) == ["B", "A"]
 
 
 def spoiled(time: np.ndarray, value: np.ndarray, noise: float | None = 1e-3, more: bool = False) -> list[str]:

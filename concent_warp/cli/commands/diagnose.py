@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.markup import escape
 
-from concent_warp.checks import Bounds, WindowLength
+from concent_warp.checks import Bounds, PositiveDuration, WindowLength
 from concent_warp.cli.fitted_effects import value_and_interval, work_progress
 from concent_warp.cli.given_model import given_model
 from concent_warp.cli.given_recording import given_recording
@@ -63,6 +63,8 @@ class Arguments:
     engine: EngineOption = "mujoco"
     jobs: Annotated[int, Bounds(-1, 4096, excluded=0)] = -1
     """Processes at a time; -1: one a CPU."""
+    seconds: PositiveDuration | None = None
+    """Time after which the best answer so far is given with what is not settled [s]; by default as long as it takes."""
     seed: int = 0
     """Seed of all random numbers."""
     out: OptionalOutPath = None
@@ -121,6 +123,7 @@ def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diag
         max_additions=arguments.additions,
         gradient=arguments.gradient,
         jobs=arguments.jobs,
+        seconds=arguments.seconds,
         seed=arguments.seed,
     )
     try:

@@ -20,7 +20,10 @@ from concent_warp.diagnosis.search.fit_candidate import (
     restart_candidate,
 )
 from concent_warp.diagnosis.tasks import TaskRunner
+from concent_warp.diagnosis.time_budget import in_words
+from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.observation import Window
+from concent_warp.simulate.time_limit import TimeUpError
 
 BATCH_SPAN = 0.15
 """Share of a diagnosis that the first fits of an addition take, for the progress."""
@@ -33,6 +36,10 @@ class CandidateFits:
         """Prepare to fit candidates to a baseline."""
         self.base, self.cfg, self.search, self.runner = base, cfg, cfg.search, runner
         self.fits: list[FittedCandidate] = []
+        self.left: list[ScreenedCandidate] = []
+        """Candidates that there was no time to fit."""
+        self.unrefined: list[Effect] = []
+        """Effects whose fits there was no time to refine."""
 
     def fit(
         self,
@@ -49,12 +56,10 @@ class CandidateFits:
         """
         least = self.search.min_expected_gain * critical_gain
         promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
-        self._fit_in_batches(promising[: self.cfg.max_fits])
+        fitted = self._fit_in_batches(promising[: self.cfg.max_fits])
         if not self.fits:
             return []
-        expected = np.array(
-            [max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, promising, strict=False)]
-        )
+        expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, fitted, strict=True)])
         best = self._best()
         self._restart_lagging(best, expected)
         self._polish_near(best, expected)
@@ -63,6 +68,23 @@ class CandidateFits:
         if self._best().ratio > self.cfg.adequate_ratio:
             self._initialise_by_multiple_shooting(short_windows)
         return self.fits
+
+    def unsettled(self, name: Callable[[Effect], str]) -> list[tuple[str, bool]]:
+        """Return sentences on what there was no time for, and whether it may change which effect is the best.
+
+        Args:
+            name: Returns the name of an effect.
+        """
+        found = []
+        if self.left:
+            names = [f"{name(s.effect)} (expected to remove {100 * s.expected_gain:.0f} %)" for s in self.left]
+            found.append((f"Not fitted: {in_words(names)}.", True))
+        best = None if not self.fits else self._best().effect
+        if rivals := [name(effect) for effect in self.unrefined if effect is not best]:
+            found.append((f"Fits not refined, which may explain as much as the best: {in_words(rivals)}.", True))
+        if best is not None and best in self.unrefined:
+            found.append((f"Fit not refined: {name(best)}.", False))
+        return found
 
     def refit_rivals(self, expected: np.ndarray) -> None:
         """Refit the best candidate and those that may equal it, for as long as that lowers the cost of one.
@@ -83,7 +105,7 @@ class CandidateFits:
             if any(self.fits[k].errors.sum() > (1 + search.equal_error) * best.errors.sum() for k in near):
                 self._refit([*near, k_best], polish_candidate, "refining initial states", search)
             elif best.ratio > search.noise_level_ratio:  # those near are its equals already
-                self.fits[k_best] = polish_candidate(base, best, search)
+                self._refit([k_best], polish_candidate, "refining initial states", search)
             if all(
                 c.fit.cost > (1 - search.min_cost_fall) * old.fit.cost for c, old in zip(self.fits, before, strict=True)
             ):
@@ -97,20 +119,35 @@ class CandidateFits:
     def _refit(self, chosen: Sequence[int], task: Callable[..., FittedCandidate], text: str, *settings: Any) -> None:
         """Replace some fits by what a task makes of each."""
         tasks = [(self.base, self.fits[k], *settings) for k in chosen]
-        for k, c in zip(chosen, self.runner.run(task, tasks, text), strict=True):
-            self.fits[k] = c
+        for k, c in zip(chosen, self.runner.run_in_time(task, tasks, text), strict=True):
+            if c is not None:
+                self.fits[k] = c
+            elif self.fits[k].effect not in self.unrefined:
+                self.unrefined.append(self.fits[k].effect)
 
-    def _fit_in_batches(self, promising: Sequence[ScreenedCandidate]) -> None:
-        """Fit candidates, a few at a time; once one explains the data, only those that promise enough beside it."""
+    def _fit_in_batches(self, promising: Sequence[ScreenedCandidate]) -> list[ScreenedCandidate]:
+        """Fit candidates, a few at a time; once one explains the data, only those that promise enough beside it.
+
+        Returns those that were fitted.
+        """
         base, search, left = self.base, self.search, list(promising)
+        fitted: list[ScreenedCandidate] = []
         while left:
-            tasks, left = [(base, s) for s in left[: search.batch_size]], left[search.batch_size :]
-            self.fits += self.runner.run(fit_candidate, tasks, "fitting", BATCH_SPAN / search.batch_size)
-            if (least := min(c.ratio for c in self.fits)) < search.explained_ratio:
+            batch, left = left[: search.batch_size], left[search.batch_size :]
+            tasks, span = [(base, s) for s in batch], BATCH_SPAN / search.batch_size
+            for s, c in zip(batch, self.runner.run_in_time(fit_candidate, tasks, "fitting", span), strict=True):
+                if c is None:
+                    self.left.append(s)
+                else:
+                    fitted.append(s)
+                    self.fits.append(c)
+            if self.fits and (least := min(c.ratio for c in self.fits)) < search.explained_ratio:
                 best = max(c.share(base) for c in self.fits)
                 at_noise = least < search.noise_level_ratio
                 needed = search.noise_level_min_gain if at_noise else search.explained_min_gain
                 left = [s for s in left if s.expected_gain > needed * best]
+                self.left = [s for s in self.left if s.expected_gain > needed * best]
+        return fitted
 
     def _restart_lagging(self, best: FittedCandidate, expected: np.ndarray) -> None:
         """Restart candidates that lag behind one that explains the data from its initial states.
@@ -149,7 +186,10 @@ class CandidateFits:
         base, search = self.base, self.search
         if max(w.end - w.start for w in base.windows) < 2 * search.shooting_window:
             return
-        windows = short_windows()
+        try:
+            windows = short_windows()
+        except TimeUpError:
+            return
         least = search.shooting_min_gain * max(c.share(base) for c in self.fits)
         near = sorted(
             (k for k, c in enumerate(self.fits) if c.share(base) > least), key=lambda k: self.fits[k].fit.cost

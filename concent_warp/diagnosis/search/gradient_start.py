@@ -59,8 +59,8 @@ class GradientStarts:
         factor = [_factor_of(s.effect, self.factors) for s in screened]
         rows = [k for k, f in enumerate(factor) if f != 1.0]
         tasks = [(base, screened[k], factor[k]) for k in rows]
-        started = dict(zip(rows, runner.run(start_from_factor, tasks, "starts from gradients"), strict=True))
-        return [started.get(k, s) for k, s in enumerate(screened)]
+        started = dict(zip(rows, runner.run_in_time(start_from_factor, tasks, "starts from gradients"), strict=True))
+        return [started.get(k) or s for k, s in enumerate(screened)]
 
 
 def _factor_of(effect: Effect, found: Factors) -> float:

@@ -12,6 +12,7 @@ from concent_warp.diagnosis.search.evidence import indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import polish_candidate
 from concent_warp.diagnosis.search.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.tasks import TaskRunner
+from concent_warp.diagnosis.time_budget import TimeBudget
 
 
 def group_indistinguishable(
@@ -20,6 +21,7 @@ def group_indistinguishable(
     assess: Callable[[FittedCandidate], Finding],
     runner: TaskRunner,
     cfg: DiagnoseCfg,
+    budget: TimeBudget | None = None,
 ) -> list[tuple[FittedCandidate, Finding]]:
     """Return the accepted candidates that cannot be distinguished from the best, the most plausible first.
 
@@ -33,8 +35,13 @@ def group_indistinguishable(
         assess: Returns the evidence of a candidate.
         runner: Runs the evaluations.
         cfg: Settings.
+        budget: What has no time is left out and noted there.
     """
-    search = cfg.search
+    search, budget = cfg.search, budget or TimeBudget(None)
+
+    def profiled(c: FittedCandidate) -> FittedCandidate:
+        unsettled = f"Interval of {c.effect.name} from the linear fit, not from its profile likelihood."
+        return budget.attempt(lambda: refine_by_profile(base, c, runner, cfg.profile), c, unsettled)
 
     def with_evidence(c: FittedCandidate) -> tuple[FittedCandidate, Finding]:
         # An accepted effect stays accepted: its gain is the evidence, even where a rough cost widens its interval.
@@ -46,8 +53,10 @@ def group_indistinguishable(
         and len(base.windows) <= base.cfg.least_squares.max_polished_windows
     ):
         first, rest = near[: search.profiled], near[search.profiled :]
-        near = [with_evidence(refine_by_profile(base, c, runner, cfg.profile)) for c, _ in first] + rest
+        near = [with_evidence(profiled(c)) for c, _ in first] + rest
     group = indistinguishable(base, near, search)
-    polished = polish_candidate(base, group[0][0], search, thorough=True)
-    group[0] = with_evidence(refine_by_profile(base, polished, runner, cfg.profile))
+    best = group[0][0]
+    unsettled = f"Fit not refined: {best.effect.name}."
+    best = budget.attempt(lambda: polish_candidate(base, best, search, thorough=True), best, unsettled)
+    group[0] = with_evidence(profiled(best))
     return group

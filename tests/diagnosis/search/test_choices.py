@@ -34,6 +34,11 @@ class MadeUp:
     errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
 
     @property
+    def effect(self) -> Any:
+        """The effect, by its name."""
+        return SimpleNamespace(name=self.name)
+
+    @property
     def fit(self) -> Any:
         """The cost as that of a fit."""
         return SimpleNamespace(cost=self.cost, of=self.name)
