@@ -1,0 +1,106 @@
+"""Recordings of the world on Drake: readings of its motion, and what a user knows of the beginning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.independent.drake_rig import ENCODERS, DrakeRig, Physics, Sensor
+from benchmarks.independent.drake_simulation import DrakeMotion, simulate
+from benchmarks.independent.instruments import Instrument, Instruments
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+
+START_STD = (2e-4, 2e-3, 5e-3, 2e-2)
+"""Standard deviations of the errors of a recorded initial state: position [m], orientation [rad], velocity [m/s],
+angular velocity [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A recording and the true initial states of its free body, which it does not say."""
+
+    recording: Recording
+    starts: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
+    """For each demonstration qpos (nq,) and qvel (nv,) of the nominal scene, or None where bodies begin at rest."""
+
+
+def record_drake(rig: DrakeRig, physics: Physics, seed: int, demonstrations: int, *, noise_stated: bool = True) -> Made:
+    """Return a recording, the same each time; motions, clocks and noise do not depend on what is hidden."""
+    instruments = Instruments.of(seed, video=rig.throws > 1)
+    taken, starts = [], []
+    for k in range(demonstrations * rig.throws):
+        trial = rig.plan(np.random.default_rng([seed, k, *rig.name.encode()]))
+        motion = simulate(rig, physics, trial)
+        rng = np.random.default_rng([seed, k, 1, *rig.name.encode()])
+        measured = {s.name: _reading(rig, physics, s, motion, instruments, rng) for s in rig.sensors}
+        if not noise_stated:
+            measured = {name: replace(channel, noise_std=None) for name, channel in measured.items()}
+        start = _start(rig, motion) if rig.free and not rig.drives else None
+        known = _estimate(start, rng) if rig.start_recorded and start is not None else (None, None)
+        action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
+        taken.append(Demonstration(f"demo_{k}", rig.name, None, *known, action=action, measured=measured))
+        starts.append(start)
+    return Made(Recording(rig.scene.xml, tuple(taken), source=f"world on Drake, {rig.name}"), tuple(starts))
+
+
+def _reading(
+    rig: DrakeRig,
+    physics: Physics,
+    sensor: Sensor,
+    motion: DrakeMotion,
+    instruments: Instruments,
+    rng: np.random.Generator,
+) -> Channel:
+    """Return what a sensor writes down."""
+    value = truth_of(rig, physics, sensor, motion)
+    instrument = _instrument(sensor, instruments)
+    tracked = any(s.kind in ("marker", "position") for s in rig.sensors)
+    late = sensor.kind in ("marker", "position", "orientation") or not tracked
+    if late and physics.sensor_delay:
+        instrument = replace(instrument, latency=instrument.latency + physics.sensor_delay)
+    channel = instrument.read(motion.time, value, rng)
+    for measure in physics.measures:
+        time, seen = measure(sensor.name, channel.time, channel.value)
+        channel = replace(channel, time=time, value=seen)
+    return channel
+
+
+def truth_of(rig: DrakeRig, physics: Physics, sensor: Sensor, motion: DrakeMotion) -> np.ndarray:
+    """Return what there is to see of a sensor's target, shape (K, dim)."""
+    if sensor.kind in ENCODERS:
+        state = next(physics.drives[d.actuator] for d in rig.drives if d.joint == sensor.target)
+        position = motion.motors[sensor.target] if state.compliance else motion.joints[sensor.target]
+        return (position - state.offset)[:, None]
+    pose = motion.poses[sensor.target]
+    if sensor.kind == "orientation":
+        flips = np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0, -1.0, 1.0)
+        return pose[:, 3:] * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    offset = np.array(sensor.offset(physics.values))
+    return pose[:, :3] + Rotation.from_quat(pose[:, 3:], scalar_first=True).apply(offset)
+
+
+def _instrument(sensor: Sensor, instruments: Instruments) -> Instrument:
+    return getattr(instruments, "position" if sensor.kind == "marker" else sensor.kind)
+
+
+def _start(rig: DrakeRig, motion: DrakeMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Return pose and velocity of the free body at time 0, qpos (7,) and qvel (6,), angular velocity in its frame."""
+    pose = motion.poses[rig.body]
+    k = int(np.searchsorted(motion.time, -1e-9))
+    span = motion.time[k + 2] - motion.time[k - 2]
+    before, after = Rotation.from_quat(pose[[k - 2, k + 2], 3:], scalar_first=True)
+    turning = (before.inv() * after).as_rotvec() / span
+    return pose[k], np.concatenate([(pose[k + 2, :3] - pose[k - 2, :3]) / span, turning])
+
+
+def _estimate(start: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return an initial state with the errors of an estimate."""
+    position, orientation, velocity, turning = START_STD
+    pose, rate = start[0].copy(), start[1].copy()
+    pose[:3] += rng.normal(0, position, 3)
+    wrong = Rotation.from_rotvec(rng.normal(0, orientation, 3))
+    pose[3:] = (Rotation.from_quat(pose[3:], scalar_first=True) * wrong).as_quat(scalar_first=True)
+    rate += np.concatenate([rng.normal(0, velocity, 3), rng.normal(0, turning, 3)])
+    return pose, rate
