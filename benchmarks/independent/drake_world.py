@@ -18,10 +18,10 @@ import tyro
 
 from benchmarks.diagnose.hidden_effects_residual import ratios
 from benchmarks.independent.data_set import Data, DataSet, Kind, Size, Truth
-from benchmarks.independent.drake_hidden import INSIDE
-from benchmarks.independent.drake_outside import OUTSIDE
-from benchmarks.independent.drake_rig import true_physics
-from benchmarks.independent.drake_rigs import DRAKE_RIGS
+from benchmarks.independent.drake.hidden import INSIDE
+from benchmarks.independent.drake.outside import OUTSIDE
+from benchmarks.independent.drake.rig import true_physics
+from benchmarks.independent.drake.rigs import DRAKE_RIGS
 from concent_warp.effects.registry import effect_class
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Recording
@@ -38,11 +38,11 @@ SINGLES: dict[str, dict[str, Values]] = {
         "joint_damping": (0.012, 0.03),
         "armature": (6e-4, 0.002),
         "actuator_gain": (0.93, 0.8),
-        "actuator_saturation": (0.5, 0.42),
+        "actuator_saturation": (0.4, 0.34),
         "actuator_delay": (0.005, 0.015),
         "actuator_lag": (0.006, 0.02),
         "backlash": (0.015, 0.04),
-        "joint_compliance": (0.03, 0.08),
+        "joint_compliance": (0.02, 0.04),
         "joint_offset": (0.03, 0.07),
         "mass": (1.08, 1.25),
         "sensor_gain": (0.01, 0.03),
@@ -50,9 +50,9 @@ SINGLES: dict[str, dict[str, Values]] = {
     "reach": {
         "joint_friction": (0.3, 0.8),
         "joint_damping": (0.5, 1.5),
-        "actuator_gain": (0.93, 0.8),
+        "actuator_gain": (0.88, 0.75),
         "actuator_delay": (0.006, 0.02),
-        "joint_compliance": (5e-4, 0.0015),
+        "joint_compliance": (0.001, 0.0025),
         "gravity_compensation": (0.08, 0.2),
         "mass": (1.1, 1.3),
         "length_scale": (0.008, 0.02),
@@ -69,10 +69,10 @@ SINGLES: dict[str, dict[str, Values]] = {
         "frame_offset": (0.0015, 0.004),
     },
     "launch": {
-        "sliding_friction": (0.33, 0.4),
-        "gravity_tilt": (0.02, 0.05),
-        "length_scale": (0.012, 0.03),
-        "latency": (0.006, 0.015),
+        "sliding_friction": (0.36, 0.45),
+        "gravity_tilt": (0.035, 0.08),
+        "length_scale": (0.03, 0.06),
+        "latency": (0.01, 0.025),
     },
     "bounce": {
         "air_drag": (1.5, 4.0),
@@ -97,7 +97,7 @@ SINGLES: dict[str, dict[str, Values]] = {
         "gravity_tilt": (0.012, 0.03),
     },
 }
-"""Middle and large value of the main parameter of each effect, by rig, in the units of `drake_hidden`."""
+"""Middle and large value of the main parameter of each effect, by rig, in the units of `drake.hidden`."""
 PAIRS: tuple[tuple[str, str, str], ...] = (
     ("swing", "joint_friction", "actuator_delay"),
     ("swing", "joint_damping", "mass"),
@@ -123,16 +123,16 @@ OUTSIDES: tuple[tuple[str, str, float], ...] = (
     ("launch", "sticky_spot", 0.6),
     ("roll", "magnet", 0.02),
     ("bounce", "gust", 0.08),
-    ("toss", "slosh", 0.15),
+    ("toss", "slosh", 0.3),
 )
-"""Rig, what the library lacks, and its magnitude in the units of `drake_outside`."""
+"""Rig, what the library lacks, and its magnitude in the units of `drake.outside`."""
 
 
 def drake_sets() -> list[DataSet]:
     """Return all data sets, in a fixed order, with names that differ.
 
-    Of the effects of a rig every other one has the large value, and every third one both; noise is stated in every other
-    data set of a kind.
+    Of the effects of a rig every other one has the large value, and every third one both; noise is stated in every
+    other data set of a kind.
     """
     found = [
         DataSet(f"drake-{rig}-null-{seed}", "drake", "null", rig, {}, seed) for rig in DRAKE_RIGS for seed in NULL_SEEDS
@@ -160,7 +160,7 @@ def _set(rig: str, kind: Kind, magnitudes: dict[str, float], size: Size, seed: i
 
 def make_drake(case: DataSet) -> Data:
     """Return the recordings of a data set, the user's scene, and the truth; the same each time."""
-    from benchmarks.independent.drake_recording import record_drake
+    from benchmarks.independent.drake.recording import record_drake
 
     rig = DRAKE_RIGS[case.rig]
     physics = true_physics(rig, case.seed)
@@ -171,8 +171,8 @@ def make_drake(case: DataSet) -> Data:
 
 
 def with_starts(case: DataSet) -> tuple[Recording, Scene, tuple[Truth, ...]]:
-    """Return the recording of a data set with its noise, the true initial states and no gaps, its scene, and the truth."""
-    from benchmarks.independent.drake_recording import record_drake
+    """Return the recording of a data set with its noise, true initial states and no gaps, its scene, and the truth."""
+    from benchmarks.independent.drake.recording import record_drake
 
     rig = DRAKE_RIGS[case.rig]
     physics = true_physics(rig, case.seed)

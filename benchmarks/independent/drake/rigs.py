@@ -1,9 +1,10 @@
 """Seven experiments of the world on Drake, with the nominal scenes of their users.
 
 `swing`: a servo swings a weight. `reach`: a two-joint arm in a vertical plane. `gantry`: two slides push a block on a
-table. `launch`: a block slides to rest. `bounce`: a soft ball on smooth PTFE, of which only the position is tracked. `roll`: a ball
-skids, then rolls. `toss`: a block turns in flight. The nominal contact of the bouncing ball has the frequency and
-damping of the world's linear spring and damper on the ball's mass; other nominal contacts are MuJoCo's default.
+table. `launch`: a block slides to rest. `bounce`: a soft ball on smooth PTFE, of which only the position is tracked.
+`roll`: a ball skids, then rolls. `toss`: a block turns in flight. The nominal contact of the bouncing ball has the
+frequency and damping of the world's linear spring and damper on the ball's mass; other nominal contacts are MuJoCo's
+default.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.drake_rig import DrakeRig, DrakeTrial, Drive, Sensor
+from benchmarks.independent.drake.rig import DrakeRig, DrakeTrial, Drive, Sensor
 
 RATE = 125.0
 """Rate of commands [Hz]."""
@@ -222,7 +223,7 @@ def launch_plan(rng: np.random.Generator) -> DrakeTrial:
 BALL = """
 <mujoco model="{model}">
   <compiler angle="radian"/>
-  <option timestep="0.001" integrator="implicitfast" cone="elliptic"/>
+  <option timestep="0.0005" integrator="implicitfast" cone="elliptic"/>
   <default>
     <geom friction="{{friction}} 0.005 0.0001" {contact}/>
   </default>
@@ -251,17 +252,17 @@ ROLL = BALL.format(
 
 
 def bounce_plan(rng: np.random.Generator) -> DrakeTrial:
-    """Sample a throw that meets the table two or three times."""
+    """Sample a throw that meets the table twice."""
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.4, 1.2)
     pose = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.35, 0.5), 1.0, 0.0, 0.0, 0.0)
     velocity = (speed * np.cos(heading), speed * np.sin(heading), rng.uniform(0.3, 1.2), *rng.uniform(-3, 3, 3))
-    return DrakeTrial(1.2, pose=pose, velocity=velocity)
+    return DrakeTrial(0.85, pose=pose, velocity=velocity)
 
 
 def roll_plan(rng: np.random.Generator) -> DrakeTrial:
     """Sample a ball shoved over the table without spin, so that it skids before it rolls."""
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.1)
-    quaternion = Rotation.random(random_state=rng).as_quat(scalar_first=True)
+    quaternion = Rotation.random(None, rng).as_quat(scalar_first=True)
     pose = (*rng.uniform(-0.1, 0.1, 2), 0.03, *quaternion)
     velocity = (speed * np.cos(heading), speed * np.sin(heading), 0.0, 0.0, 0.0, rng.uniform(-2, 2))
     return DrakeTrial(1.5, pose=pose, velocity=velocity)
@@ -288,7 +289,7 @@ TOSS = """
 
 def toss_plan(rng: np.random.Generator) -> DrakeTrial:
     """Sample a throw with spin that ends before it lands."""
-    quaternion = Rotation.random(random_state=rng).as_quat(scalar_first=True)
+    quaternion = Rotation.random(None, rng).as_quat(scalar_first=True)
     pose = (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 0.8), *quaternion)
     velocity = (*rng.uniform(-1.5, 1.5, 2), rng.uniform(2.0, 3.0), *rng.uniform(-8, 8, 3))
     return DrakeTrial(0.7, pose=pose, velocity=velocity)
@@ -418,7 +419,7 @@ _RIGS = (
         body="ball",
         shape="ball",
         bounces=True,
-        throws=4,
+        throws=5,
     ),
     DrakeRig(
         "roll",

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.independent.data_set import Truth
-from benchmarks.independent.drake_rig import ENCODERS, BodyForce, BodyState, DrakeRig, Friction, Measure, Physics
+from benchmarks.independent.drake.rig import ENCODERS, BodyForce, BodyState, DrakeRig, Friction, Measure, Physics
 
 Hidden = Callable[[DrakeRig, Physics, float], Truth]
 DRAG_COEFFICIENT = 0.47

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.independent.data_set import Truth
-from benchmarks.independent.drake_hidden import Hidden
-from benchmarks.independent.drake_rig import BodyState, DrakeRig, Friction, JointForce, Physics
+from benchmarks.independent.drake.hidden import Hidden
+from benchmarks.independent.drake.rig import BodyState, DrakeRig, Friction, JointForce, Physics
 
 POLES = 11
 """Periods of cogging in a turn of a joint."""
 POLE_PITCH = 0.025
 """Period of cogging of a linear motor [m]."""
-PLACE = np.array([0.06, 0.03])
+PLACE = np.array([0.02, 0.01])
 """Place on the table of the magnet, and of the sticky spot [m]."""
 REACH = 0.06
 """How far magnet and sticky spot reach [m]."""
@@ -116,7 +116,7 @@ def gust(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
 
 
 def slosh(rig: DrakeRig, physics: Physics, magnitude: float) -> Truth:
-    """Let a share of the body's mass [-] swing in it on springs."""
+    """Let a share of the body's mass [-] swing in it on springs, about a place off its centre."""
     physics.slosh = magnitude
     return _outside("slosh", rig)
 

@@ -7,48 +7,26 @@ actuators and sensors are removed before, and what they stand for is done here:
 - Drives are sampled at 1 kHz, their torque is held in between. Rotors are Drake's reflected inertia; with play or a
   spring in the gear, a motor-side body on a joint of its own.
 - Coulomb friction of joints is LuGre friction [Canudas de Wit et al., IEEE Trans. Automat. Control 40(3), 1995].
-- Blocks stand on four small feet, so that their support is known; feet and balls touch the table at points, the finger
-  pushes a block by hydroelastic contact [Elandt et al., IROS 2019]; all with the SAP solver [Castro, Permenter, Han, IEEE
-  Trans. Robot. 39(2), 2023]. Friction and normal force are lagged [Castro et al., arXiv 2312.03908], for a sliding block
-  glides above the table in the convex approximation. The bouncing ball uses that one: its contact is then a linear
-  spring and damper. Implicit integration adds sqrt(k / m) dt / 2 to its damping ratio; the damper has so much less.
+- Blocks stand on four small feet, so that their support is known. Feet and balls touch the table at points, the finger
+  pushes a block by hydroelastic contact [Elandt et al., IROS 2019], all with the SAP solver [Castro, Permenter, Han,
+  IEEE Trans. Robot. 39(2), 2023]. Friction and normal force are lagged [Castro et al., arXiv 2312.03908], for a sliding
+  block glides above the table in the convex approximation. The bouncing ball uses that one: its contact is then a
+  linear spring and damper. Implicit integration adds sqrt(k / m) dt / 2 to its damping ratio; the damper has so much
+  less.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from pydrake.all import (  # pyright: ignore[reportMissingImports]
-    AddCompliantHydroelasticProperties,
-    AddContactMaterial,
-    AddMultibodyPlant,
-    AddRigidHydroelasticProperties,
-    Box,
-    ContactModel,
-    CoulombFriction,
-    Cylinder,
-    DiagramBuilder,
-    DiscreteContactApproximation,
-    HalfSpace,
-    MultibodyPlantConfig,
-    Parser,
-    PrismaticJoint,
-    PrismaticSpring,
-    ProximityProperties,
-    RevoluteJoint,
-    RigidTransform,
-    RotationalInertia,
-    Simulator,
-    SpatialInertia,
-    Sphere,
-    UnitInertia,
-)
 from scipy.signal import lfilter
 
-from benchmarks.independent.drake_rig import (
+from benchmarks.independent.drake.rig import (
     ENCODERS,
     BodyState,
     DrakeRig,
@@ -58,6 +36,11 @@ from benchmarks.independent.drake_rig import (
     Friction,
     Physics,
 )
+
+try:
+    drake: Any = import_module("pydrake.all")  # Any, for its stubs declare arrays otherwise than NumPy
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("the world on Drake needs the extra: pip install 'concent-warp[benchmarks]'") from error
 
 CONTROL_PERIOD = 1e-3
 """Period of the drives' controllers [s]."""
@@ -79,8 +62,10 @@ FOOT_STIFFNESS = 1e6
 """Stiffness of each [N/m]."""
 ROLLING_STIFFNESS = 1e5
 """Stiffness of a ball that does not bounce [N/m]."""
-SLOSH_FREQUENCY = 3.0
+SLOSH_FREQUENCY = 2.0
 """Frequency of mass that swings in a body [Hz]."""
+SLOSH_PLACE = 0.02
+"""Where that mass rests, along the body's x [m]."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +105,10 @@ class _Axis:
 
 @dataclass
 class _World:
-    plant: object
-    simulator: Simulator
-    context: object
-    motor_joints: dict[str, object] = field(default_factory=dict)
+    plant: Any
+    simulator: Any
+    context: Any
+    motor_joints: dict[str, Any] = field(default_factory=dict)
 
 
 def simulate(rig: DrakeRig, physics: Physics, trial: DrakeTrial) -> DrakeMotion:
@@ -132,7 +117,7 @@ def simulate(rig: DrakeRig, physics: Physics, trial: DrakeTrial) -> DrakeMotion:
     Raises:
         RuntimeError: The simulation diverged.
     """
-    world = _build(rig, physics)
+    world = build(rig, physics)
     plant, context = world.plant, world.context
     _place(rig, physics, trial, plant, context)
     dt = rig.step
@@ -223,18 +208,20 @@ class Bristle:
         return stiffness * self.deflection + damping * (self.deflection - before)
 
 
-def _build(rig: DrakeRig, physics: Physics) -> _World:
+def build(rig: DrakeRig, physics: Physics) -> _World:
     """Return the world of a rig, its masses set, at the initial pose of the MJCF."""
     logging.getLogger("drake").setLevel(logging.ERROR)
-    builder = DiagramBuilder()
-    config = MultibodyPlantConfig(time_step=0.0 if rig.continuous else rig.step)
-    plant, scene = AddMultibodyPlant(config, builder)
+    builder = drake.DiagramBuilder()
+    config = drake.MultibodyPlantConfig(time_step=0.0 if rig.continuous else rig.step)
+    plant, scene = drake.AddMultibodyPlant(config, builder)
     if not rig.continuous:
-        approximation = DiscreteContactApproximation.kSap if rig.bounces else DiscreteContactApproximation.kLagged
+        approximation = (
+            drake.DiscreteContactApproximation.kSap if rig.bounces else drake.DiscreteContactApproximation.kLagged
+        )
         plant.set_discrete_contact_approximation(approximation)
-        plant.set_contact_model(ContactModel.kHydroelasticWithFallback)
+        plant.set_contact_model(drake.ContactModel.kHydroelasticWithFallback)
     del scene
-    Parser(plant).AddModelsFromString(_stripped(rig.text.format(**physics.values)), ".xml")
+    drake.Parser(plant).AddModelsFromString(_stripped(rig.text.format(**physics.values)), ".xml")
     for joint, damping in physics.damping.items():
         plant.GetJointByName(joint).set_default_damping(damping)
     motors = {}
@@ -254,7 +241,7 @@ def _build(rig: DrakeRig, physics: Physics) -> _World:
     plant.mutable_gravity_field().set_gravity_vector(physics.gravity)
     plant.Finalize()
     diagram = builder.Build()
-    simulator = Simulator(diagram)
+    simulator = drake.Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     if plant.num_actuators():
         plant.get_actuation_input_port().FixValue(context, np.zeros(plant.num_actuators()))
@@ -283,15 +270,17 @@ def _stripped(text: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _motor(plant, joint, armature: float):
+def _motor(plant: Any, joint: Any, armature: float) -> Any:
     """Add the motor's side of a gear: a body on a joint beside the link's, with the reflected inertia of the rotor."""
     axis = joint.revolute_axis()
-    inertia = SpatialInertia(1e-6, np.zeros(3), UnitInertia.SolidSphere(np.sqrt(2.5 * armature / 1e-6)))
+    inertia = drake.SpatialInertia(1e-6, np.zeros(3), drake.UnitInertia.SolidSphere(np.sqrt(2.5 * armature / 1e-6)))
     body = plant.AddRigidBody(f"{joint.name()}_motor", joint.child_body().model_instance(), inertia)
-    return plant.AddJoint(RevoluteJoint(f"{joint.name()}_motor", joint.frame_on_parent(), body.body_frame(), axis, 0.0))
+    return plant.AddJoint(
+        drake.RevoluteJoint(f"{joint.name()}_motor", joint.frame_on_parent(), body.body_frame(), axis, 0.0)
+    )
 
 
-def _add_slosh(rig: DrakeRig, physics: Physics, plant) -> None:
+def _add_slosh(rig: DrakeRig, physics: Physics, plant: Any) -> None:
     """Add a mass that swings on springs along the body's x and y."""
     body = plant.GetBodyByName(rig.body)
     part = physics.slosh * body.default_mass()
@@ -299,68 +288,78 @@ def _add_slosh(rig: DrakeRig, physics: Physics, plant) -> None:
     frame = body.body_frame()
     for name, axis, mass in (("slosh_x", [1.0, 0, 0], 1e-4 * part), ("slosh_y", [0, 1.0, 0], part)):
         inner = plant.AddRigidBody(
-            name, body.model_instance(), SpatialInertia(mass, np.zeros(3), UnitInertia.SolidSphere(1e-3))
+            name, body.model_instance(), drake.SpatialInertia(mass, np.zeros(3), drake.UnitInertia.SolidSphere(1e-3))
         )
         damping = 0.1 * np.sqrt(stiffness * part)
-        joint = plant.AddJoint(PrismaticJoint(name, frame, inner.body_frame(), axis, damping=damping))
-        plant.AddForceElement(PrismaticSpring(joint, 0.0, stiffness))
+        joint = plant.AddJoint(drake.PrismaticJoint(name, frame, inner.body_frame(), axis, damping=damping))
+        rest = SLOSH_PLACE * axis[0]
+        joint.set_default_translation(rest)
+        plant.AddForceElement(drake.PrismaticSpring(joint, rest, stiffness))
         frame = inner.body_frame()
 
 
-def _add_contacts(rig: DrakeRig, physics: Physics, plant) -> None:
+def _add_contacts(rig: DrakeRig, physics: Physics, plant: Any) -> None:
     """Add table, body and finger as they touch each other."""
     v, size = physics.values, physics.size
     table = _material(v["friction"] / (2 - v["friction"]))  # with a body of coefficient 1, Drake's mean is `friction`
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "table_contact", table)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), drake.RigidTransform(), drake.HalfSpace(), "table_contact", table
+    )
     body = plant.GetBodyByName(rig.body)
     if rig.shape == "ball":
         stiffness = v.get("stiffness", ROLLING_STIFFNESS)
         frequency = np.sqrt(stiffness / (physics.mass * v["mass"]))
         ratio = v["damping_ratio"] - 0.5 * frequency * rig.step if rig.bounces else 1.0
         ball = _material(1.0, stiffness, 2 * ratio / frequency)
-        plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(size * v["radius"]), "ball_contact", ball)
+        plant.RegisterCollisionGeometry(
+            body, drake.RigidTransform(), drake.Sphere(size * v["radius"]), "ball_contact", ball
+        )
         return
     block = _material(1.0)
     x, y, z = size * np.array([v["half_x"], v["half_y"], v["half_z"]]) - FOOT
     for i, (a, b) in enumerate(((-x, -y), (-x, y), (x, -y), (x, y))):
         foot = _material(1.0, FOOT_STIFFNESS)
-        plant.RegisterCollisionGeometry(body, RigidTransform([a, b, -z]), Sphere(FOOT), f"foot_{i}", foot)
+        plant.RegisterCollisionGeometry(body, drake.RigidTransform([a, b, -z]), drake.Sphere(FOOT), f"foot_{i}", foot)
     if rig.finger:
         pad = _material(v["pad"] / (2 - v["pad"]))
-        AddRigidHydroelasticProperties(0.004, pad)
-        AddCompliantHydroelasticProperties(0.2, MODULUS, block)
-        box = Box(2 * (x + FOOT), 2 * (y + FOOT), 2 * z)  # does not reach the table
-        plant.RegisterCollisionGeometry(body, RigidTransform(), box, "block_contact", block)
-        shape = Cylinder(v["finger_radius"], 2 * v["finger_length"])
-        plant.RegisterCollisionGeometry(plant.GetBodyByName(rig.finger), RigidTransform(), shape, "finger_contact", pad)
+        drake.AddRigidHydroelasticProperties(0.001, pad)
+        drake.AddCompliantHydroelasticProperties(0.2, MODULUS, block)
+        box = drake.Box(2 * (x + FOOT), 2 * (y + FOOT), 2 * z)  # does not reach the table
+        plant.RegisterCollisionGeometry(body, drake.RigidTransform(), box, "block_contact", block)
+        shape = drake.Cylinder(v["finger_radius"], 2 * v["finger_length"])
+        plant.RegisterCollisionGeometry(
+            plant.GetBodyByName(rig.finger), drake.RigidTransform(), shape, "finger_contact", pad
+        )
 
 
-def _material(friction: float, stiffness: float = 1e12, relaxation: float = 0.0) -> ProximityProperties:
+def _material(friction: float, stiffness: float = 1e12, relaxation: float = 0.0) -> Any:
     """Return properties of a surface: coefficient [-], stiffness at a point [N/m], time over which it relaxes [s]."""
-    properties = ProximityProperties()
-    AddContactMaterial(
+    properties = drake.ProximityProperties()
+    drake.AddContactMaterial(
         dissipation=DISSIPATION,
         point_stiffness=stiffness,
-        friction=CoulombFriction(friction, friction),
+        friction=drake.CoulombFriction(friction, friction),
         properties=properties,
     )
     properties.AddProperty("material", "relaxation_time", relaxation)
     return properties
 
 
-def _weigh(rig: DrakeRig, physics: Physics, plant, context) -> None:
+def _weigh(rig: DrakeRig, physics: Physics, plant: Any, context: Any) -> None:
     """Set mass, centre of mass and inertia of the body under test."""
     body = plant.GetBodyByName(rig.body)
     nominal = body.default_spatial_inertia()
     center = nominal.get_com()
     central = nominal.Shift(center).CalcRotationalInertia().CopyToFullMatrix3() * physics.mass * physics.inertia
     mass = nominal.get_mass() * physics.mass * (1 - physics.slosh)
-    i = RotationalInertia(central[0, 0], central[1, 1], central[2, 2], central[0, 1], central[0, 2], central[1, 2])
-    shifted = SpatialInertia.MakeFromCentralInertia(mass, center + physics.center, i)
+    i = drake.RotationalInertia(
+        central[0, 0], central[1, 1], central[2, 2], central[0, 1], central[0, 2], central[1, 2]
+    )
+    shifted = drake.SpatialInertia.MakeFromCentralInertia(mass, center + physics.center, i)
     body.SetSpatialInertiaInBodyFrame(context, shifted)
 
 
-def _place(rig: DrakeRig, physics: Physics, trial: DrakeTrial, plant, context) -> None:
+def _place(rig: DrakeRig, physics: Physics, trial: DrakeTrial, plant: Any, context: Any) -> None:
     """Set the state in which the simulation begins: drives at their first command, the free body as the trial says."""
     q, v = plant.GetPositions(context), plant.GetVelocities(context)
     for drive in rig.drives:
@@ -370,7 +369,7 @@ def _place(rig: DrakeRig, physics: Physics, trial: DrakeTrial, plant, context) -
                 q[plant.GetJointByName(name).position_start()] = first
     if rig.free:
         body = plant.GetBodyByName(rig.body)
-        pose, velocity = np.array(trial.pose), np.array(trial.velocity if len(trial.velocity) else np.zeros(6))
+        pose, velocity = np.array(trial.pose, float), np.array(trial.velocity or np.zeros(6), float)
         if rig.shape != "none" and not rig.bounces:
             pose[2] = physics.size * physics.values["half_z" if rig.shape == "box" else "radius"]
         start = body.floating_positions_start()
@@ -417,13 +416,13 @@ def setpoints(time: np.ndarray, value: np.ndarray, ticks: np.ndarray, state: Dri
     return np.asarray(lfilter([share], [1, share - 1], held - held[0])) + held[0]
 
 
-def _dof(plant, joint: str) -> tuple[int, int]:
+def _dof(plant: Any, joint: str) -> tuple[int, int]:
     """Return where position and velocity of a joint stand."""
     found = plant.GetJointByName(joint)
     return found.position_start(), found.velocity_start()
 
 
-def _push(physics: Physics, plant, context, body, time: float, v: np.ndarray, tau: np.ndarray) -> None:
+def _push(physics: Physics, plant: Any, context: Any, body: Any, time: float, v: np.ndarray, tau: np.ndarray) -> None:
     """Add forces on the free body."""
     pose = plant.EvalBodyPoseInWorld(context, body)
     rotation = pose.rotation().matrix()
@@ -437,6 +436,6 @@ def _push(physics: Physics, plant, context, body, time: float, v: np.ndarray, ta
         tau[start + 3 : start + 6] += force
 
 
-def _pose(pose: RigidTransform) -> np.ndarray:
+def _pose(pose: Any) -> np.ndarray:
     """Return x y z and quaternion wxyz, shape (7,)."""
     return np.concatenate([pose.translation(), pose.rotation().ToQuaternion().wxyz()])

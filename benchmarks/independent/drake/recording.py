@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.independent.drake_rig import ENCODERS, DrakeRig, Physics, Sensor
-from benchmarks.independent.drake_simulation import DrakeMotion, simulate
+from benchmarks.independent.drake.rig import ENCODERS, DrakeRig, Physics, Sensor
+from benchmarks.independent.drake.simulation import DrakeMotion, simulate
 from benchmarks.independent.instruments import Instrument, Instruments
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 
@@ -19,11 +19,11 @@ angular velocity [rad/s]."""
 
 @dataclass(frozen=True)
 class Made:
-    """A recording and the true initial states of its free body, which it does not say."""
+    """A recording and the true initial states, which it does not say."""
 
     recording: Recording
     starts: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
-    """For each demonstration qpos (nq,) and qvel (nv,) of the nominal scene, or None where bodies begin at rest."""
+    """For each demonstration qpos (nq,) and qvel (nv,) of the nominal scene, or None where it has no free body."""
 
 
 def record_drake(rig: DrakeRig, physics: Physics, seed: int, demonstrations: int, *, noise_stated: bool = True) -> Made:
@@ -37,8 +37,8 @@ def record_drake(rig: DrakeRig, physics: Physics, seed: int, demonstrations: int
         measured = {s.name: _reading(rig, physics, s, motion, instruments, rng) for s in rig.sensors}
         if not noise_stated:
             measured = {name: replace(channel, noise_std=None) for name, channel in measured.items()}
-        start = _start(rig, motion) if rig.free and not rig.drives else None
-        known = _estimate(start, rng) if rig.start_recorded and start is not None else (None, None)
+        start = _start(rig, motion) if rig.free else None
+        known = (None, None) if start is None or not rig.start_recorded else _estimate(start, rng)
         action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
         taken.append(Demonstration(f"demo_{k}", rig.name, None, *known, action=action, measured=measured))
         starts.append(start)
@@ -86,17 +86,20 @@ def _instrument(sensor: Sensor, instruments: Instruments) -> Instrument:
 
 
 def _start(rig: DrakeRig, motion: DrakeMotion) -> tuple[np.ndarray, np.ndarray]:
-    """Return pose and velocity of the free body at time 0, qpos (7,) and qvel (6,), angular velocity in its frame."""
+    """Return the nominal scene's state at time 0, qpos (nq,) and qvel (nv,); driven joints stand before the body."""
     pose = motion.poses[rig.body]
     k = int(np.searchsorted(motion.time, -1e-9))
     span = motion.time[k + 2] - motion.time[k - 2]
     before, after = Rotation.from_quat(pose[[k - 2, k + 2], 3:], scalar_first=True)
     turning = (before.inv() * after).as_rotvec() / span
-    return pose[k], np.concatenate([(pose[k + 2, :3] - pose[k - 2, :3]) / span, turning])
+    driven = [motion.joints[d.joint][[k - 2, k, k + 2]] for d in rig.drives]
+    rate = (pose[k + 2, :3] - pose[k - 2, :3]) / span
+    joints, rates = [x[1] for x in driven], [(x[2] - x[0]) / span for x in driven]
+    return np.concatenate([joints, pose[k]]), np.concatenate([rates, rate, turning])
 
 
 def _estimate(start: tuple[np.ndarray, np.ndarray], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return an initial state with the errors of an estimate."""
+    """Return the state of a single free body with the errors of an estimate."""
     position, orientation, velocity, turning = START_STD
     pose, rate = start[0].copy(), start[1].copy()
     pose[:3] += rng.normal(0, position, 3)

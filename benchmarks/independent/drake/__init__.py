@@ -1,0 +1,1 @@
+"""The world on Drake: experiments, simulation, hidden effects, recordings. Only `simulation` imports Drake."""
