@@ -129,7 +129,7 @@ def stribeck_friction(experiment: Experiment, magnitude: float) -> Cause:
 
     found = drives(rig)
     joints = tuple(d.joint for d in found)
-    truth = true_values("extra", joints, np.array([magnitude * d.weight for d in found]))
+    truth = {**true_values("extra", joints, np.array([magnitude * d.weight for d in found])), "speed": fade}
     levels = {d.joint: at(d) for d in found}
     return Cause("stribeck_friction", HiddenEffect("stribeck_friction"), truth, joints, levels=levels)
 

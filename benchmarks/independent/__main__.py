@@ -1,0 +1,169 @@
+"""Diagnoses the data sets of the independent worlds and writes the page.
+
+python -m benchmarks.independent                                  # development sets that are not done, the page
+python -m benchmarks.independent --kinds null --rigs drop         # some of them
+python -m benchmarks.independent --locked --out runs/locked       # the locked sets, once, at the end
+python -m benchmarks.independent --report                         # the page from what is done
+python -m benchmarks.independent --report --earlier OTHER/results.jsonl --locked-results LOCKED/results.jsonl
+
+Each set is diagnosed by a process of its own, one of `--jobs`, within `--limit` seconds of processor time. Results are
+kept in `--out`, one file a set and `results.jsonl` with all, so that the command may be stopped and called again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from benchmarks.independent.data_set import KINDS, DataSet, Kind, World
+from benchmarks.independent.page import read_results, write_page_from
+from benchmarks.independent.scoring import line
+from benchmarks.independent.split import locked_names
+from benchmarks.independent.study import PROCESSOR_SECONDS, WALL_SECONDS, described, path
+from benchmarks.independent.worlds import all_sets
+from benchmarks.pages import ROOT, machine, machine_line
+from concent_warp.files import write_text
+
+OUT = Path("runs/independent")
+EXPECTED_SECONDS = {"pendulum": 60.0, "arm": 250.0, "slide": 120.0, "spin": 120.0, "push": 250.0, "drop": 90.0}
+"""First guess of the time of a set by rig [s], until sets of the rig are done; of other rigs that of the push."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    kinds: tuple[Kind, ...] = KINDS
+    rigs: tuple[str, ...] = ()
+    """Rigs; all by default."""
+    world: World | None = None
+    """One of the two worlds; both by default."""
+    names: tuple[str, ...] = ()
+    """Only data sets of these names."""
+    locked: bool = False
+    """Diagnose the locked sets, and no others."""
+    jobs: int = len(os.sched_getaffinity(0))
+    """Data sets at a time."""
+    limit: float = PROCESSOR_SECONDS
+    """Processor time of a diagnosis from which on it counts as wrong [s]."""
+    wall: float = WALL_SECONDS
+    """Duration from which on it counts as wrong, whatever the processor was given to [s]."""
+    out: Path = OUT
+    """Folder of the results."""
+    report: bool = False
+    """Write the page from what is done, and diagnose nothing."""
+    earlier: Path | None = None
+    """Results of an earlier state of the method, shown beside."""
+    locked_results: Path | None = None
+    """Results of the locked sets, where they lie in another folder."""
+    host: str = ""
+    """The machine of the results in words, where it is not this one."""
+
+
+def main(args: Args) -> None:
+    """Diagnose what is not done yet, and write the page where all was asked for."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    every = all_sets()
+    chosen = [c for c in every if wanted(c, args)]
+    if not args.report:
+        run(chosen, args)
+    merge(args.out, every)
+    if args.report or not (args.rigs or args.names or args.world or args.locked or len(args.kinds) < len(KINDS)):
+        rows = read_results(args.out / "results.jsonl")
+        if args.locked_results is not None:
+            rows += read_results(args.locked_results)
+        earlier = [] if args.earlier is None else read_results(args.earlier)
+        write_page_from(rows, earlier, every, args.host or machine_line(machine()))
+
+
+def wanted(case: DataSet, args: Args) -> bool:
+    """Return whether a data set was asked for."""
+    return (
+        (case.name in locked_names()) == args.locked
+        and case.kind in args.kinds
+        and (not args.rigs or case.rig in args.rigs)
+        and args.world in (None, case.world)
+        and (not args.names or case.name in args.names)
+    )
+
+
+def run(chosen: Sequence[DataSet], args: Args) -> None:
+    """Diagnose what is not done yet."""
+    pending = [c for c in chosen if not path(args.out, c.name).is_file()]
+    random.Random(0).shuffle(pending)  # what is done when it is stopped is a fair part of the whole
+    done: dict[str, list[float]] = {}
+    commit, begun = revision(), time.monotonic()
+    with ThreadPoolExecutor(max(args.jobs, 1)) as pool:
+        futures = {pool.submit(in_process, case, args, commit): case for case in pending}
+        left = list(pending)
+        for k, future in enumerate(as_completed(futures)):
+            case, (result, seconds) = futures[future], future.result()
+            left.remove(case)
+            done.setdefault(case.rig, []).append(seconds)
+            minutes = remaining(left, done, args.jobs) / 60
+            spent = (time.monotonic() - begun) / 60
+            print(f"{k + 1:3d}/{len(pending)} {line(result)}  ({spent:.0f} min, {minutes:.0f} left)", flush=True)
+
+
+def remaining(left: Sequence[DataSet], done: dict[str, list[float]], jobs: int) -> float:
+    """Return the expected time for the sets that are left [s], from those of their rig that are done."""
+    guesses = {rig: EXPECTED_SECONDS.get(rig, EXPECTED_SECONDS["push"]) for rig in {c.rig for c in left} | set(done)}
+    seen = [s / guesses[rig] for rig, of in done.items() for s in of]
+    factor = float(np.mean(seen)) if seen else 1.0
+    each = [float(np.mean(done[c.rig])) if c.rig in done else factor * guesses[c.rig] for c in left]
+    return max(sum(each) / max(jobs, 1), max(each, default=0.0))
+
+
+def in_process(case: DataSet, args: Args, commit: str) -> tuple[dict[str, Any], float]:
+    """Return the result of one set, diagnosed by a process of its own, and the time that all took [s]."""
+    begun = time.monotonic()
+    command = [sys.executable, "-m", "benchmarks.independent.study", case.name, str(args.out), "--commit", commit]
+    command += ["--limit", str(args.limit), "--wall", str(args.wall)]
+    places = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    said = ""
+    try:
+        ended = subprocess.run(
+            command, env=os.environ | threads | {"PYTHONPATH": places}, capture_output=True, text=True,
+            timeout=2 * args.wall + 600, check=False,
+        )  # fmt: skip
+        said = f"ended with {ended.returncode}: {ended.stderr.strip()[-1000:]}"
+    except subprocess.TimeoutExpired:
+        said = "time-out"
+    where = path(args.out, case.name)
+    if not where.is_file():
+        lost = described(case) | {"truth": [], "error": said, "seconds": time.monotonic() - begun, "commit": commit}
+        write_text(where, json.dumps(lost) + "\n")
+    return json.loads(where.read_text()), time.monotonic() - begun
+
+
+def merge(out: Path, every: Sequence[DataSet]) -> None:
+    """Write the results of all sets that are done into one file, a line each."""
+    found = [path(out, c.name) for c in every]
+    lines = [json.dumps(json.loads(p.read_text())) for p in found if p.is_file()]
+    write_text(out / "results.jsonl", "".join(f"{one}\n" for one in lines))
+
+
+def revision() -> str:
+    """Return the revision of this checkout, empty where there is none."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short=12", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
