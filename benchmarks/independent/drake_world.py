@@ -6,6 +6,15 @@ python -m benchmarks.independent.drake_world --kinds null --rigs swing launch
 The table has, for each data set, the time to make it and the root mean square of residual over noise in the worst
 channel (`benchmarks.diagnose.hidden_effects_residual`, with refitted initial states): of the nominal model, and of the
 nominal model with the library's effects at the true values. Making a data set needs Drake (the extra `benchmarks`).
+
+The nominal models are not exact where nothing is hidden either. The ratio of `swing` and `reach` is 1.4 to 1.5 (sampled
+control with a torque that is held, friction with presliding, tolerances, quantisation), of `launch`, `roll` and `toss`
+1.0 to 1.3. Two are larger, since MuJoCo's contacts differ from Coulomb's law there:
+
+- `bounce`, 3 to 4: friction of MuJoCo's contact shares the time constant of its normal force, so it takes 0.12 m/s off
+  a ball that bounces at 0.8 m/s where mu (1 + e) v is 0.19 m/s, as in Drake.
+- `gantry`, 4 to 7: under the finger's push MuJoCo's block chatters from corner to corner, which changes how far it
+  turns; with normal forces at rest, friction turns it as far as in Drake.
 """
 
 from __future__ import annotations
@@ -60,8 +69,8 @@ SINGLES: dict[str, dict[str, Values]] = {
         "time_base": (0.004, 0.01),
     },
     "gantry": {
-        "sliding_friction": (0.45, 0.6),
-        "mass": (1.3, 1.8),
+        "sliding_friction": (0.5, 0.8),
+        "mass": (1.5, 2.5),
         "joint_friction": (1.0, 3.0),
         "joint_damping": (8.0, 25.0),
         "actuator_gain": (0.85, 0.6),
@@ -75,26 +84,26 @@ SINGLES: dict[str, dict[str, Values]] = {
         "latency": (0.01, 0.025),
     },
     "bounce": {
-        "air_drag": (1.5, 4.0),
-        "wind": (1.5, 4.0),
+        "air_drag": (2.5, 5.0),
+        "wind": (3.0, 6.0),
         "contact_compliance": (0.13, 0.2),
-        "gravity_tilt": (0.012, 0.03),
-        "size": (1.05, 1.12),
-        "length_scale": (0.01, 0.025),
-        "time_base": (0.006, 0.015),
+        "gravity_tilt": (0.035, 0.07),
+        "size": (1.1, 1.2),
+        "length_scale": (0.02, 0.045),
+        "time_base": (0.012, 0.03),
     },
     "roll": {
-        "rolling_friction": (3e-4, 8e-4),
+        "rolling_friction": (1e-4, 3e-4),
         "sliding_friction": (0.2, 0.3),
         "gravity_tilt": (0.004, 0.01),
-        "inertia": (1.15, 1.4),
+        "inertia": (1.3, 1.67),
         "center_of_mass": (8e-4, 0.002),
     },
     "toss": {
-        "center_of_mass": (0.002, 0.005),
-        "length_scale": (0.006, 0.015),
-        "time_base": (0.005, 0.012),
-        "gravity_tilt": (0.012, 0.03),
+        "center_of_mass": (0.005, 0.012),
+        "length_scale": (0.015, 0.035),
+        "time_base": (0.012, 0.03),
+        "gravity_tilt": (0.03, 0.07),
     },
 }
 """Middle and large value of the main parameter of each effect, by rig, in the units of `drake.hidden`."""

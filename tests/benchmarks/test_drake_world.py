@@ -1,18 +1,16 @@
-"""The world on Drake obeys physics that are known, and its data sets have what they say."""
+"""The world on Drake obeys physics that are known, and hidden effects show; where Drake is installed."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.independent.data_set import TOLERANCE
 from benchmarks.independent.drake.hidden import INSIDE
 from benchmarks.independent.drake.outside import OUTSIDE
-from benchmarks.independent.drake.rig import MACHINING, DrakeTrial, DriveState, Friction, Physics, true_physics
+from benchmarks.independent.drake.rig import DrakeTrial, DriveState, Friction, Physics, true_physics
 from benchmarks.independent.drake.rigs import DRAKE_RIGS
 from benchmarks.independent.drake_world import OUTSIDES, SINGLES, drake_sets, make_drake, true_model, with_starts
 
@@ -156,17 +154,6 @@ def test_masses_of_the_world_are_those_of_the_scene(name):
         assert central == pytest.approx(axes @ np.diag(model.body_inertia[b]) @ axes.T, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", DRAKE_RIGS)
-def test_nominal_values_are_wrong_within_the_tolerances(name):
-    rig = DRAKE_RIGS[name]
-    true = rig.drawn(5)
-    masses = {m for names in rig.masses for m in names.split("+")}
-    assert all(0 < abs(true[m] / rig.values[m] - 1) <= TOLERANCE for m in masses)
-    for length in rig.lengths:
-        assert 0 < abs(true[length] - rig.values[length]) <= min(MACHINING, TOLERANCE * rig.values[length])
-    assert {n for n in true if true[n] != rig.values[n]} == masses | set(rig.lengths)
-
-
 CASES = [(rig, effect, values[1]) for rig, effects in SINGLES.items() for effect, values in effects.items()]
 
 
@@ -189,16 +176,12 @@ def test_a_hidden_effect_shows(name, effect, magnitude):
     assert largest > 3
 
 
-@pytest.mark.parametrize(
-    ("name", "effect"), [(r, e) for r, e, _ in CASES if e not in ("backlash",)], ids=lambda x: str(x)
-)
+@pytest.mark.parametrize(("name", "effect"), [(r, e) for r, e, _ in CASES if e != "wind"], ids=lambda x: str(x))
 def test_an_effect_of_no_size_changes_nothing(name, effect):
     rig = DRAKE_RIGS[name]
     trial = brief(rig, 0.4)
     plain, changed = true_physics(rig, 1), true_physics(rig, 1)
     magnitude = changed.values[SETTERS[effect]] if effect in SETTERS else NULL.get(effect, 0.0)
-    if effect == "wind":
-        pytest.skip("still air has drag")
     if effect == "gravity_tilt":
         magnitude = 1e-15
     INSIDE[effect](rig, changed, magnitude)
@@ -222,28 +205,13 @@ def test_data_sets_are_reproducible_and_do_not_depend_on_one_another():
     assert not np.array_equal(held.time[:5], first.recording.demonstrations[0].measured["block_position"].time[:5])
 
 
-def test_noise_is_stated_in_half_of_the_data_and_always_held_out():
-    cases = drake_sets()
-    stated = Counter((c.kind, c.noise_stated) for c in cases)
-    assert all(abs(stated[kind, True] - stated[kind, False]) <= 1 for kind in ("null", "single", "pair", "outside"))
-    (case,) = (c for c in cases if c.name == "drake-launch-null-0")
+def test_noise_is_stated_as_the_data_set_says_and_always_held_out():
+    (case,) = (c for c in drake_sets() if c.name == "drake-launch-null-0")
     for told in (True, False):
         made = make_drake(replace(case, noise_stated=told))
         channels = [c for d in made.recording.demonstrations for c in d.measured.values()]
         assert all((c.noise_std is not None) == told for c in channels)
         assert all(c.noise_std is not None for d in made.held_out.demonstrations for c in d.measured.values())
-
-
-def test_there_are_enough_data_sets_of_each_kind_with_names_that_differ():
-    cases = drake_sets()
-    assert len({c.name for c in cases}) == len(cases)
-    count = Counter(c.kind for c in cases)
-    assert count["null"] >= 10
-    assert count["pair"] >= 8
-    assert count["outside"] >= 8
-    singles = [c for c in cases if c.kind == "single"]
-    assert len({e for c in singles for e in c.magnitudes}) >= 12
-    assert len({c.rig for c in singles}) >= 5
 
 
 @pytest.mark.parametrize("effect", ["joint_friction-large", "joint_damping-middle"])
@@ -254,17 +222,7 @@ def test_the_library_does_not_reproduce_the_world_exactly_but_comes_nearer(effec
     (case,) = (c for c in drake_sets() if c.name == f"drake-swing-{effect}")
     recording, scene, truth = with_starts(case)
     model = true_model(scene, truth)
+    assert model is not None
     nominal, true = (ratios(m, recording)["axle_encoder"] for m in (Model(scene), model))
     assert true > 1.2
     assert nominal > 1.5 * true
-
-
-@pytest.mark.parametrize("case", [c for c in drake_sets() if c.kind in ("single", "pair")], ids=lambda c: c.name)
-def test_the_library_knows_effects_and_true_values_by_their_names(case):
-    rig = DRAKE_RIGS[case.rig]
-    physics = true_physics(rig, case.seed)
-    truth = tuple(INSIDE[name](rig, physics, value) for name, value in case.magnitudes.items())
-    model = true_model(rig.scene, truth)
-    if all(t.parameters for t in truth):
-        for added, t in zip(model.effects, truth, strict=True):
-            assert {p.name for p in added.effect.parameters(rig.scene.model)} == set(t.parameters)

@@ -213,9 +213,10 @@ LAUNCH = """
 
 
 def launch_plan(rng: np.random.Generator) -> DrakeTrial:
-    """Sample a launch along the table with some spin."""
+    """Sample a launch over the middle of the table with some spin."""
     heading, turn, speed = *rng.uniform(-np.pi, np.pi, 2), rng.uniform(0.6, 1.2)
-    pose = (*rng.uniform(-0.1, 0.1, 2), 0.02, np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+    x, y = rng.uniform(-0.03, 0.03, 2) - 0.1 * np.array([np.cos(heading), np.sin(heading)])
+    pose = (x, y, 0.02, np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
     velocity = (speed * np.cos(heading), speed * np.sin(heading), 0.0, 0.0, 0.0, rng.uniform(-2.0, 2.0))
     return DrakeTrial(speed / 3.0 + 0.3, pose=pose, velocity=velocity)
 
@@ -260,10 +261,11 @@ def bounce_plan(rng: np.random.Generator) -> DrakeTrial:
 
 
 def roll_plan(rng: np.random.Generator) -> DrakeTrial:
-    """Sample a ball shoved over the table without spin, so that it skids before it rolls."""
+    """Sample a ball shoved over the middle of the table; it skids before it rolls."""
     heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.1)
     quaternion = Rotation.random(None, rng).as_quat(scalar_first=True)
-    pose = (*rng.uniform(-0.1, 0.1, 2), 0.03, *quaternion)
+    x, y = rng.uniform(-0.03, 0.03, 2) - 0.1 * np.array([np.cos(heading), np.sin(heading)])
+    pose = (x, y, 0.03, *quaternion)
     velocity = (speed * np.cos(heading), speed * np.sin(heading), 0.0, 0.0, 0.0, rng.uniform(-2, 2))
     return DrakeTrial(1.5, pose=pose, velocity=velocity)
 
