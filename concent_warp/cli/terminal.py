@@ -131,7 +131,8 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
     """Show a bar, a line of text beside it and the time left.
 
     What is given is to be called with the share done, 0..1, the text, and the seconds left, None to estimate them from
-    the share. Where there is no terminal, plain lines come now and then.
+    the share. A text that ends with a line break stays above the bar. Where there is no terminal, plain lines come now
+    and then.
     """
     out = _console(stderr=True)
     begun = time.monotonic()
@@ -141,7 +142,9 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
         def plain(share: float, text: str, left: float | None) -> None:
             nonlocal last
             spent = time.monotonic() - begun
-            if share > 0 and spent - last >= PLAIN_PERIOD:
+            if text.endswith("\n"):
+                out.print(f"{title}: {printable(text.strip())}", markup=False)
+            elif share > 0 and spent - last >= PLAIN_PERIOD:
                 last = spent
                 HAS_PRINTED.set()
                 out.print(f"{title}: {100 * share:.0f} %{' ' * bool(text)}{text}{_time_left(share, spent, left)}")
@@ -156,6 +159,9 @@ def status_bar(title: str) -> Iterator[Callable[[float, str, float | None], None
         task = bar.add_task(title, total=1.0, text="")
 
         def update(share: float, text: str, left: float | None) -> None:
+            if text.endswith("\n"):
+                bar.console.print(printable(text.strip()), markup=False)
+                return
             remaining = _time_left(share, time.monotonic() - begun, left)
             bar.update(task, completed=share, text=f"{text}{remaining}".lstrip(", "))
 

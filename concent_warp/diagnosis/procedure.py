@@ -46,7 +46,7 @@ from concent_warp.diagnosis.search.nominal_values import (
     without_nominal_values,
 )
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
-from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import finer_time_step
 from concent_warp.diagnosis.search.unknown_force import unknown_force
@@ -308,13 +308,17 @@ class Procedure:
     def _screened(self, base: FittedModel, effects: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return all candidates with their expected gains."""
         span = 0.5 * ADDITIONS_SPAN / self.cfg.max_additions
-        found = self.runner.run_in_time(screen, [(base, e, self.cfg.search) for e in effects], "screening", span)
+        at_measured = linear_at_measured_states(base, self.cfg.search)
+        tasks = [(base, e, self.cfg.search, at_measured) for e in effects]
+        found = self.runner.run_in_time(screen, tasks, "screening", span)
         screened = [s for s in found if s is not None]
         if len(screened) < len(effects):
             missed = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is None]
             self.budget.note(f"Not screened: {in_words(missed)}.", step)
             if not screened:
                 raise TimeUpError
+        names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
+        self.runner.progress(self.runner.share, ranking(base, screened, names, self.cfg.seed))
         return self.gradient.apply(base, screened, self.runner) if self.gradient else screened
 
     def _record(

@@ -163,6 +163,11 @@ class Effect:
         return type(self).edit is not Effect.edit
 
     @property
+    def prepares(self) -> bool:
+        """Whether the model differs by more than the values of its fields as soon as it has the effect."""
+        return type(self).prepare is not Effect.prepare or self.edits
+
+    @property
     def measures(self) -> bool:
         """Whether the effect changes what the instruments read."""
         return type(self).measure is not Effect.measure

@@ -185,3 +185,21 @@ def test_settings_that_make_no_sense_are_an_error_of_one_line(arguments, words, 
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
+
+
+def test_a_first_ranking_is_printed_before_the_answer(swing, capsys):
+    assert diagnose(swing / "demo.h5", "--model", str(swing / "scene.xml")) == 0
+    said = capsys.readouterr().err
+    assert "diagnosing: first ranking, error expected to fall by: joint_damping " in said
+
+
+def test_a_time_ends_the_diagnosis_with_what_is_open(swing, capsys):
+    assert diagnose(swing / "demo.h5", "--seconds", "0.001") == 0
+    said = capsys.readouterr().out
+    assert "The time did not suffice for a verdict" in said
+    assert "Open: whether any effect is missing." in said
+    assert diagnose(swing / "demo.h5", "--seconds", "0.001", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "unsettled"
+    assert "Open: whether any effect is missing." in document["unsettled"]
+    assert diagnose(swing / "demo.h5", "--seconds", "0") == 2

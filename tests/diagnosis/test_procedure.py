@@ -398,9 +398,13 @@ def test_where_nothing_is_accepted_findings_are_kept_by_gain(monkeypatch):
 
 def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
     made = procedure()
-    monkeypatch.setattr(module, "screen", lambda _base, effect, _cfg: effect.upper())
+    monkeypatch.setattr(module, "linear_at_measured_states", lambda _base, _cfg: "shared")
+    monkeypatch.setattr(module, "ranking", lambda _base, _screened, names, _seed: f"ranked {names}")
+    monkeypatch.setattr(module, "label", lambda effect, _among: effect)
+    monkeypatch.setattr(module, "screen", lambda _base, effect, _cfg, at: effect.upper() if at == "shared" else "")
     assert made._screened(node(2.0), ["a", "b"], 0) == ["A", "B"]
     assert made.runner.share == pytest.approx(0.5 * 0.85 / 3)
+    assert made.seen[-1][1] == "ranked ['a', 'b']"
     made.gradient = SimpleNamespace(apply=lambda _base, screened, _runner: screened[::-1])
     assert made._screened(node(2.0), ["a", "b"], 0) == ["B", "A"]
 

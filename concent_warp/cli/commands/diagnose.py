@@ -22,6 +22,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import EXPERIMENT_FILE, diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.diagnosis.search.candidates import candidates
+from concent_warp.diagnosis.search.screening import FIRST_RANKING
 from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none
 from concent_warp.model import Model
@@ -128,7 +129,11 @@ def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diag
     )
     try:
         with work_progress("diagnosing") as progress:
-            return diagnose(model, recording, cfg, engine=arguments.engine, out=arguments.out, progress=progress)
+
+            def show(share: float, text: str) -> None:
+                progress(share, f"{text}\n" if text.startswith(FIRST_RANKING) else text)
+
+            return diagnose(model, recording, cfg, engine=arguments.engine, out=arguments.out, progress=show)
     except KeyboardInterrupt:
         advice = f"Finished parts are kept; continue with: {command_line()}"
         if arguments.out is None:

@@ -49,6 +49,8 @@ def polish_candidate(
     stuck = candidate.fit.cost == base.fit.cost
     fit = solver.polish(candidate.fit, thorough=thorough, stuck=stuck)
     found = _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
+    if found.fit.polished != fit.polished:
+        found = replace(found, fit=replace(found.fit, polished=fit.polished))
     return replace(found, polished=fit.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost)
 
 

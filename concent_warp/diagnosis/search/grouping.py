@@ -58,5 +58,7 @@ def group_indistinguishable(
     best = group[0][0]
     unsettled = f"Fit not refined: {best.effect.name}."
     best = budget.attempt(lambda: polish_candidate(base, best, search, thorough=True), best, unsettled)
-    group[0] = with_evidence(profiled(best))
+    # A profile from where another one ended, and a polish found nothing, would be the same.
+    same = best.std is not None and best.fit.cost == group[0][0].fit.cost
+    group[0] = with_evidence(best if same else profiled(best))
     return group

@@ -16,6 +16,8 @@ from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter,
 
 def refit_jointly(last: FittedModel) -> FittedModel:
     """Return a model with all parameters and initial states fitted together once more, where that lowers the cost."""
+    if last.fit.polished:
+        return last
     solver = last.solver()
     fit = solver.polish(last.fit, thorough=True)
     if fit.cost >= last.fit.cost:

@@ -10,11 +10,19 @@ import numpy as np
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.cross_validation import bootstrap_interval
 from concent_warp.fit.effects.least_squares import Linear, Solver
 from concent_warp.fit.effects.robust import cauchy_weight, huber
 
+FIRST_RANKING = "first ranking"
+"""How the text of the progress begins that has it."""
+RANKED = 4
+"""Candidates in it."""
 
-def screen(base: FittedModel, effect: Effect, cfg: SearchCfg | None = None) -> ScreenedCandidate:
+
+def screen(
+    base: FittedModel, effect: Effect, cfg: SearchCfg | None = None, at_measured: tuple[Linear, ...] = ()
+) -> ScreenedCandidate:
     """Return a candidate with the gain that a fit is expected to have.
 
     Sensitivities are taken at the baseline's initial states, and at the measured ones where those are far away: initial
@@ -24,25 +32,68 @@ def screen(base: FittedModel, effect: Effect, cfg: SearchCfg | None = None) -> S
         base: The fitted baseline.
         effect: The candidate.
         cfg: Settings.
+        at_measured: See `linear_at_measured_states`; computed where not given.
     """
     cfg = cfg or SearchCfg()
     solver = base.solver(effect)
     values = solver.p.start.copy()
     # Sensitivities need finite values where the null value is infinite, as that of a limit is.
     at = np.where(np.isfinite(values), values, solver.scale)
+    taken_over = bool(np.isfinite(values).all())
+    same = taken_over and not effect.prepares
+    known = base.fit.linear if taken_over else ()
     # The residual is the baseline's own; at a start off the null value it is another.
-    pieces = with_residuals(
-        base.projected(replace(base.fit, linear=solver.linearise(at, base.fit.offsets))), base.pieces
-    )
+    linear = solver.linearise(at, base.fit.offsets, known, residual_known=same)
+    pieces = with_residuals(base.projected(replace(base.fit, linear=linear)), base.pieces)
     gain = _linear_gain(base, pieces, base.pieces, base.errors)
-    if max(float(np.abs(o).max()) for o in base.fit.offsets) > cfg.max_state_offset:
+    if _are_far(base, cfg):
         zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
-        measured = base.projected(replace(base.fit, linear=solver.linearise(at, zero), offsets=zero))
+        known = (at_measured or linear_at_measured_states(base, cfg)) if taken_over else ()
+        linear = solver.linearise(at, zero, known, residual_known=same)
+        measured = base.projected(replace(base.fit, linear=linear, offsets=zero))
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in measured]
         before = base.held_out(plain).own()
         gain = max(gain, _linear_gain(base, measured, plain, before))
     scanned_gain, start = _scan(solver, base, values)
     return ScreenedCandidate(effect, gain, scanned_gain, start, pieces)
+
+
+def ranking(base: FittedModel, screened: Sequence[ScreenedCandidate], names: Sequence[str], seed: int = 0) -> str:
+    """Return the candidates with the largest expected gains in words, with 95 % intervals over the blocks of time.
+
+    Intervals are those of the linear step; a gain that a scanned value promises has none.
+
+    Args:
+        base: The fitted baseline.
+        screened: All candidates.
+        names: Their names.
+        seed: Seed of the bootstrap.
+    """
+    said = []
+    for k in sorted(range(len(screened)), key=lambda k: -screened[k].expected_gain)[:RANKED]:
+        s, rng = screened[k], np.random.default_rng(seed)
+        text = f"{names[k]} {100 * s.expected_gain:.0f} %"
+        if s.linear_gain >= s.scanned_gain:
+            gain = base.errors - base.held_out(with_residuals(s.pieces, base.pieces)).own()
+            low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, rng)
+            text += f" [{100 * min(low, s.linear_gain):.0f}, {100 * max(high, s.linear_gain):.0f}]"
+        said.append(text)
+    return f"{FIRST_RANKING}, error expected to fall by: {', '.join(said)}"
+
+
+def linear_at_measured_states(base: FittedModel, cfg: SearchCfg) -> tuple[Linear, ...]:
+    """Return residuals and sensitivities of a fitted model at the measured initial states; none where it is near them.
+
+    All candidates share them.
+    """
+    if not _are_far(base, cfg):
+        return ()
+    return base.solver().linearise(base.fit.values, [np.zeros_like(o) for o in base.fit.offsets])
+
+
+def _are_far(base: FittedModel, cfg: SearchCfg) -> bool:
+    """Return whether fitted initial states are far from the measured ones."""
+    return max(float(np.abs(o).max()) for o in base.fit.offsets) > cfg.max_state_offset
 
 
 def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Linear, ...]:

@@ -112,6 +112,8 @@ class Fit:
     converged: bool
     simulated: float
     """Simulated time [s]."""
+    polished: bool = False
+    """Whether a thorough polish ended here, so that another one finds nothing."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ class Solver:
                     there = self._fit_at(best, values, self._promising_windows(best, values), noise)
                 found = min(found, there, key=lambda f: f.cost)
             if found.cost > (1 - min_gain) * best.cost:
-                break
+                return replace(best, polished=thorough)
             best = found
         return best
 
@@ -234,7 +236,7 @@ class Solver:
         found = part.polish(begin, thorough=thorough, stuck=stuck)
         min_gain = self.cfg.min_thorough_gain if thorough else self.cfg.min_gain
         if found.cost > (1 - min_gain) * begin.cost:
-            return fit
+            return replace(fit, polished=True) if thorough else fit
         known = dict(zip(some, found.offsets, strict=True))
         offsets = tuple(known.get(w, o) for w, o in enumerate(fit.offsets))
         measured = [np.zeros_like(o) for o in fit.offsets]
@@ -324,28 +326,48 @@ class Solver:
         """Return one simulation for each window."""
         return self.search.trials(values, offsets)
 
-    def linearise(self, values: np.ndarray, offsets: Sequence[np.ndarray]) -> tuple[Linear, ...]:
-        """Return residuals and sensitivities at a point; `offsets` in units of their spread."""
+    def linearise(
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        known: Sequence[Linear] = (),
+        *,
+        residual_known: bool = False,
+    ) -> tuple[Linear, ...]:
+        """Return residuals and sensitivities at a point.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states in units of their spread, one (2 nv,) a window.
+            known: The same of a model without the last parameters, at a point where these change nothing: its
+                sensitivities are taken over.
+            residual_known: Whether its residuals are those of this model too.
+        """
         count, size = len(self.p.windows), len(self.scale)
-        dynamic = [k for k in range(size) if not self.p.measured_only[k]]
+        first = known[0].jacobian.shape[1] if known else 0
+        dynamic = [k for k in range(first, size) if not self.p.measured_only[k]]
+        measured = [k for k in range(first, size) if self.p.measured_only[k]]
         steps = self._steps(values)
-        trials = self.trials(values, offsets)
+        simulated = bool(measured) or not residual_known
+        points = [values] if simulated else []
         for k in dynamic:
-            moved = values.copy()
-            moved[k] += steps[k]
-            trials += self.trials(moved, offsets)
+            points.append(values.copy())
+            points[-1][k] += steps[k]
+        trials = [trial for point in points for trial in self.trials(point, offsets)]
         readers = self.p.readers(trials)
-        base = [self.p.observed(w, readers[w], values) for w in range(count)]
+        seen = [self.p.observed(trial.window, read, trial.values) for trial, read in zip(trials, readers, strict=True)]
+        base = seen[:count] if simulated else [window.residual for window in known]
         jacobian = [np.zeros((len(r), size)) for r in base]
-        for i, k in enumerate(dynamic):
+        for i, k in enumerate(dynamic, start=int(simulated)):
             for w in range(count):
-                row = (i + 1) * count + w
-                jacobian[w][:, k] = (self.p.observed(w, readers[row], trials[row].values) - base[w]) / steps[k]
-        for k in set(range(size)) - set(dynamic):
+                jacobian[w][:, k] = (seen[i * count + w] - base[w]) / steps[k]
+        for k in measured:
             moved = values.copy()
             moved[k] += steps[k]
             for w in range(count):
                 jacobian[w][:, k] = (self.p.observed(w, readers[w], moved) - base[w]) / steps[k]
+        for w, window in enumerate(known):
+            jacobian[w][:, :first] = window.jacobian / self.scale[:first]
         self._adapt(jacobian)
         return tuple(Linear(r, j * self.scale) for r, j in zip(base, jacobian, strict=True))
 

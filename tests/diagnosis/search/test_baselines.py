@@ -32,6 +32,7 @@ class Fit:
     values: Any = (1.0,)
     offsets: Any = (np.array([0.5]),)
     starts: Any = "starts"
+    polished: bool = False
 
 
 @pytest.mark.parametrize(("values", "polished"), [((1.0,), True), ((), False)])

@@ -31,6 +31,7 @@ class MadeUp:
     cost: float = 100.0
     ratio: float = 1.2
     polished: bool = False
+    std: Any = None
     errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
 
     @property
@@ -247,8 +248,10 @@ class Judged:
     reason: str
 
 
-@pytest.mark.parametrize(("windows", "wider"), [(16, True), (17, True), (16, False)])
-def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equals(monkeypatch, windows, wider):
+@pytest.mark.parametrize(
+    ("windows", "wider", "better"), [(16, True, True), (17, True, False), (16, False, False), (16, True, False)]
+)
+def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equals(monkeypatch, windows, wider, better):
     done, cfg = [], DiagnoseCfg(jobs=1)
     fits = [made(n, 0.5) for n in "abcde"]
     pairs: Any = [(c, Judged(c.name, True, "")) for c in fits]
@@ -262,11 +265,11 @@ def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equa
 
     def refine(_base, c, _runner, _cfg):
         done.append(("profile", c.name))
-        return replace(c, gain=c.gain + 0.1)
+        return replace(c, gain=c.gain + 0.1, std="known")
 
     def polish(_base, c, _search, *, thorough):
         done.append(("polish", c.name, thorough))
-        return c
+        return replace(c, cost=c.cost - 1.0, std=None) if better else c
 
     monkeypatch.setattr(grouping, "indistinguishable", indistinguishable)
     monkeypatch.setattr(grouping, "refine_by_profile", refine)
@@ -281,11 +284,12 @@ def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equa
     profiled = wider and windows == 16
     near = [("profile", n) for n in "abc"] if profiled else []
     size = 5 if wider else 2
+    again = [] if profiled and not better else [("profile", "a")]
     assert done == [
-        ("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True), ("profile", "a"),
+        ("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True), *again,
     ]  # fmt: skip
     assert [(f.name, f.accepted, f.reason) for _, f in group] == [("a", True, ""), ("b", True, "")]
-    assert group[0][0].gain == pytest.approx(0.7 if profiled else 0.6)
+    assert group[0][0].gain == pytest.approx(0.7 if profiled and better else 0.6)
 
 
 def point(distance: float, cost: float, rise: float = 0.0, parameter: int = 0) -> Any:

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,9 @@ from concent_warp.diagnosis.search.evidence import indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate, restart_candidate
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
 from concent_warp.diagnosis.search.grouping import group_indistinguishable
+from concent_warp.diagnosis.search.joint_fit import refit_jointly
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
-from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.search.screening import FIRST_RANKING, linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -213,3 +215,64 @@ def test_a_diagnosis_fits_with_its_own_settings():
     assert 6 <= base.blocks.count <= 7 < plain.blocks.count
     assert set(base.blocks.fold) == {0, 1, 2}
     np.testing.assert_allclose(base.windows[0].spread[0], plain.windows[0].spread[0] * 4 / 3)
+
+
+def test_screening_takes_over_what_the_baseline_knows(lacking):
+    own = replace(lacking, model=lacking.model.add(effect("armature")))
+    base = fit_baseline(own.model, own.windows, own.blocks, "mujoco")
+    offsets = base.fit.offsets
+    for name, same in (("joint_damping", True), ("joint_friction", False)):
+        assert effect(name).prepares is not same
+        whole, shared = base.solver(effect(name)), base.solver(effect(name))
+        values = whole.p.start
+        alone = whole.linearise(values, offsets)
+        known = shared.linearise(values, offsets, base.fit.linear, residual_known=same)
+        assert shared.p.simulated == pytest.approx(whole.p.simulated * (1 if same else 2) / 3)
+        for a, b, mine in zip(alone, known, base.fit.linear, strict=True):
+            assert b.jacobian[:, 0].tolist() == mine.jacobian[:, 0].tolist()
+            assert np.abs(a.residual - b.residual).max() < 1e-6
+            # The baseline's finite difference has a shorter step, adapted by its fit.
+            assert np.abs(a.jacobian - b.jacobian)[:, 0].max() < 0.1 * np.abs(a.jacobian).max()
+            assert b.jacobian[:, 1] == pytest.approx(a.jacobian[:, 1], abs=1e-4)
+
+
+def test_an_effect_of_measurement_is_screened_on_one_simulation(lacking):
+    latency = effect_class("latency")("angle")
+    solver, again = lacking.solver(latency), lacking.solver(latency)
+    known = solver.linearise(solver.p.start, lacking.fit.offsets, lacking.fit.linear, residual_known=True)
+    whole = again.linearise(again.p.start, lacking.fit.offsets)
+    assert solver.p.simulated == pytest.approx(again.p.simulated)
+    assert [piece.jacobian.tolist() for piece in known] == [piece.jacobian.tolist() for piece in whole]
+
+
+def test_sensitivities_at_the_measured_states_are_shared_by_all_candidates(lacking):
+    cfg = SearchCfg()
+    near = replace(lacking, fit=replace(lacking.fit, offsets=tuple(0.5 * np.ones(2) for _ in lacking.fit.offsets)))
+    assert linear_at_measured_states(near, cfg) == ()
+    offsets = tuple(np.array([0.5, 1.1]) for _ in lacking.fit.offsets)
+    far = replace(lacking, fit=replace(lacking.fit, offsets=offsets))
+    shared = linear_at_measured_states(far, cfg)
+    assert len(shared) == len(far.windows)
+    given, computed = screen(far, effect("joint_damping"), cfg, shared), screen(far, effect("joint_damping"), cfg)
+    assert given.linear_gain == computed.linear_gain
+
+
+def test_what_a_thorough_polish_ended_with_is_not_polished_again(lacking):
+    found = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    polished = polish_candidate(lacking, found, thorough=True)
+    assert polished.fit.polished
+    added = add_candidate(lacking, polished)
+    assert refit_jointly(added) is added
+    assert not polish_candidate(lacking, found).fit.polished
+
+
+def test_a_first_ranking_comes_from_the_screening_with_intervals(lacking):
+    screened = [screen(lacking, effect(name)) for name in NAMES]
+    text = ranking(lacking, screened, NAMES)
+    assert text.startswith(f"{FIRST_RANKING}, error expected to fall by: joint_damping ")
+    gain, low, high = map(int, re.findall(r"joint_damping (\d+) % \[(-?\d+), (-?\d+)\]", text)[0])
+    assert low <= gain <= high
+    assert gain == round(100 * screened[0].expected_gain)
+    assert text.index("joint_damping") < text.index("joint_friction")
+    scanned = replace(screened[2], scanned_gain=0.99)
+    assert ranking(lacking, [*screened[:2], scanned], NAMES).split(": ")[1].startswith("armature 99 %, joint_damping")

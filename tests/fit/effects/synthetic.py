@@ -70,6 +70,7 @@ class SyntheticPrediction:
     ) -> None:
         rng = np.random.default_rng(len(offsets))
         self.start = np.array(start, dtype=float)
+        self.prior_mean = self.start.copy()
         scales = (0.2, 0.3, 0.1)
         self.parameters = tuple(
             Parameter(name, "1", null, smallest, largest, scale)
