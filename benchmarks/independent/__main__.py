@@ -21,6 +21,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,11 @@ def wanted(case: DataSet, args: Args) -> bool:
 def run(chosen: Sequence[DataSet], args: Args) -> None:
     """Diagnose what is not done yet."""
     pending = [c for c in chosen if not path(args.out, c.name).is_file()]
+    if any(c.world == "drake" for c in pending) and find_spec("pydrake") is None:
+        raise SystemExit(
+            "independent benchmark: the world on Drake needs the package drake, which is not installed; install the"
+            " extra concent-warp[benchmarks], or leave that world out with --world mujoco"
+        )
     random.Random(0).shuffle(pending)  # what is done when it is stopped is a fair part of the whole
     done: dict[str, list[float]] = {}
     commit, begun = revision(), time.monotonic()

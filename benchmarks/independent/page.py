@@ -62,7 +62,7 @@ wrong by up to 1 %, also where nothing is hidden; noise is stated in half of the
 processor time; one that takes longer counts as wrong.
 
 A quarter of the effects x rigs, the rigs `grasp` and `insertion`, and half of the Drake data are locked by a rule on
-their names, fixed before any result: [split.json](../../benchmarks/independent/split.json).
+their names, fixed before any result: `benchmarks/independent/split.json`.
 
 *Exactly right*: the effects that are there and nothing else, each named alone or in a group of at most two. No effect
 counts for another one. Square brackets have Wilson's 95 % intervals.
