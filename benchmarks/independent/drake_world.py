@@ -80,7 +80,7 @@ SINGLES: dict[str, dict[str, Values]] = {
     "launch": {
         "sliding_friction": (0.36, 0.45),
         "gravity_tilt": (0.035, 0.08),
-        "length_scale": (0.03, 0.06),
+        "length_scale": (0.06, 0.1),
         "latency": (0.01, 0.025),
     },
     "bounce": {
@@ -88,7 +88,7 @@ SINGLES: dict[str, dict[str, Values]] = {
         "wind": (3.0, 6.0),
         "contact_compliance": (0.13, 0.2),
         "gravity_tilt": (0.035, 0.07),
-        "size": (1.1, 1.2),
+        "sliding_friction": (0.08, 0.12),
         "length_scale": (0.02, 0.045),
         "time_base": (0.012, 0.03),
     },
