@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -20,11 +21,31 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def work_progress(title: str) -> Iterator[Callable[[float, str], None]]:
-    """Show a bar; what is given is to be called with the share done, 0..1, and what is being done."""
+def work_progress(title: str, seconds: float | None = None) -> Iterator[Callable[[float, str], None]]:
+    """Show a bar; what is given is to be called with the share done, 0..1, and what is being done.
+
+    Args:
+        title: Of the bar.
+        seconds: Time after which the work ends at the latest [s].
+    """
     quiet_warp()
+    begun = time.monotonic()
     with status_bar(title) as update:
-        yield lambda share, text: update(share, text, None)
+        yield lambda share, text: update(share, text, time_left(share, time.monotonic() - begun, seconds))
+
+
+def time_left(share: float, spent: float, seconds: float | None) -> float | None:
+    """Return the time left [s] of work that ends after some seconds at the latest; None where it has no end.
+
+    Args:
+        share: Share that is done, 0..1.
+        spent: Time spent [s].
+        seconds: Time after which it ends [s].
+    """
+    if seconds is None:
+        return None
+    most = max(seconds - spent, 0.0)
+    return most if share <= 0 else min(most, spent * (1 - share) / share)
 
 
 def _number(value: float) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from concent_warp.cli import main
+from concent_warp.cli.fitted_effects import time_left
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -203,3 +204,11 @@ def test_a_time_ends_the_diagnosis_with_what_is_open(swing, capsys):
     assert document["verdict"] == "unsettled"
     assert "Open: whether any effect is missing." in document["unsettled"]
     assert diagnose(swing / "demo.h5", "--seconds", "0") == 2
+
+
+def test_the_time_left_ends_with_the_time_given():
+    assert time_left(0.5, 10.0, None) is None
+    assert time_left(0.5, 10.0, 60.0) == 10.0
+    assert time_left(0.1, 10.0, 60.0) == 50.0
+    assert time_left(0.0, 10.0, 60.0) == 50.0
+    assert time_left(0.5, 70.0, 60.0) == 0.0

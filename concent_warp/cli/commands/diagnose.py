@@ -128,7 +128,7 @@ def _diagnosed(arguments: Arguments, model: Model, recording: Recording) -> Diag
         seed=arguments.seed,
     )
     try:
-        with work_progress("diagnosing") as progress:
+        with work_progress("diagnosing", arguments.seconds) as progress:
 
             def show(share: float, text: str) -> None:
                 progress(share, f"{text}\n" if text.startswith(FIRST_RANKING) else text)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,6 +35,14 @@ class InitialStateCfg:
     """Multiple of a window's last fall of the cost that must suffice to reach its bound, or its fit ends [-]."""
     dampings: tuple[Positive, ...] = (1e-3, 3e-2, 3e-1, 3.0, 30.0)
     """Levenberg-Marquardt dampings that are tried in each iteration, relative to the curvature [-]."""
+    reliable_share: float = 0.9
+    """Share of the predicted fall of a window's cost that the step with the first damping must reach to be taken
+    without trying the others [-], where motion is smooth: the derivatives are then right to about a tenth."""
+    settled_fall: float = 0.01
+    """Predicted fall of a window's cost below which its initial state counts as found without another simulation, where
+    motion is smooth [cost]: a hundredth of the log likelihood's unit."""
+    settled_share: float = 1e-5
+    """The same in units of the window's cost, in addition [-]. Empirical."""
     first_step: Positive = 0.3
     """First step of a finite difference, in units of the state's spread [-]."""
     smallest_step: Positive = 0.003
@@ -66,6 +75,16 @@ class _FiniteDifferences:
     """The states tried, one a row, shape (2 nv, 2 nv)."""
     residuals: list[np.ndarray]
     """Their residuals, each (n,)."""
+
+
+@dataclass(frozen=True)
+class _PredictedStep:
+    """A step of one window's initial state."""
+
+    move: np.ndarray
+    """In units of the state's spread, shape (2 nv,)."""
+    fall: float
+    """Predicted fall of the window's cost."""
 
 
 class InitialStateSearch:
@@ -205,25 +224,40 @@ class InitialStateSearch:
         for _ in range(iterations):
             differences = self.finite_differences(values, offsets, residuals, remaining)
             limit = huber_limit(residuals, self.robust)
-            tried, rows, may_fade = [], [], []
-            for w, difference in zip(remaining, differences, strict=True):
-                there = [
-                    offsets[w] + start_step(residuals[w], difference.columns, offsets[w], limit, d, self.robust)
-                    for d in cfg.dampings
-                ]
+            costs_before = {w: start_cost(residuals[w], offsets[w], limit, self.robust) for w in remaining}
+            steps = [
+                self._step(residuals[w], difference.columns, offsets[w], limit)
+                for w, difference in zip(remaining, differences, strict=True)
+            ]
+            tried: list[list[np.ndarray]] = []
+            for w, difference, step in zip(remaining, differences, steps, strict=True):
+                there: list[np.ndarray] = []
                 if np.mean(residuals[w] ** 2) > outlying**2:
+                    there = self._damped(residuals[w], difference.columns, offsets[w], limit)
                     there += self._samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng)
+                elif not self.p.windows[w].smooth:
+                    there = self._damped(residuals[w], difference.columns, offsets[w], limit)
+                elif not self._is_settled(step, costs_before[w]):
+                    there = [offsets[w] + step.move]
                 tried.append(there)
-                rows += [SimulationRequest(w, values, o * self.p.windows[w].spread) for o in there]
-                may_fade += [bool(self.fading[w].all())] * len(there)
-            references = self.references(values, offsets, residuals, remaining)
-            (found, _), moving, at = residuals_near(self.p, references, rows, may_fade, cfg.fading), [], 0
+            found = self._residuals_at(values, offsets, residuals, remaining, tried)
+            # The other dampings, where the first one disappoints.
+            rest: list[list[np.ndarray]] = [[] for _ in remaining]
+            reliable = [False] * len(remaining)
+            for k, (w, difference) in enumerate(zip(remaining, differences, strict=True)):
+                if not self.p.windows[w].smooth or len(tried[k]) != 1:
+                    continue
+                fall = costs_before[w] - start_cost(found[k][0], tried[k][0], limit, self.robust)
+                reliable[k] = fall >= cfg.reliable_share * steps[k].fall
+                if not reliable[k]:
+                    rest[k] = self._damped(residuals[w], difference.columns, offsets[w], limit)[1:]
+            more = self._residuals_at(values, offsets, residuals, remaining, rest)
+            moving = []
             for k, (w, difference) in enumerate(zip(remaining, differences, strict=True)):
                 starts[w] = difference.columns
-                there = [*tried[k], *difference.offsets]
-                seen = [*found[at : at + len(tried[k])], *difference.residuals]
-                at += len(tried[k])
-                cost = start_cost(residuals[w], offsets[w], limit, self.robust)
+                there = [*tried[k], *rest[k], *difference.offsets]
+                seen = [*found[k], *more[k], *difference.residuals]
+                cost = costs_before[w]
                 costs = [start_cost(r, o, limit, self.robust) for r, o in zip(seen, there, strict=True)]
                 best = int(np.argmin(costs))
                 if costs[best] < cost:
@@ -231,6 +265,10 @@ class InitialStateSearch:
                 if costs[best] > (1 - cfg.min_fall) * cost:
                     aim[w] += 1 if np.mean(residuals[w] ** 2) > outlying**2 else len(cfg.target_changes)
                 short = min(costs[best], cost) - upper_bounds.get(w, np.inf)
+                if reliable[k]:
+                    step = self._step(residuals[w], difference.columns, offsets[w], limit)
+                    if self._is_settled(step, costs[best]):
+                        continue
                 if aim[w] < len(cfg.target_changes) and short <= cfg.max_expected_falls * max(cost - costs[best], 0.0):
                     moving.append(w)
                     change = np.sqrt(np.mean(difference.columns**2, axis=0))
@@ -240,6 +278,48 @@ class InitialStateSearch:
             remaining = moving
             if not remaining:
                 break
+
+    def _step(self, residual: np.ndarray, columns: np.ndarray, offset: np.ndarray, limit: float) -> _PredictedStep:
+        """Return the least damped step of a window, with the fall of the cost that its derivatives predict."""
+        move = start_step(residual, columns, offset, limit, self.cfg.dampings[0], self.robust)
+        after = start_cost(residual + columns @ move, offset + move, limit, self.robust)
+        return _PredictedStep(move, start_cost(residual, offset, limit, self.robust) - after)
+
+    def _is_settled(self, step: _PredictedStep, cost: float) -> bool:
+        """Return whether a step promises too little to be simulated in a window of smooth motion with some cost."""
+        return step.fall <= self.cfg.settled_fall + self.cfg.settled_share * cost
+
+    def _damped(self, residual: np.ndarray, columns: np.ndarray, offset: np.ndarray, limit: float) -> list[np.ndarray]:
+        """Return the initial states to which steps of each damping lead."""
+        return [offset + start_step(residual, columns, offset, limit, d, self.robust) for d in self.cfg.dampings]
+
+    def _residuals_at(
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        residuals: Sequence[np.ndarray],
+        windows: Sequence[int],
+        tried: Sequence[Sequence[np.ndarray]],
+    ) -> list[list[np.ndarray]]:
+        """Return the residuals of some windows at other initial states, a list for each window.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states of all windows.
+            residuals: Residuals of all windows there.
+            windows: Indices of the windows.
+            tried: Errors of the initial states to try, a list for each of them.
+        """
+        rows, may_fade = [], []
+        for w, there in zip(windows, tried, strict=True):
+            rows += [SimulationRequest(w, values, o * self.p.windows[w].spread) for o in there]
+            may_fade += [bool(self.fading[w].all())] * len(there)
+        if not rows:
+            return [[] for _ in tried]
+        references = self.references(values, offsets, residuals, windows)
+        found, _ = residuals_near(self.p, references, rows, may_fade, self.cfg.fading)
+        ends = np.cumsum([0, *(len(there) for there in tried)])
+        return [found[a:b] for a, b in pairwise(ends)]
 
     def _samples_about(
         self,

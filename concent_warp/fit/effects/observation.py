@@ -120,6 +120,8 @@ class Window:
     """Number of residuals."""
     clock: np.ndarray = field(repr=False)
     """Time in the demonstration that each residual belongs to [s], shape (count,)."""
+    smooth: bool = False
+    """Whether nothing touches anything in the model's motion, which then depends smoothly on the initial state."""
 
 
 def start_spread(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -122,7 +123,31 @@ def observe(
             start = end
     if not windows:
         raise RecordingError("nothing was measured that a model could be compared with", where=recording.source)
-    return windows
+    return [replace(w, smooth=True) for w in windows] if moves_untouched(model, windows, engine) else windows
+
+
+def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName) -> bool:
+    """Return whether nothing touches anything in the model's motion from the estimated state of each window on.
+
+    It is taken that something does where a body moves freely.
+    """
+    m = model.compile()
+    if (m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any():
+        return False
+    if not (m.geom_contype | m.geom_conaffinity).any():
+        return True
+    simulator = make_engine(engine, model)
+    for w in windows:
+        steps = max(int(np.ceil((w.end - w.start) / m.opt.timestep - 1e-9)), 1)
+        start = Variants(1, qpos=w.qpos[None], qvel=w.qvel[None])
+        try:
+            ctrl = commands(m, w.demonstration, steps, w.start)
+        except RecordingError:  # it has no commands; who simulates it says so
+            return False
+        rollout = simulator.run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
+        if rollout.diverged.any() or rollout.touched.any():
+            return False
+    return True
 
 
 def keeps_close(

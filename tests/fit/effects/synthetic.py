@@ -32,6 +32,7 @@ class SyntheticWindow:
     start: float = 0.0
     end: float = 1.0
     number: int = 0
+    smooth: bool = False
 
     @property
     def count(self) -> int:
@@ -86,7 +87,7 @@ class SyntheticPrediction:
             seen += noise * rng.normal(0, NOISE, count)
             seen[count // 3] += outlier * NOISE
             seen += impact * NOISE * self.jump(offset[0] * SPREAD[0]) * clock
-            self.windows.append(SyntheticWindow(clock, seen, SPREAD))
+            self.windows.append(SyntheticWindow(clock, seen, SPREAD, smooth=not impact))
 
     @staticmethod
     def jump(position: float) -> float:

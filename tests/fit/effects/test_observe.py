@@ -1,4 +1,6 @@
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -6,7 +8,7 @@ import pytest
 
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, start_spread
-from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
+from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, moves_untouched, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
@@ -120,3 +122,24 @@ def test_a_few_samples_are_too_little(count):
     few = {"angle": Channel(channel.time[:count], channel.value[:count], NOISE)} if count else {}
     with pytest.raises(RecordingError, match="too little was measured"):
         observe(drawing(recording), with_channels(recording, **few))
+
+
+TOUCHING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2"><joint type="slide" axis="0 0 1"/>
+<geom size=".05" {}/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("scene", "seconds", "untouched"),
+    [
+        (TOUCHING.format(""), 0.1, True),
+        (TOUCHING.format(""), 0.3, False),
+        (TOUCHING.format('contype="0" conaffinity="0"'), 0.3, True),
+        (TOUCHING.format("").replace('type="slide" axis="0 0 1"', 'type="free"'), 0.1, False),
+    ],
+)
+def test_motion_is_smooth_where_nothing_moves_freely_or_touches_anything(scene, seconds, untouched):
+    model = Model(Scene(scene))
+    m = model.compile()
+    d = Demonstration("demo", measured={})
+    window: Any = SimpleNamespace(demonstration=d, start=0.0, end=seconds, qpos=m.qpos0, qvel=np.zeros(m.nv))
+    assert moves_untouched(model, [window], "mujoco") is untouched
