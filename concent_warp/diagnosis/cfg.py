@@ -146,9 +146,10 @@ class UnknownForceCfg:
     """Most centres over the positions that a free body visits. Empirical."""
     min_gain: float = 0.03
     """Share of the held-out error that the force must remove [-]; it stays near 0.01 on data without one. Empirical."""
-    min_share: float = 0.01
-    """Share of the discrepancy of the first model that the force must explain [-]: the formula of an effect is right to
-    about a tenth, a hundredth in squares."""
+    min_share: float = 0.08
+    """Share of the discrepancy of the first model that the force must explain [-]; what explains less is an error of
+    the form of the effects that were added: outside a simulator formulas are right to about a quarter, a twelfth in
+    squares. Empirical."""
     expected_shares: tuple[PositiveShare, ...] = (0.02, 0.1, 0.5)
     """Shares of the error that the prior of the force expects, tried in turn [-]. Empirical."""
     force_scale: Positive = 0.1
@@ -166,9 +167,9 @@ class UnknownForceCfg:
 class TimeStepCfg:
     """Settings of the test for errors of the model's own time step."""
 
-    max_error: Positive = 0.2
-    """Error of the time step over the noise that is left after a division of the step [-]: in squares, a few percent
-    of what the noise itself leaves."""
+    max_error: Positive = 0.3
+    """Error of the time step over the noise that is left after a division of the step [-]: in squares, a tenth of what
+    the noise itself leaves."""
     max_division: Annotated[int, Bounds(1, 1000)] = 8
     """Most parts that a step is divided into; 1 leaves the model's time step as it is. The search takes as many times
     longer."""

@@ -8,7 +8,7 @@ made superfluous.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -48,7 +48,7 @@ from concent_warp.diagnosis.search.nominal_values import (
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
-from concent_warp.diagnosis.search.time_step import finer_time_step
+from concent_warp.diagnosis.search.time_step import finer_time_step, with_scene_of
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE, TOGETHER_SHARE, TimeBudget, in_words
@@ -110,7 +110,7 @@ class Procedure:
         given = self.baseline()
         with self.budget.until(SEARCH_SHARE):
             fitted, detectable = self.search(given)
-        fitted = self.final_values(self.remove_nominal(self.remove_superfluous(fitted)))
+        fitted = self.final_values(self.restore_given(given, self.remove_superfluous(fitted)))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
 
@@ -119,7 +119,7 @@ class Procedure:
         attempt, detectable, fitted = self.budget.attempt, (), [given]
         far = "Open: how far the model as given is off over short windows."
         if (coarse := attempt(lambda: self.coarse_baseline(given), None, far)) is not None:
-            found, detectable = self.add_effects([coarse], detectable)
+            found, detectable = self.add_effects([coarse], detectable, effects_alone=True)
             fitted = attempt(
                 lambda: self.carry_over(given, found),
                 [],
@@ -132,28 +132,27 @@ class Procedure:
         return fitted, detectable or smallest
 
     def add_effects(
-        self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
+        self, fitted: list[FittedModel], detectable: tuple[Detectable, ...], *, effects_alone: bool = False
     ) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the fitted models with one more for each effect that is added, and the detectable sizes of all.
 
         Args:
             fitted: The model as given and after earlier additions.
             detectable: Smallest detectable sizes as far as they are known.
+            effects_alone: Whether time step and nominal values stay as they are: over short windows the initial states
+                hide what they change.
         """
         cfg, runner, fitted = self.cfg, self.runner, list(fitted)
         while True:
             step = len(fitted) - 1
             if (step or nominal_effects(fitted[-1].model)) and not self._is_lacking(fitted[-1]):
                 break
-            finer = self._finer(fitted[-1])
+            finer = None if effects_alone else self._finer(fitted[-1])
             if finer is not None and not self._is_lacking(finer):
                 fitted = self._adopt(fitted, finer)
                 break
-            if (nominal := self._nominal(fitted[-1])) is not None:
-                both = None if finer is None else self._nominal(finer)
-                if both is not None and both.errors.sum() <= (1 + cfg.search.equal_error) * nominal.errors.sum():
-                    fitted, nominal = self._adopt(fitted, finer or nominal), both
-                fitted = [*fitted[:-1], nominal]
+            if not effects_alone and (found := self._with_nominal(fitted, finer)) is not None:
+                fitted = found
                 continue
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
@@ -195,6 +194,17 @@ class Procedure:
         unsettled = "Open: whether nominal values are off within their tolerance."
         return self.budget.attempt(lambda: with_nominal_values(one, self.cfg.nominal), None, unsettled)
 
+    def _with_nominal(self, fitted: list[FittedModel], finer: FittedModel | None) -> list[FittedModel] | None:
+        """Return the fitted models, the last with nominal values and, where that explains as much, a shorter time step.
+
+        It is None where nominal values explain nothing more.
+        """
+        plain, both = self._nominal(fitted[-1]), None if finer is None else self._nominal(finer)
+        limit = np.inf if plain is None else (1 + self.cfg.search.equal_error) * plain.errors.sum()
+        if finer is not None and both is not None and both.errors.sum() <= limit:
+            return [*self._adopt(fitted, finer)[:-1], both]
+        return None if plain is None else [*fitted[:-1], plain]
+
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
         """Return the fitted models with the last one replaced by that with a shorter time step."""
         self.time_step = time_step_finding(fitted[-1], finer, self.cfg.seed)
@@ -215,8 +225,6 @@ class Procedure:
             coarse: The model as given and after each addition, over short windows.
         """
         fitted = [base]
-        if coarse[0].model.scene != base.model.scene or nominal_effects(coarse[0].model):
-            fitted = [self._refitted(coarse[0].model, base.windows)]
         for step, one in enumerate(coarse[1:]):
             after = self._refitted(one.model, base.windows)
             if 1 - after.errors.sum() / max(fitted[-1].errors.sum(), 1e-12) < self.cfg.min_gain:
@@ -280,6 +288,8 @@ class Procedure:
         critical = float(np.quantile(null, 1 - cfg.significance_level))
         needed = max(critical, cfg.min_gain)
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
+        if not self._is_lacking(base):
+            return None, smallest
 
         def finding(c: FittedCandidate) -> Finding:
             return assess(base, c, null, step, effects, cfg)
@@ -370,17 +380,35 @@ class Procedure:
         self.groups = [group for group in self.groups if group]
         return fitted
 
-    def remove_nominal(self, fitted: list[FittedModel]) -> list[FittedModel]:
-        """Return the fitted models, the last with nominal values as given where fitted ones explain too little more."""
-        last = fitted[-1]
-        if not nominal_effects(last.model):
-            return fitted
-        self.runner.progress(self.runner.share, "removing nominal values")
-        unsettled = "Open: whether nominal values are needed beside the effects."
-        reduced = self.budget.attempt(lambda: without_nominal_values(last), None, unsettled)
-        if reduced is None or 1 - last.errors.sum() / max(reduced.errors.sum(), 1e-12) >= self.cfg.min_gain:
-            return fitted
-        return [*fitted[:-1], reduced]
+    def restore_given(self, given: FittedModel, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, the last with time step and nominal values as given where others explain no more.
+
+        Effects that were added later may have made them superfluous.
+        """
+        last, sentence = fitted[-1], "Open: whether {} beside the effects."
+        if self.time_step is not None:
+            self.runner.progress(self.runner.share, "restoring the time step")
+            refit = partial(with_scene_of, last, given)
+            restored = self._if_as_good(last, refit, sentence.format("a shorter time step is needed"))
+            self.time_step = None if restored is not last else self.time_step
+            last = restored
+        if nominal_effects(last.model):
+            self.runner.progress(self.runner.share, "restoring nominal values")
+            refit = partial(without_nominal_values, last)
+            last = self._if_as_good(last, refit, sentence.format("other nominal values are needed"))
+        return [*fitted[:-1], last]
+
+    def _if_as_good(self, last: FittedModel, refit: Callable[[], FittedModel], unsettled: str) -> FittedModel:
+        """Return a simpler fitted model if it explains nearly as much as the last one, else that.
+
+        Held-out errors come from linear steps, which bounds do not stop; so the costs are compared as well.
+        """
+        reduced = self.budget.attempt(refit, None, unsettled)
+        if reduced is None:
+            return last
+        pairs = ((last.errors.sum(), reduced.errors.sum()), (last.fit.cost, reduced.fit.cost))
+        needed = any(1 - less / max(more, 1e-12) >= self.cfg.min_gain for less, more in pairs)
+        return last if needed else reduced
 
     def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
@@ -430,7 +458,7 @@ class Procedure:
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > cfg.adequate_ratio else 0.0
         adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
         unknown = None
-        if adequate:
+        if adequate and any(f.accepted for f in self.findings):
             nodes = [given, *(fitted[1:] or fitted)]
             unknown = self.budget.attempt(
                 lambda: unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs)),
@@ -438,7 +466,8 @@ class Procedure:
                 "Open: whether a force of unknown form explains more.",
             )
         verdict: Verdict = "none_needed"
-        if not adequate or unknown is not None:
+        lacking = unknown is not None and not unknown.form_error
+        if not adequate or lacking:
             verdict = "none_of_these"
         elif len(fitted) > 1:
             verdict = "group" if any(len(group) > 1 for group in self.groups) else "effect"
@@ -453,7 +482,7 @@ class Procedure:
             effects=tuple(sorted(self.findings, key=lambda f: (not f.accepted, f.step, -f.gain))),
             groups=tuple(self.groups),
             where=where,
-            unexplained=unexplained if unknown is None else max(unexplained, unknown.share),
+            unexplained=max(unexplained, unknown.share) if unknown is not None and lacking else unexplained,
             ratio=(given.noise_ratio, *(one.noise_ratio for one in after)),
             detectable=detectable,
             next_experiment=experiment,

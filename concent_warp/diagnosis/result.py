@@ -100,11 +100,18 @@ class UnknownForceFound:
     instead: float | None = None
     """Share of the held-out error that the effect removes which was added instead [-]; None where the force acts beside
     all effects."""
+    form_error: bool = False
+    """Whether it explains so little of the discrepancy that it is an error of the form of the accepted effects."""
 
     @property
     def sentence(self) -> str:
         """A sentence on what the force explains."""
         words, gain = f"{self.words[0].upper()}{self.words[1:]}", 100 * self.gain
+        if self.form_error:
+            return (
+                f"{words} explains {100 * self.share:.1f} % of the discrepancy besides: no more than an error in the "
+                "formulas of the accepted effects."
+            )
         if self.instead is None:
             return f"{words} explains another {gain:.0f} % of the error."
         added = f"the effect that was added explains {100 * self.instead:.0f} %"
@@ -112,7 +119,14 @@ class UnknownForceFound:
 
     def to_json(self) -> dict[str, Any]:
         """Return the force in plain types."""
-        return {"words": self.words, "gain": self.gain, "p": self.p, "share": self.share, "instead": self.instead}
+        return {
+            "words": self.words,
+            "gain": self.gain,
+            "p": self.p,
+            "share": self.share,
+            "instead": self.instead,
+            "form_error": self.form_error,
+        }
 
 
 @dataclass(frozen=True)

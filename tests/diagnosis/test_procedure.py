@@ -257,6 +257,7 @@ def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monke
         ((3.0, 1.0), [("a",)], 0.3, "none_of_these", 0.3),
         ((3.0, 2.0), [("a",)], 0.3, "none_of_these", 3 / 8),
         ((1.0,), [], 0.3, "none_of_these", 0.3),
+        ((3.0, 1.0), [("a",)], -0.05, "effect", 0.0),
     ],
 )
 def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown, verdict, unexplained):
@@ -266,7 +267,8 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
         finding("late", 0.1, step=1), finding("no", 0.9, accepted=False), finding("first", 0.2),
         finding("less", 0.8, accepted=False), finding("later", 0.95, accepted=False, step=1),
     ]  # fmt: skip
-    force = None if unknown is None else SimpleNamespace(share=unknown)
+    # A share below zero stands for an error of form.
+    force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0)
     monkeypatch.setattr(module, "unknown_force", lambda nodes, _cfg, _results: force if len(nodes) else None)
     nodes = [node(r, name=str(r)) for r in ratios]
     found = made.conclude(nodes[0], nodes, ("size",), ["a gap"])

@@ -12,13 +12,15 @@ from concent_warp.diagnosis.search.baseline import fitted_model
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
+from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
 
 def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
-    It is None where none shows, or where they predict held-out data no better.
+    It is None where none shows, where they predict held-out data no better, or where one runs to its bound: then
+    something larger is missing.
 
     Args:
         base: The fitted model.
@@ -34,7 +36,11 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
     start = np.concatenate([solver.p.start[:nominal], base.fit.values])
     fit = solver.polish(solver.fit(start, base.fit.offsets, base.fit.starts))
     found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
-    return found if found.errors.sum() < base.errors.sum() else None
+    bounded = [
+        FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)
+    ]
+    better = found.errors.sum() < base.errors.sum() and not any(p.at_bound for p in bounded)
+    return found if better else None
 
 
 def nominal_effects(model: Model) -> list[int]:

@@ -45,6 +45,13 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     return found if _explains_more(base, found, cfg) else None
 
 
+def with_scene_of(last: FittedModel, given: FittedModel) -> FittedModel:
+    """Return a fitted model with the scene, and so the time step, of another, all parameters fitted again."""
+    solver = replace(last, model=replace(last.model, scene=given.model.scene)).solver()
+    fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
+    return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
+
+
 def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
     """Return what a shorter time step changes.
 

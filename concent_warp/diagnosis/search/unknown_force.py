@@ -50,16 +50,17 @@ def unknown_force(nodes: Sequence[FittedModel], cfg: DiagnoseCfg, results: Resul
     runs = all("mujoco" in added.effect.engines for added in last.model.effects)
     if not runs:
         return None
-    lacked = max(max(first.ratio, last.ratio) ** 2 - 1, min_gain)
-    if last.ratio**2 >= 1 + min_gain and (found := _best_force(last, None, lacked, cfg, results)) is not None:
-        return found
+    lacked, beside = max(max(first.ratio, last.ratio) ** 2 - 1, min_gain), None
+    if last.ratio**2 >= 1 + min_gain:
+        beside = _best_force(last, None, lacked, cfg, results)
     effects = [len(n.model.effects) for n in nodes]
-    if any(after <= before for before, after in pairwise(effects)):
-        return None  # effects were removed again, so that a residual before one is not what the last ones explain
+    if (beside is not None and not beside.form_error) or any(after <= before for before, after in pairwise(effects)):
+        return beside  # where effects were removed again, a residual before one is not what the last ones explain
     for before, after in reversed(list(pairwise(nodes[1:]))):
-        if (found := _best_force(before, after, lacked, cfg, results)) is not None:
+        found = _best_force(before, after, lacked, cfg, results)
+        if found is not None and not found.form_error:
             return found
-    return None
+    return beside
 
 
 def _best_force(
@@ -88,7 +89,7 @@ def _best_force(
     best = int(np.argmax(gains))
     more = gains[best] - instead
     share = more * base.ratio**2 / lacked
-    if more < settings.min_gain or share < settings.min_share:
+    if more < settings.min_gain:
         return None
     p = null_p_value(max_gain_under_null(base, tried, cfg.null_samples, cfg.seed), gains[best])
     if rival is not None:
@@ -98,7 +99,10 @@ def _best_force(
     # Several forces at once are named by the one that explains most by itself.
     force = tried[int(np.argmax(gains[: len(settings.expected_shares) * len(screened)]))].effect
     assert isinstance(force, UnknownForce)
-    return UnknownForceFound(force.words, gains[best], p, min(share, 1.0), None if rival is None else instead)
+    form_error = share < settings.min_share
+    return UnknownForceFound(
+        force.words, gains[best], p, min(share, 1.0), None if rival is None else instead, form_error=form_error
+    )
 
 
 def _held_out(base: FittedModel, s: ScreenedCandidate) -> np.ndarray:

@@ -398,13 +398,19 @@ def test_forces_are_tested_on_the_last_model_and_against_the_effects_added_befor
     assert unknown_force(nodes, cfg, ANY) is None
     assert asked == [(1.1, None, 8.0), (1.5, 1.1, 8.0), (2.0, 1.5, 8.0)]
     asked.clear()
-    answers = ["found"]
-    assert unknown_force(nodes, cfg, ANY) == "found"
-    assert len(asked) == 1
-    asked.clear()
-    answers = [None, "found"]
-    assert unknown_force(nodes, cfg, ANY) == "found"
-    assert len(asked) == 2
+    large, small = SimpleNamespace(form_error=False), SimpleNamespace(form_error=True)
+    for given, expected, count in (
+        ([large], large, 1),
+        ([None, large], large, 2),
+        ([small, large], large, 2),
+        ([small, None, None], small, 3),
+        ([small, small, small], small, 3),
+        ([None, small, small], None, 3),
+    ):
+        asked.clear()
+        answers[:] = given
+        assert unknown_force(nodes, cfg, ANY) is expected
+        assert len(asked) == count
     asked.clear()
     unknown_force(chain(1.01), cfg, ANY)
     assert asked == []
@@ -457,7 +463,10 @@ def test_the_best_force_must_be_large_and_significant(monkeypatch):
     half = _best_force(model, None, 4.0, cfg, results)
     assert half is not None
     assert half.share == pytest.approx(gain * model.ratio**2 / 4)
-    assert _best_force(model, None, 1e3, cfg, results) is None
+    assert not half.form_error
+    tiny = _best_force(model, None, 1e3, cfg, results)
+    assert tiny is not None
+    assert tiny.form_error
     assert _best_force(model, None, 1.0, replace(cfg, significance_level=1e-9), results) is None
     strict = replace(cfg, unknown_force=replace(cfg.unknown_force, min_gain=gain * 1.01))
     assert _best_force(model, None, 1.0, strict, results) is None

@@ -8,6 +8,7 @@ import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate
@@ -97,14 +98,20 @@ def test_a_force_that_depends_on_place_is_seen_behind_an_effect_that_took_up_par
     assert CFG.unknown_force.min_gain <= found.gain < 1 - 1 / partly[-1].ratio ** 2 + 0.1
 
 
-def test_the_verdict_then_is_none_of_these_and_says_so(partly):
-    recording = ridden(friction=FRICTION, force=bump)
-    said = Procedure(Model(Scene(rail())), recording, CFG).conclude(partly[0], partly, (), ())
-    assert said.verdict == "none_of_these"
+@pytest.mark.parametrize(("part", "verdict"), [(0.2, "none_of_these"), (1.0, "effect")])
+def test_a_force_that_explains_much_of_the_discrepancy_decides_the_verdict(part, verdict):
+    recording = ridden(friction=part * FRICTION, force=bump)
+    partly = nodes_of(recording, "joint_friction")
+    made = Procedure(Model(Scene(rail())), recording, CFG)
+    made.findings = [Finding("joint_friction", (), "", (), 0.9, 0.9, 0.9, 0.0, 0.0, True, 0, ())]
+    said = made.conclude(partly[0], partly, (), ())
+    assert said.verdict == verdict
     assert said.unknown_force is not None
-    assert said.unexplained >= said.unknown_force.share
+    assert said.unknown_force.form_error == (verdict == "effect")
     assert said.to_json()["unknown_force"]["gain"] == said.unknown_force.gain
-    assert any("depends on the position of rail explains another" in s for s in said.sentences())
+    expected = "no more than an error in the formulas" if verdict == "effect" else "explains another"
+    assert any("depends on the position of rail" in s and expected in s for s in said.sentences())
+    assert (said.unexplained > 0.1) == (verdict == "none_of_these")
 
 
 def test_a_force_that_beats_the_effect_which_was_added_is_seen(partly):
