@@ -94,6 +94,8 @@ class Procedure:
         self.noise_factors: dict[str, float] = {}
         self.time_step: FinerTimeStep | None = None
         self.nominal_values: tuple[FittedParameter, ...] = ()
+        self.provisional: int | None = None
+        """Index of an addition that stays only if it makes an earlier one superfluous."""
         self.budget = TimeBudget(cfg.seconds)
 
     def run(self) -> Diagnosis:
@@ -110,7 +112,7 @@ class Procedure:
         given = self.baseline()
         with self.budget.until(SEARCH_SHARE):
             fitted, detectable = self.search(given)
-        fitted = self.final_values(self.restore_given(given, self.remove_superfluous(fitted)))
+        fitted = self.final_values(self.restore_given(given, self.simplified(fitted)))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
 
@@ -142,11 +144,15 @@ class Procedure:
             effects_alone: Whether time step and nominal values stay as they are: over short windows the initial states
                 hide what they change.
         """
-        cfg, runner, fitted = self.cfg, self.runner, list(fitted)
+        cfg, runner, fitted, first = self.cfg, self.runner, list(fitted), fitted[0]
         while True:
             step = len(fitted) - 1
             if (step or nominal_effects(fitted[-1].model)) and not self._is_lacking(fitted[-1]):
                 break
+            if step and self._is_form_error(fitted[-1], first):
+                if step == 1 or self.provisional is not None:
+                    break
+                self.provisional = step
             finer = None if effects_alone else self._finer(fitted[-1])
             if finer is not None and not self._is_lacking(finer):
                 fitted = self._adopt(fitted, finer)
@@ -177,6 +183,14 @@ class Procedure:
     def _is_lacking(self, one: FittedModel) -> bool:
         """Return whether the residual beyond the noise is as much as an effect must remove."""
         return one.ratio**2 >= 1 + self.cfg.min_gain
+
+    def _is_form_error(self, one: FittedModel, first: FittedModel) -> bool:
+        """Return whether a model with added effects leaves no more than errors in their formulas.
+
+        It is then adequate, and little is left beside the discrepancy of the first model.
+        """
+        left, lacked = one.ratio**2 - 1, first.ratio**2 - 1
+        return left < self.cfg.unknown_force.min_share * lacked and is_adequate(one, self.noise_factors, self.cfg)
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
@@ -347,6 +361,19 @@ class Procedure:
             for f in sorted(rest, key=lambda f: -f.gain)
         ]
 
+    def simplified(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models without superfluous effects, and without one that takes up errors of formulas."""
+        found = self.remove_superfluous(fitted)
+        if len(found) > len(fitted) or self.provisional is None or len(fitted) <= self.provisional + 1:
+            return found
+        self.groups, self.hypotheses = self.groups[: self.provisional], self.hypotheses[: self.provisional]
+        reason = "explains no more than errors in the formulas of the others"
+        self.findings = [
+            replace(f, accepted=False, reason=reason) if f.accepted and f.step == self.provisional else f
+            for f in self.findings
+        ]
+        return found[: self.provisional + 1]
+
     def remove_superfluous(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, with one more for each effect that is removed since later ones made it superfluous.
 
@@ -364,7 +391,7 @@ class Procedure:
             refit = partial(lambda given: list(run_tasks(refit_without_effect, given, self.cfg.jobs)), tasks)
             if (reduced := self.budget.attempt(refit, None, unsettled)) is None:
                 break
-            shares = [1 - last.errors.sum() / max(one.errors.sum(), 1e-12) for one in reduced]
+            shares = [_gain_over(one, last) for one in reduced]
             least = int(np.argmin(shares))
             if shares[least] >= self.cfg.min_gain:
                 break
@@ -399,16 +426,9 @@ class Procedure:
         return [*fitted[:-1], last]
 
     def _if_as_good(self, last: FittedModel, refit: Callable[[], FittedModel], unsettled: str) -> FittedModel:
-        """Return a simpler fitted model if it explains nearly as much as the last one, else that.
-
-        Held-out errors come from linear steps, which bounds do not stop; so the costs are compared as well.
-        """
+        """Return a simpler fitted model if it explains nearly as much as the last one, else that."""
         reduced = self.budget.attempt(refit, None, unsettled)
-        if reduced is None:
-            return last
-        pairs = ((last.errors.sum(), reduced.errors.sum()), (last.fit.cost, reduced.fit.cost))
-        needed = any(1 - less / max(more, 1e-12) >= self.cfg.min_gain for less, more in pairs)
-        return last if needed else reduced
+        return last if reduced is None or _gain_over(reduced, last) >= self.cfg.min_gain else reduced
 
     def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
@@ -516,6 +536,15 @@ class Procedure:
                 offsets=given.fit.offsets,
             )
         )
+
+
+def _gain_over(reduced: FittedModel, last: FittedModel) -> float:
+    """Return the share of a simpler model's error that the last one removes: held out, or of its cost if that is more.
+
+    Held-out errors come from linear steps, which the bounds of the parameters do not stop.
+    """
+    pairs = ((last.errors.sum(), reduced.errors.sum()), (last.fit.cost, reduced.fit.cost))
+    return float(max(1 - less / max(more, 1e-12) for less, more in pairs))
 
 
 def _is_other(fitted: Sequence[FittedModel]) -> bool:

@@ -6,6 +6,7 @@ import pytest
 
 from concent_warp.cli import main
 from concent_warp.events.sequence import ContactEventSequence
+from concent_warp.examples import example
 from concent_warp.model import Model
 from concent_warp.recording.load import load_recording
 
@@ -156,13 +157,13 @@ def test_a_model_with_more_bodies_than_were_recorded_is_refused(bench, tmp_path,
         "add --list",
         "add --list --model inset.toml",
         "add joint_damping --model inset.toml --fit demo.h5 --demonstrations demo_0 -o {out}/damped.toml",
-        "diagnose demo.h5 --model inset.toml --effects joint_damping --jobs 1",
+        "diagnose {servo} --effects joint_friction joint_damping --jobs 1",
     ],
 )
 def test_tables_fit_80_columns(line, bench, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(bench)
     monkeypatch.delenv("COLUMNS", raising=False)
-    assert main(line.format(out=tmp_path).split()) == 0
+    assert main(line.format(out=tmp_path, servo=example("servo")).split()) == 0
     rows = [row for row in capsys.readouterr().out.splitlines() if set(row) & set("│┃━─")]
     assert rows
     assert max(map(len, rows)) <= 80

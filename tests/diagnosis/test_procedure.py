@@ -39,7 +39,7 @@ def node(ratio: float, errors: float = 1.0, effects: int = 0, name: str = "", sc
     window = SimpleNamespace(readings=[SimpleNamespace(channel="angle", rows=slice(0, 4))])
     return SimpleNamespace(
         ratio=ratio, noise_ratio=10 * ratio, errors=np.array([errors / 2] * 2), model=model, windows=[window],
-        fit=SimpleNamespace(offsets="o"), pieces=[piece], cfg=EffectSolverCfg(),
+        fit=SimpleNamespace(offsets="o", cost=errors), pieces=[piece], cfg=EffectSolverCfg(),
     )  # fmt: skip
 
 
@@ -55,8 +55,11 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
     for ratios, answers, count in (
         ((3.0, 2.0, 1.5, 1.2), 9, 4),
         ((3.0, 2.0), 1, 2),
-        ((3.0, 1.0246), 9, 2),
-        ((3.0, 1.0248, 1.0), 9, 3),
+        ((1.27, 1.0246), 9, 2),
+        ((1.27, 1.0248, 1.0), 9, 3),
+        ((3.0, 1.24, 1.0), 9, 2),  # adequate, and 7 % of the discrepancy is left
+        ((2.4, 1.24, 1.0), 9, 3),
+        ((5.0, 1.26, 1.0), 9, 3),
         ((1.0, 1.0), 9, 2),
     ):
         made, asked = procedure(), []
@@ -72,7 +75,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         monkeypatch.setattr(module, "finer_time_step", lambda *_: None)
         monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
         monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
-        monkeypatch.setattr(made, "remove_superfluous", lambda fitted: fitted)
+        monkeypatch.setattr(made, "simplified", lambda fitted: fitted)
         monkeypatch.setattr(made, "final_values", lambda fitted: fitted)
         monkeypatch.setattr(made, "conclude", lambda *args, concluded=concluded: concluded.append(args))
         made.run()
@@ -134,6 +137,39 @@ def test_the_answer_starts_with_the_model_as_given(monkeypatch):
     assert found.ratio == (30.0, 12.0, 10.0)
     assert found.models == (given.model, finer.model, added.model)
     assert procedure().conclude(given, [given], (), ()).ratio == (30.0,)
+
+
+def test_a_third_effect_of_an_adequate_model_stays_if_it_makes_another_superfluous(monkeypatch):
+    for errors, left in ((104.0, 5), (200.0, 3)):  # errors of the model without the first
+        made = procedure()
+        nodes = [node(50, effects=0), node(7, effects=1), node(1.15, effects=2), node(1.0, 100.0, effects=3)]
+        names, reduced = iter("abc"), node(1.0, errors, effects=2)
+
+        def find(_base, step, made=made, nodes=nodes, names=names):
+            name = next(names)
+            made.groups.append((name,))
+            made.hypotheses.append({})
+            made.findings.append(finding(name, 0.9, step=step))
+            return nodes[step + 1], ()
+
+        monkeypatch.setattr(made, "find_addition", find)
+        monkeypatch.setattr(module, "finer_time_step", lambda *_: None)
+        monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
+        monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
+        worse = node(9, 900.0, effects=2)
+
+        def refit(last, k, nodes=nodes, reduced=reduced, worse=worse):
+            return reduced if last is nodes[3] and not k else worse
+
+        monkeypatch.setattr(module, "refit_without_effect", refit)
+        fitted, _ = made.add_effects(nodes[:1], ())
+        assert fitted == nodes
+        after = made.simplified(fitted)
+        superfluous = errors < 105
+        assert after == ([*nodes, reduced] if superfluous else nodes[:3])
+        assert made.groups == ([("b",), ("c",)] if superfluous else [("a",), ("b",)])
+        assert [f.name for f in made.findings if f.accepted] == (["b", "c"] if superfluous else ["a", "b"])
+        assert len(after) == left
 
 
 def test_superfluous_effects_are_removed_the_least_needed_first(monkeypatch):

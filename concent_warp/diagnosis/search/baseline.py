@@ -10,7 +10,8 @@ import numpy as np
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
-from concent_warp.fit.effects.least_squares import Fit, Solver, projected
+from concent_warp.fit.effects.intervals import FittedParameter
+from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import huber_limit
@@ -74,7 +75,25 @@ def fitted_model(
 ) -> FittedModel:
     """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
     settings = cfg.least_squares
-    pieces = tuple(projected(fit, settings.robust))
+    pieces = tuple(_without_bounded(model, projected(fit, settings.robust)))
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
     errors = HeldOut(block_sums(pieces, blocks, limit), blocks, settings.prior).own()
     return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine, cfg)
+
+
+def _without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:
+    """Return sensitivities of 0 to nominal values at their bounds, beyond which no linear step may lead.
+
+    Args:
+        model: The fitted model.
+        pieces: Residuals and sensitivities by window.
+    """
+    if not any(added.effect.nominal for added in model.effects):
+        return pieces
+    plain, free = replace(model, effects=()).compile(), []
+    for added in model.effects:
+        for p, value in zip(added.effect.parameters(plain), added.values, strict=True):
+            free.append(not (added.effect.nominal and FittedParameter.within(p, value, 0.0).at_bound))
+    mask = np.ones(pieces[0].jacobian.shape[1])
+    mask[: len(free)] = free
+    return [replace(piece, jacobian=piece.jacobian * mask) for piece in pieces]
