@@ -112,7 +112,7 @@ def _misread(demonstration: Demonstration, effects: Sequence[HiddenEffect]) -> D
     for effect in effects:
         if effect.measure is not None:
             for name, channel in measured.items():
-                gone = np.isnan(channel.value).any(axis=1)
+                gone = np.asarray(np.isnan(channel.value).any(axis=1))
                 value = channel.value.copy()
                 value[gone] = [1.0, 0, 0, 0] if value.shape[1] == 4 else 0.0
                 time, value = effect.measure(name, channel.time, value)

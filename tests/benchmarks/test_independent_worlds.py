@@ -110,12 +110,12 @@ def test_tolerances_are_within_a_hundredth_and_differ_between_seeds(script):
         rigs.draw_tolerances(spec, seed)
         worlds.append(spec.compile())
     m = nominal.model
+    block = m.body("block").id
     for world in worlds:
         for field in ("body_mass", "geom_size", "actuator_gainprm"):
             a, b = getattr(m, field), getattr(world, field)
             ratio = b[a > 0] / a[a > 0]
             assert np.abs(ratio - 1).max() <= 0.01 + 1e-9
-        block = m.body("block").id
         assert world.body_mass[block] != m.body_mass[block]
         size = 2 * (world.geom_size[m.body_geomadr[block]] - m.geom_size[m.body_geomadr[block]])
         assert 0 < np.abs(size).max() <= 3e-4
