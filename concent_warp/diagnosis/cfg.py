@@ -180,11 +180,11 @@ class NominalCfg:
     """Settings of the fit of nominal values within their tolerance, see `concent_warp.effects.library.nominal`."""
 
     enabled: bool = True
-    """Whether masses, lengths and gains may differ from their nominal values within the tolerance."""
+    """Whether masses, lengths, gains and latencies may differ from their nominal values within the tolerance."""
     min_change: Positive = 0.1
     """Change of the predictions within the tolerance from which on a value is fitted: RMS over the noise, initial
     states fitted [-]. In squares, 1 % of what the noise itself leaves."""
-    max_values: Count = 8
+    max_values: Count = 16
     """Most values that are fitted, the most visible ones. Empirical."""
 
 

@@ -48,7 +48,7 @@ from concent_warp.diagnosis.search.nominal_values import (
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
-from concent_warp.diagnosis.search.time_step import finer_time_step, with_scene_of
+from concent_warp.diagnosis.search.time_step import at_given_step, finer_time_step, renew_defects
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE, TOGETHER_SHARE, TimeBudget, in_words
@@ -112,7 +112,7 @@ class Procedure:
         given = self.baseline()
         with self.budget.until(SEARCH_SHARE):
             fitted, detectable = self.search(given)
-        fitted = self.final_values(self.restore_given(given, self.simplified(fitted)))
+        fitted = self.final_values(self.restore_given(self.simplified(fitted)))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
 
@@ -177,7 +177,7 @@ class Procedure:
                 continue
             if best is None:
                 break
-            fitted.append(add_candidate(fitted[-1], best))
+            fitted.append(renew_defects(add_candidate(fitted[-1], best)))
         return fitted, detectable
 
     def _is_lacking(self, one: FittedModel) -> bool:
@@ -213,10 +213,9 @@ class Procedure:
 
         It is None where nominal values explain nothing more.
         """
-        plain, both = self._nominal(fitted[-1]), None if finer is None else self._nominal(finer)
-        limit = np.inf if plain is None else (1 + self.cfg.search.equal_error) * plain.errors.sum()
-        if finer is not None and both is not None and both.errors.sum() <= limit:
+        if finer is not None and (both := self._nominal(finer)) is not None:
             return [*self._adopt(fitted, finer)[:-1], both]
+        plain = self._nominal(fitted[-1])
         return None if plain is None else [*fitted[:-1], plain]
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
@@ -407,7 +406,7 @@ class Procedure:
         self.groups = [group for group in self.groups if group]
         return fitted
 
-    def restore_given(self, given: FittedModel, fitted: list[FittedModel]) -> list[FittedModel]:
+    def restore_given(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with time step and nominal values as given where others explain no more.
 
         Effects that were added later may have made them superfluous.
@@ -415,7 +414,7 @@ class Procedure:
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if self.time_step is not None:
             self.runner.progress(self.runner.share, "restoring the time step")
-            refit = partial(with_scene_of, last, given)
+            refit = partial(at_given_step, last)
             restored = self._if_as_good(last, refit, sentence.format("a shorter time step is needed"))
             self.time_step = None if restored is not last else self.time_step
             last = restored
@@ -441,7 +440,7 @@ class Procedure:
         self.runner.progress(self.runner.share, "fitting all effects together")
         attempt = self.budget.attempt
         unsettled = "Not refitted: all effects together."
-        last = attempt(lambda: refit_jointly(fitted[-1]), fitted[-1], unsettled, TOGETHER_SHARE)
+        last = attempt(lambda: renew_defects(refit_jointly(fitted[-1])), fitted[-1], unsettled, TOGETHER_SHARE)
         owned = len(last.model.effects) - len(accepted)
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         parameters = joint_parameters(last, widening)
@@ -507,7 +506,7 @@ class Procedure:
             detectable=detectable,
             next_experiment=experiment,
             issues=tuple(issues),
-            models=(given.model, *(one.model for one in after)),
+            models=(given.model, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
             time_step=self.time_step,
@@ -549,5 +548,5 @@ def _gain_over(reduced: FittedModel, last: FittedModel) -> float:
 
 def _is_other(fitted: Sequence[FittedModel]) -> bool:
     """Return whether the last of some fitted models has another time step, or other nominal values, than the first."""
-    first, last = fitted[0].model, fitted[-1].model
-    return first.scene != last.scene or len(nominal_effects(first)) != len(nominal_effects(last))
+    first, last = fitted[0], fitted[-1]
+    return first.timestep != last.timestep or len(nominal_effects(first.model)) != len(nominal_effects(last.model))

@@ -56,6 +56,8 @@ NOMINAL: tuple[type[Effect], ...] = (
     nominal.NominalLength,
     nominal.NominalSize,
     nominal.NominalGain,
+    nominal.NominalVelocityGain,
+    nominal.NominalLatency,
 )
 """Nominal values within their tolerance, which a model may have and no diagnosis calls missing."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,6 +46,19 @@ class FittedModel:
     def noise_ratio(self) -> float:
         """Root mean square residual over the noise [-], "x noise"."""
         return noise_ratio(np.concatenate([piece.residual for piece in self.pieces]))
+
+    @property
+    def timestep(self) -> float:
+        """Time step of the predictions, or that for which their defects correct them [s]."""
+        defect = self.windows[0].defect
+        return float(self.model.scene.model.opt.timestep) if defect is None else defect.timestep
+
+    @property
+    def delivered(self) -> Model:
+        """The model as it is handed out: with the time step for which defects correct its predictions."""
+        if self.windows[0].defect is None:
+            return self.model
+        return replace(self.model, scene=self.model.scene.with_timestep(self.timestep))
 
     def prediction(self, *effects: Effect, windows: Sequence[Window] = ()) -> Prediction:
         """Return the prediction of the model with some more effects, for its own windows or others."""

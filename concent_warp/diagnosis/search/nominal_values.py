@@ -34,7 +34,8 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
     solver = replace(base, model=replace(base.model, effects=(*added, *base.model.effects))).solver()
     nominal = len(solver.p.start) - len(base.fit.values)
     start = np.concatenate([solver.p.start[:nominal], base.fit.values])
-    fit = solver.polish(solver.fit(start, base.fit.offsets, base.fit.starts))
+    # Within the tolerance residuals are in proportion to the values: no polish is needed.
+    fit = solver.fit(start, base.fit.offsets, base.fit.starts)
     found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
     bounded = [
         FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)

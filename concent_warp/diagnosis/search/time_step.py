@@ -20,11 +20,14 @@ from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.screening import robust_sum
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
+from concent_warp.fit.effects.observation import TimeStepDefect
 from concent_warp.fit.effects.robust import cauchy_weight
 
 
 def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     """Return a fitted model with a shorter time step where that explains significantly more, else None.
+
+    Its simulations keep the step as given; what the shorter one changes is added, see `TimeStepDefect`.
 
     Args:
         base: The fitted model.
@@ -33,23 +36,31 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     division = _division(base, cfg.time_step)
     if division < 2:
         return None
-    finer = _with_time_step(base, base.model.scene.model.opt.timestep / division)
+    finer = _with_defects(base, base.model.scene.model.opt.timestep / division)
     before = robust_sum(base, [piece.residual for piece in base.pieces])
     promised = 1 - robust_sum(base, _without_own(base, _projected(base, _residuals(finer)))) / max(before, 1e-12)
     if promised < cfg.search.min_expected_gain * cfg.min_gain:
         return None
-    solver = finer.solver()
-    fit = solver.fit(offsets=base.fit.offsets, starts=base.fit.starts)
-    fit = solver.improve_initial_states(fit, []) if not len(fit.values) else solver.polish(fit)
-    found = fitted_model(solver.p.model(fit.values), base.windows, base.blocks, fit, base.engine, base.cfg)
+    found = renew_defects(_refitted(finer))
     return found if _explains_more(base, found, cfg) else None
 
 
-def with_scene_of(last: FittedModel, given: FittedModel) -> FittedModel:
-    """Return a fitted model with the scene, and so the time step, of another, all parameters fitted again."""
-    solver = replace(last, model=replace(last.model, scene=given.model.scene)).solver()
+def renew_defects(one: FittedModel) -> FittedModel:
+    """Return a fitted model with a shorter time step with the defects of its own motion, fitted again.
+
+    Without a shorter time step it is returned as it is.
+    """
+    if one.windows[0].defect is None:
+        return one
+    return _refitted(_with_defects(one, one.timestep))
+
+
+def at_given_step(last: FittedModel) -> FittedModel:
+    """Return a fitted model with the time step as given, all parameters fitted again."""
+    plain = _without_defects(last)
+    solver = plain.solver()
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
-    return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
+    return fitted_model(solver.p.model(fit.values), plain.windows, last.blocks, fit, last.engine, last.cfg)
 
 
 def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
@@ -64,13 +75,33 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, np.random.default_rng(seed))
     change = [a - b for a, b in zip(_residuals(finer), _residuals(base), strict=True)]
     return FinerTimeStep(
-        given=float(base.model.scene.model.opt.timestep),
-        used=float(finer.model.scene.model.opt.timestep),
+        given=base.timestep,
+        used=finer.timestep,
         change=noise_ratio(np.concatenate(_projected(base, change))),
         gain=float(gain.sum() / max(base.errors.sum(), 1e-12)),
         low=low,
         high=high,
     )
+
+
+def _without_defects(one: FittedModel) -> FittedModel:
+    """Return a model whose predictions are those of its own time step."""
+    return replace(one, windows=tuple(replace(w, defect=None) for w in one.windows))
+
+
+def _with_defects(one: FittedModel, timestep: float) -> FittedModel:
+    """Return a model with the defects of its motion against a shorter time step [s]; not fitted again."""
+    plain = _without_defects(one)
+    pairs = zip(plain.windows, _residuals(_with_time_step(plain, timestep)), _residuals(plain), strict=True)
+    return replace(one, windows=tuple(replace(w, defect=TimeStepDefect(timestep, a - b)) for w, a, b in pairs))
+
+
+def _refitted(one: FittedModel) -> FittedModel:
+    """Return a model fitted again from where it is."""
+    solver = one.solver()
+    fit = solver.fit(one.fit.values, one.fit.offsets, one.fit.starts)
+    fit = solver.improve_initial_states(fit, [])
+    return fitted_model(solver.p.model(fit.values), one.windows, one.blocks, fit, one.engine, one.cfg)
 
 
 def _explains_more(base: FittedModel, finer: FittedModel, cfg: DiagnoseCfg) -> bool:

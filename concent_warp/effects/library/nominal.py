@@ -1,7 +1,8 @@
-"""Nominal values of a model within their tolerance: masses, lengths and gains that are known to about one percent.
+"""Nominal values of a model within their tolerance: masses, lengths, gains and the clocks of instruments.
 
-They are no effects that a model lacks: data sheets and rulers are no better. A diagnosis fits them before it looks for
-an effect, each with a normal prior about the nominal value, so that small errors of several are not taken for one.
+They are no effects that a model lacks: data sheets, rulers and time stamps are no better. A diagnosis fits them before
+it looks for an effect, each with a normal prior about the nominal value, so that small errors of several are not taken
+for one.
 """
 
 from __future__ import annotations
@@ -9,13 +10,17 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.effects.effect import Effect, Parameter
+from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.library.drives import ActuatorGain
+from concent_warp.effects.library.measurement import MeasurementEffect
 from concent_warp.effects.library.objects import Size
 from concent_warp.effects.select import element_name, free_bodies
 
 TOLERANCE = 0.01
 """Standard deviation of a nominal value over the value [-]: what scales, rulers and data sheets state as a rule."""
+CLOCK_TOLERANCE = 5e-4
+"""Standard deviation of a channel's latency [s]: stamps are given when a bus is polled, at 1 kHz as a rule (a frame of
+USB 2.0 takes 1 ms)."""
 BOUND = 2.0
 """Bounds, in standard deviations: 95 % of a normal distribution."""
 PRIOR_SCALES = 10.0
@@ -134,3 +139,57 @@ class NominalGain(ActuatorGain):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor an actuator."""
         return nominal_parameters("gain", self.target)
+
+
+class NominalVelocityGain(ActuatorGain):
+    """Gains of velocity feedback within their tolerance."""
+
+    name = "nominal_velocity_gain"
+    nominal = True
+    summary = "The drive's velocity feedback is the model's times a factor within the tolerance of nominal values."
+    confusions = ("joint_damping", "latency")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return the actuators with velocity feedback."""
+        fed_back = {m.actuator(a).name for a in range(m.nu) if m.actuator_biasprm[a, 2]}
+        found = tuple(n for names in super().targets(m) for n in names if n in fed_back)
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one factor an actuator."""
+        return nominal_parameters("velocity_gain", self.target)
+
+    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
+        """Bias."""
+        return ("actuator_biasprm",)
+
+    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
+        """Scale the velocity feedback."""
+        m.actuator_biasprm[self.ids(m), 2] *= values
+
+
+class NominalLatency(MeasurementEffect):
+    """Latencies of channels within the tolerance of clocks, each by itself."""
+
+    name = "nominal_latency"
+    nominal = True
+    summary = "What a channel stamps t was seen at t - delay, with a delay within the tolerance of clocks."
+    signature = "residuals in proportion to velocity, at the same delay in all phases"
+    confusions = ("latency", "actuator_delay")
+
+    @classmethod
+    def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
+        """Return all sensors of poses and joints together."""
+        found = tuple(n for group in super().targets(m) for n in group)
+        return (found,) if found else ()
+
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
+        """Return one delay a sensor."""
+        bound, scale = BOUND * CLOCK_TOLERANCE, CLOCK_TOLERANCE / PRIOR_SCALES
+        return tuple(Parameter(f"delay[{t}]", "s", 0.0, -bound, bound, scale) for t in self.target)
+
+    def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
+        """Read earlier."""
+        delays = dict(zip(self.target, map(float, values), strict=True))
+        return lambda sensor, time: read(sensor, time - delays.get(sensor, 0.0))

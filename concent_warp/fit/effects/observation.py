@@ -100,6 +100,20 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class TimeStepDefect:
+    """What a shorter time step changes in a window's predictions, at some values and initial state.
+
+    Added to the predictions with the model's own step (defect correction: Stetter, "The defect correction principle and
+    discretization methods", Numerische Mathematik 29, 1978), it stands for simulations with the shorter one.
+    """
+
+    timestep: float
+    """The shorter time step [s]."""
+    residual: np.ndarray = field(repr=False)
+    """Residuals with the shorter step less those with the model's own, in units of noise, shape (count,)."""
+
+
+@dataclass(frozen=True)
 class Window:
     """A span of a demonstration that is simulated in one go."""
 
@@ -122,6 +136,8 @@ class Window:
     """Time in the demonstration that each residual belongs to [s], shape (count,)."""
     smooth: bool = False
     """Whether nothing touches anything in the model's motion, which then depends smoothly on the initial state."""
+    defect: TimeStepDefect | None = None
+    """Correction of the predictions for a time step that is too long; None for none."""
 
 
 def start_spread(

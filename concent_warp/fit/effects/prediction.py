@@ -253,7 +253,7 @@ class Prediction:
             predicted = read(r.channel, r.time + w.start)
             value = turn(predicted, r.value) if r.orientation else r.value - predicted
             residual[r.rows] = r.residuals(np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most))
-        return np.clip(residual, -most, most)
+        return np.clip(residual if w.defect is None else residual + w.defect.residual, -most, most)
 
     def residuals(self, trials: Sequence[SimulationRequest]) -> list[np.ndarray]:
         """Return the residuals of each trial, see `observed`."""
