@@ -186,6 +186,9 @@ class NominalCfg:
     states fitted [-]. In squares, 1 % of what the noise itself leaves."""
     max_values: Count = 16
     """Most values that are fitted, the most visible ones. Empirical."""
+    bounded_ratio: Positive = 1.1
+    """Noise ratio up to which a fit with values at their bounds counts [-]; where more is left, something larger than a
+    tolerance is missing. That of `SearchCfg.explained_ratio`."""
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class CandidateFits:
         self._polish_near(best, expected)
         expected = np.maximum(expected, [c.share(self.base) for c in self.fits])
         self.refit_rivals(expected)
-        if self._best().ratio > self.cfg.adequate_ratio:
+        if self._best().ratio > self.cfg.adequate_ratio and self._left() > self.cfg.unknown_force.min_share:
             self._initialise_by_multiple_shooting(short_windows)
         return self.fits
 
@@ -115,6 +115,10 @@ class CandidateFits:
     def _best(self) -> FittedCandidate:
         """Return the fit that removes most of the baseline's error."""
         return max(self.fits, key=lambda c: c.share(self.base))
+
+    def _left(self) -> float:
+        """Return the share of the baseline's squared residual beyond the noise that the best fit leaves [-]."""
+        return (self._best().ratio ** 2 - 1) / max(self.base.ratio**2 - 1, 1e-9)
 
     def _refit(self, chosen: Sequence[int], task: Callable[..., FittedCandidate], text: str, *settings: Any) -> None:
         """Replace some fits by what a task makes of each."""

@@ -19,8 +19,8 @@ from concent_warp.model import Model
 def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
-    It is None where none shows, where they predict held-out data no better, or where one runs to its bound: then
-    something larger is missing.
+    It is None where none shows, where they predict held-out data no better, or where one runs to its bound and more
+    than noise is left: then something larger is missing.
 
     Args:
         base: The fitted model.
@@ -40,8 +40,8 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
     bounded = [
         FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)
     ]
-    better = found.errors.sum() < base.errors.sum() and not any(p.at_bound for p in bounded)
-    return found if better else None
+    inside = found.ratio <= cfg.bounded_ratio or not any(p.at_bound for p in bounded)
+    return found if inside and found.errors.sum() < base.errors.sum() else None
 
 
 def nominal_effects(model: Model) -> list[int]:
@@ -54,7 +54,7 @@ def without_nominal_values(last: FittedModel) -> FittedModel:
     dropped = nominal_effects(last.model)
     effects = tuple(a for i, a in enumerate(last.model.effects) if i not in dropped)
     solver = replace(last, model=replace(last.model, effects=effects)).solver()
-    fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
+    fit = solver.fit(offsets=last.fit.offsets, starts=last.fit.starts)
     return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
 
 

@@ -59,7 +59,7 @@ def at_given_step(last: FittedModel) -> FittedModel:
     """Return a fitted model with the time step as given, all parameters fitted again."""
     plain = _without_defects(last)
     solver = plain.solver()
-    fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
+    fit = solver.fit(offsets=last.fit.offsets, starts=last.fit.starts)
     return fitted_model(solver.p.model(fit.values), plain.windows, last.blocks, fit, last.engine, last.cfg)
 
 

@@ -174,6 +174,8 @@ class Solver:
         cfg = self.cfg
         if len(self.p.windows) > cfg.max_polished_windows:
             return self._polish_by_sample(fit, thorough=thorough, stuck=stuck)
+        if all(w.smooth for w in self.p.windows):
+            return self._polish_smooth(fit, thorough=thorough)
         measured, best = [np.zeros_like(o) for o in fit.offsets], fit
         if not stuck:
             fresh = self.improve_initial_states(fit, [measured])
@@ -198,6 +200,21 @@ class Solver:
             if found.cost > (1 - min_gain) * best.cost:
                 return replace(best, polished=thorough)
             best = found
+        return best
+
+    def _polish_smooth(self, fit: Fit, *, thorough: bool) -> Fit:
+        """Return a fit continued with new derivatives by the initial states, for as long as that lowers the cost.
+
+        Where nothing touches anything, these change little with the parameters, and all converge together.
+        """
+        min_gain, best = self.cfg.min_thorough_gain if thorough else self.cfg.min_gain, fit
+        for _ in range(self.cfg.polish_steps):
+            there = self.improve_initial_states(best, [])
+            if len(fit.values):
+                there = self.fit(there.values, there.offsets, there.starts, refits=0)
+            if there.cost > (1 - min_gain) * best.cost:
+                return replace(min(best, there, key=lambda f: f.cost), polished=thorough)
+            best = there
         return best
 
     def _promising_windows(self, fit: Fit, values: np.ndarray) -> list[int]:
