@@ -145,7 +145,10 @@ class CandidateFits:
                 else:
                     fitted.append(s)
                     self.fits.append(c)
-            if self.fits and (least := min(c.ratio for c in self.fits)) < search.explained_ratio:
+            if not self.fits:
+                continue
+            least = min(c.ratio for c in self.fits)
+            if least < search.explained_ratio or self._left() < self.cfg.unknown_force.min_share:
                 best = max(c.share(base) for c in self.fits)
                 at_noise = least < search.noise_level_ratio
                 needed = search.noise_level_min_gain if at_noise else search.explained_min_gain
@@ -183,6 +186,7 @@ class CandidateFits:
             and c.ratio > search.noise_level_ratio
             and not (restarted and c.share(self.base) > search.close_min_gain * gain)
         ]
+        chosen = sorted(chosen, key=lambda k: -expected[k])[: search.rivals]
         self._refit(chosen, polish_candidate, "refining initial states", search)
 
     def _initialise_by_multiple_shooting(self, short_windows: Callable[[], Sequence[Window]]) -> None:

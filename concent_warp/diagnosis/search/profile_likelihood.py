@@ -72,7 +72,11 @@ def profile_point(
     values = solver.inside(c.fit.values + move * solver.scale)
     windows = range(len(base.windows))
     offsets, starts, residuals = solver.search.refined(
-        values, solver.first_order_offsets(c.fit, move), windows, cfg.state_iterations
+        values,
+        solver.first_order_offsets(c.fit, move),
+        windows,
+        cfg.state_iterations,
+        known=dict(enumerate(c.fit.starts)),
     )
     expected = 0.5 * float(move @ c.sums.normal.sum(axis=0) @ move)
     cost = solver.cost(residuals, offsets, values)

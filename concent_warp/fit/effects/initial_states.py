@@ -150,6 +150,7 @@ class InitialStateSearch:
         windows: Sequence[int],
         iterations: int,
         upper_bounds: Mapping[int, float] | None = None,
+        known: Mapping[int, np.ndarray] | None = None,
     ) -> tuple[list[np.ndarray], dict[int, np.ndarray], list[np.ndarray]]:
         """Fit the initial states of some windows; returns all states, the derivatives of those, and all residuals.
 
@@ -160,10 +161,12 @@ class InitialStateSearch:
             iterations: Most computations of the derivatives with respect to the initial states.
             upper_bounds: Costs by window to fall below; the fit of a window ends where the falls of its cost do not
                 suffice for it, see `InitialStateCfg.max_expected_falls`.
+            known: Derivatives by window from a point nearby, which serve for as long as steps along them lower the cost
+                as they predict.
         """
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
-        self._iterate(values, offsets, residuals, starts, windows, iterations, rng, upper_bounds or {})
+        self._iterate(values, offsets, residuals, starts, windows, iterations, rng, upper_bounds or {}, known)
         size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
         outlying = (
             [w for w in windows if size[w] > self.cfg.outlier_ratio * max(1.0, float(np.median(size)))]
@@ -216,13 +219,14 @@ class InitialStateSearch:
         iterations: int,
         rng: np.random.Generator,
         upper_bounds: Mapping[int, float],
+        known: Mapping[int, np.ndarray] | None = None,
     ) -> None:
         """Iterate the initial states of some windows until no step lowers their cost; changes its arguments."""
-        cfg = self.cfg
+        cfg, known = self.cfg, dict(known or {})
         remaining, aim = list(windows), [0] * len(offsets)
         outlying = cfg.outlier_ratio * max(1.0, float(np.median([np.sqrt(np.mean(r**2)) for r in residuals])))
         for _ in range(iterations):
-            differences = self.finite_differences(values, offsets, residuals, remaining)
+            differences = self._differences(values, offsets, residuals, remaining, known)
             limit = huber_limit(residuals, self.robust)
             costs_before = {w: start_cost(residuals[w], offsets[w], limit, self.robust) for w in remaining}
             steps = [
@@ -232,7 +236,10 @@ class InitialStateSearch:
             tried: list[list[np.ndarray]] = []
             for w, difference, step in zip(remaining, differences, steps, strict=True):
                 there: list[np.ndarray] = []
-                if np.mean(residuals[w] ** 2) > outlying**2:
+                if w in known:
+                    if not self._is_negligible(step, costs_before[w]):
+                        there = self._damped(residuals[w], difference.columns, offsets[w], limit)[::2]
+                elif np.mean(residuals[w] ** 2) > outlying**2:
                     there = self._damped(residuals[w], difference.columns, offsets[w], limit)
                     there += self._samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng)
                 elif not self.p.windows[w].smooth:
@@ -245,7 +252,7 @@ class InitialStateSearch:
             rest: list[list[np.ndarray]] = [[] for _ in remaining]
             reliable = [False] * len(remaining)
             for k, (w, difference) in enumerate(zip(remaining, differences, strict=True)):
-                if not self.p.windows[w].smooth or len(tried[k]) != 1:
+                if w in known or not self.p.windows[w].smooth or len(tried[k]) != 1:
                     continue
                 fall = costs_before[w] - start_cost(found[k][0], tried[k][0], limit, self.robust)
                 reliable[k] = fall >= cfg.reliable_share * steps[k].fall
@@ -259,6 +266,17 @@ class InitialStateSearch:
                 seen = [*found[k], *more[k], *difference.residuals]
                 cost = costs_before[w]
                 costs = [start_cost(r, o, limit, self.robust) for r, o in zip(seen, there, strict=True)]
+                if w in known:
+                    fall = max(cost - min(costs, default=cost), 0.0)
+                    if fall > 0:
+                        best = int(np.argmin(costs))
+                        offsets[w], residuals[w] = there[best], seen[best]
+                    if not tried[k]:
+                        continue
+                    if fall < cfg.reliable_share * steps[k].fall:
+                        del known[w]
+                    moving.append(w)
+                    continue
                 best = int(np.argmin(costs))
                 if costs[best] < cost:
                     offsets[w], residuals[w] = there[best], seen[best]
@@ -284,6 +302,24 @@ class InitialStateSearch:
         move = start_step(residual, columns, offset, limit, self.cfg.dampings[0], self.robust)
         after = start_cost(residual + columns @ move, offset + move, limit, self.robust)
         return _PredictedStep(move, start_cost(residual, offset, limit, self.robust) - after)
+
+    def _differences(
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        residuals: Sequence[np.ndarray],
+        windows: Sequence[int],
+        known: Mapping[int, np.ndarray],
+    ) -> list[_FiniteDifferences]:
+        """Return finite differences of some windows; derivatives that are known, without simulations, for others."""
+        fresh = [w for w in windows if w not in known]
+        found = dict(zip(fresh, self.finite_differences(values, offsets, residuals, fresh), strict=True))
+        none = np.empty((0, 0))
+        return [found[w] if w in found else _FiniteDifferences(known[w], none, []) for w in windows]
+
+    def _is_negligible(self, step: _PredictedStep, cost: float) -> bool:
+        """Return whether a step along derivatives from nearby promises too little to be simulated."""
+        return step.fall <= max(self.cfg.settled_fall, self.cfg.min_fall * cost)
 
     def _is_settled(self, step: _PredictedStep, cost: float) -> bool:
         """Return whether a step promises too little to be simulated in a window of smooth motion with some cost."""

@@ -60,15 +60,21 @@ class LeastSquaresCfg:
     jump a little from value to value, and smaller steps measure the jumps."""
     noise_ratio: float = 1.05
     """Residual over noise below which a window's initial state counts as found [-]."""
+    same_state: float = 0.3
+    """Largest difference of two initial states, in units of their spread, below which a search from one ends where that
+    from the other does [-]. Empirical."""
+    together_ratio: float = 1.1
+    """Residual over noise below which a polish moves parameters and initial states together [-]: little is left that
+    other initial states could hide. Empirical."""
     min_gain: float = 5e-3
     """Relative fall of the cost for which a polish goes on [-]."""
     min_thorough_gain: float = 3e-4
     """The same for a thorough polish, which is for the sake of the parameters' values [-]."""
-    polish_steps: int = 6
+    polish_steps: int = 4
     """Most steps of the parameters in a polish [-]."""
     polish_step_decrease: Factor = 3.0
     """Factor by which a step at fixed initial states is shortened where it raises the cost [-]."""
-    polish_step_lengths: tuple[Positive, ...] = (1.0, 3.0)
+    polish_step_lengths: tuple[Positive, ...] = (1.0,)
     """Lengths that are tried for such a step, relative to the least-squares step [-]."""
     screened_gain: float = 0.5
     """Share of a step's predicted fall of the cost in the windows that are simulated first [-]."""
@@ -142,7 +148,11 @@ class Solver:
         self.search = InitialStateSearch(prediction, self.cfg.initial_states, self.cfg.robust)
 
     def fit_initial_states(
-        self, values: np.ndarray, offsets: Sequence[np.ndarray], iterations: int | None = None
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        iterations: int | None = None,
+        known: Sequence[np.ndarray] = (),
     ) -> tuple[list[np.ndarray], tuple[np.ndarray, ...]]:
         """Fit the initial states alone, each window by itself, at fixed parameters.
 
@@ -151,12 +161,13 @@ class Solver:
             offsets: Errors of the initial states in units of their spread, where to start.
             iterations: Most computations of the derivatives with respect to the initial states; by default
                 `InitialStateCfg.iterations`.
+            known: Derivatives by the initial states from a point nearby, one a window; see `InitialStateSearch`.
 
         Returns:
             The errors of the initial states, and the residuals' derivatives with respect to them, see `Fit.starts`.
         """
         most = self.cfg.initial_states.iterations if iterations is None else iterations
-        found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), most)
+        found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), most, known=dict(enumerate(known)))
         return found, tuple(starts[w] for w in range(len(offsets)))
 
     def polish(self, fit: Fit, *, thorough: bool = False, stuck: bool = False) -> Fit:
@@ -174,8 +185,9 @@ class Solver:
         cfg = self.cfg
         if len(self.p.windows) > cfg.max_polished_windows:
             return self._polish_by_sample(fit, thorough=thorough, stuck=stuck)
-        if all(w.smooth for w in self.p.windows):
-            return self._polish_smooth(fit, thorough=thorough)
+        size = np.mean(np.concatenate([window.residual for window in fit.linear]) ** 2)
+        if all(w.smooth for w in self.p.windows) or size < cfg.together_ratio**2:
+            return self._polish_together(fit, thorough=thorough)
         measured, best = [np.zeros_like(o) for o in fit.offsets], fit
         if not stuck:
             fresh = self.improve_initial_states(fit, [measured])
@@ -202,10 +214,11 @@ class Solver:
             best = found
         return best
 
-    def _polish_smooth(self, fit: Fit, *, thorough: bool) -> Fit:
+    def _polish_together(self, fit: Fit, *, thorough: bool) -> Fit:
         """Return a fit continued with new derivatives by the initial states, for as long as that lowers the cost.
 
-        Where nothing touches anything, these change little with the parameters, and all converge together.
+        Where nothing touches anything, or little more than noise is left, these change little with the parameters, and
+        all converge together.
         """
         min_gain, best = self.cfg.min_thorough_gain if thorough else self.cfg.min_gain, fit
         for _ in range(self.cfg.polish_steps):
@@ -232,7 +245,7 @@ class Solver:
     def _fit_at(self, fit: Fit, values: np.ndarray, first: Sequence[int], noise: float) -> Fit:
         """Return a fit at other values, initial states fitted anew; unchanged if the cost of `first` windows rises."""
         measured = [np.zeros_like(o) for o in fit.offsets]
-        there = self.improve_initial_states(replace(fit, values=values), [measured], noise, first)
+        there = self.improve_initial_states(replace(fit, values=values), [measured], noise, first, fresh=False)
         limit = huber_limit([window.residual for window in fit.linear], self.cfg.robust)
         before, after = (
             sum(start_cost(f.linear[w].residual, f.offsets[w], limit, self.cfg.robust) for w in first)
@@ -241,7 +254,7 @@ class Solver:
         if after >= before:
             return fit
         rest = sorted(set(range(len(measured))) - set(first))
-        return self.improve_initial_states(there, [measured], noise, rest) if rest else there
+        return self.improve_initial_states(there, [measured], noise, rest, fresh=False) if rest else there
 
     def _polish_by_sample(self, fit: Fit, *, thorough: bool, stuck: bool) -> Fit:
         """Return a fit polished on a sample of the windows, and where that helps on all of them from its values."""
@@ -266,6 +279,8 @@ class Solver:
         others: Sequence[Sequence[np.ndarray]],
         noise: float | None = None,
         windows: Sequence[int] | None = None,
+        *,
+        fresh: bool = True,
     ) -> Fit:
         """Return a fit at the same parameters with the best initial state of each window that is found.
 
@@ -274,15 +289,24 @@ class Solver:
             others: Errors of the initial states to start from, besides those of the fit, in units of their spread.
             noise: Residual over noise of windows that need no others; by default `LeastSquaresCfg.noise_ratio`.
             windows: Indices of the windows to improve; by default all.
+            fresh: Whether derivatives by the initial states are computed anew; else only where those of the fit mislead.
         """
         mine = range(len(self.p.windows)) if windows is None else windows
         noise = self.cfg.noise_ratio if noise is None else noise
-        offsets, fresh, residuals = self.search.refined(fit.values, fit.offsets, mine, 1)
-        starts = dict(enumerate(fit.starts)) | fresh
+        known, most = ({}, 1) if fresh else (dict(enumerate(fit.starts)), self.cfg.refit_iterations)
+        offsets, renewed, residuals = self.search.refined(fit.values, fit.offsets, mine, most, known=known)
+        starts = dict(enumerate(fit.starts)) | renewed
         limit = huber_limit(residuals, self.cfg.robust)
-        outlying = [w for w in mine if np.mean(residuals[w] ** 2) > noise**2]
-        for begin in others if outlying else ():
+        for begin in others:
+            outlying = [
+                w
+                for w in mine
+                if np.mean(residuals[w] ** 2) > noise**2
+                and np.abs(begin[w] - offsets[w]).max() > self.cfg.same_state
+            ]
             upper_bounds = {w: start_cost(residuals[w], offsets[w], limit, self.cfg.robust) for w in outlying}
+            if not outlying:
+                continue
             there, found, left = self.search.refined(
                 fit.values, begin, outlying, self.cfg.initial_states.iterations, upper_bounds
             )
@@ -467,7 +491,7 @@ class Solver:
                 return _State(values, offsets, cost, state.starts, state.refits), lowered
             if state.refits:
                 begin = state.offsets if cost > cfg.restart_ratio * state.cost else offsets
-                refitted, starts = self.fit_initial_states(values, begin, iterations=cfg.refit_iterations)
+                refitted, starts = self.fit_initial_states(values, begin, cfg.refit_iterations, state.starts)
                 again = self.cost(self.p.residuals(self.trials(values, refitted)), refitted, values)
                 state = replace(state, refits=state.refits - 1)
                 if again < state.cost:
