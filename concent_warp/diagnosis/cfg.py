@@ -94,6 +94,9 @@ class SearchCfg:
     """Relative difference of held-out errors below which candidates count as equal [-]. Empirical."""
     equal_standard_errors: float = 2.0
     """Standard errors of that difference below which candidates count as equal: 95 % of a normal distribution."""
+    max_odds: Annotated[float, Bounds(1, above_low=True)] = 20.0
+    """Posterior odds against a candidate, beside the most plausible one that explains as much, from which on it is not
+    named [-]: 5 %, as of an interval."""
     near_equal_factor: Annotated[float, Bounds(1)] = 1.25
     """Factor on both bounds within which candidates are compared by profile likelihood before they are separated [-].
     Empirical."""
@@ -229,6 +232,9 @@ class DiagnoseCfg:
     """RMS residual over noise up to which a model explains the data [-]. Empirical."""
     adequate_channel_ratio: Positive = 1.5
     """The same of each channel alone [-]: many good channels do not outweigh one that the model misses. Empirical."""
+    form_error_ratio: Positive = 2.0
+    """RMS residual over noise up to which a remainder may be an error in the formulas of accepted effects [-], if it is
+    less than `UnknownForceCfg.min_share` of the first discrepancy. Empirical."""
     null_samples: Annotated[int, Bounds(1, 1_000_000)] = 400
     """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
     p-value is 1 / (null_samples + 1)."""

@@ -187,10 +187,10 @@ class Procedure:
     def _is_form_error(self, one: FittedModel, first: FittedModel) -> bool:
         """Return whether a model with added effects leaves no more than errors in their formulas.
 
-        It is then adequate, and little is left beside the discrepancy of the first model.
+        Little is then left beside the discrepancy of the first model, and little beside the noise.
         """
         left, lacked = one.ratio**2 - 1, first.ratio**2 - 1
-        return left < self.cfg.unknown_force.min_share * lacked and is_adequate(one, self.noise_factors, self.cfg)
+        return left < self.cfg.unknown_force.min_share * lacked and one.ratio <= self.cfg.form_error_ratio
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
@@ -476,6 +476,9 @@ class Procedure:
         beyond = max(first**2 - 1.0, 1e-9)
         unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > cfg.adequate_ratio else 0.0
         adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
+        form_error = None
+        if not adequate and any(f.accepted for f in self.findings) and self._is_form_error(fitted[-1], given):
+            adequate, form_error = True, unexplained
         unknown = None
         if adequate and any(f.accepted for f in self.findings):
             nodes = [given, *(fitted[1:] or fitted)]
@@ -509,6 +512,7 @@ class Procedure:
             models=(given.model, *(one.delivered for one in after)),
             seed=cfg.seed,
             unknown_force=unknown,
+            form_error=form_error if verdict in ("effect", "group") else None,
             time_step=self.time_step,
             nominal_values=self.nominal_values,
             unsettled=tuple(self.budget.unsettled),

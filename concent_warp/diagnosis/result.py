@@ -208,10 +208,13 @@ class Diagnosis:
     seed: int = 0
     unknown_force: UnknownForceFound | None = None
     """A force of no known form that explains part of the last model's residual; None where there is none."""
+    form_error: float | None = None
+    """Share of the discrepancy that is left above the noise and taken for errors in the formulas of the accepted
+    effects [-]; None where no more than noise is left, or something else is missing."""
     time_step: FinerTimeStep | None = None
     """A shorter time step that the data ask for; None where the model's own is short enough."""
     nominal_values: tuple[FittedParameter, ...] = ()
-    """Masses, lengths and gains that the data ask for within their tolerance, as factors on the nominal values."""
+    """Masses, lengths, gains and latencies that the data ask for within their tolerance; factors but for latencies."""
     unsettled: tuple[str, ...] = ()
     """Sentences on what there was no time for, see `DiagnoseCfg.seconds`."""
 
@@ -246,6 +249,7 @@ class Diagnosis:
             "where": [dict(place) for place in self.where],
             "unexplained": self.unexplained,
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),
+            "form_error": self.form_error,
             "time_step": None if self.time_step is None else self.time_step.to_json(),
             "nominal_values": [_parameter(p) for p in self.nominal_values],
             "ratio": list(self.ratio),
@@ -290,14 +294,24 @@ class Diagnosis:
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
             )
+        if self.form_error is not None:
+            said.append(
+                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no more "
+                "than errors in the formulas of the accepted effects."
+            )
         if self.unknown_force is not None:
             said.append(self.unknown_force.sentence)
         if self.next_experiment:
             said.append(f"Next experiment: {self.next_experiment.sentence}")
         numerical = [] if self.time_step is None else [self.time_step.sentence]
         if self.nominal_values:
-            values = ", ".join(f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]" for p in self.nominal_values)
-            numerical.append(f"Nominal values were fitted within their tolerance of 1 %: {values}.")
+            values = ", ".join(
+                f"{p.name} x {p.value:.3f} [{p.low:.3f}, {p.high:.3f}]"
+                if p.unit == "-"
+                else f"{p.name} {p.value:.2g} [{p.low:.2g}, {p.high:.2g}] {p.unit}"
+                for p in self.nominal_values
+            )
+            numerical.append(f"Nominal values were fitted within their tolerances: {values}.")
         return [*self.issues, *numerical, *said, *self.unsettled]
 
 

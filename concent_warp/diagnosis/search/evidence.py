@@ -116,7 +116,8 @@ def indistinguishable(
     Their held-out errors differ from the best one's by less than `equal_standard_errors` standard errors, over blocks
     and including the roughness of the costs, or by less than the share `equal_error`. A candidate that leaves more also
     counts where the best is so much rarer that this outweighs it: the formula of a similar effect may fit slightly
-    better than that of the missing one, as simulations of the same formula differ too.
+    better than that of the missing one, as simulations of the same formula differ too. One whose posterior odds against
+    the most plausible are worse than `max_odds` is left out.
 
     Args:
         base: The fitted baseline.
@@ -135,7 +136,8 @@ def indistinguishable(
         bound = max(cfg.equal_standard_errors * error, cfg.equal_error * best.errors.sum())
         if rarer or difference.sum() <= slack * bound:
             group.append((c, f))
-    return sorted(group, key=lambda pair: -_plausibility(base, *pair))
+    ranked = sorted(((_plausibility(base, *pair), pair) for pair in group), key=lambda found: -found[0])
+    return [pair for score, pair in ranked if score > ranked[0][0] - 2 * np.log(cfg.max_odds)]
 
 
 def _log_errors(base: FittedModel, c: FittedCandidate) -> float:

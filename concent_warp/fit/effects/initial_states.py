@@ -169,7 +169,11 @@ class InitialStateSearch:
         self._iterate(values, offsets, residuals, starts, windows, iterations, rng, upper_bounds or {}, known)
         size = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
         outlying = (
-            [w for w in windows if size[w] > self.cfg.outlier_ratio * max(1.0, float(np.median(size)))]
+            [
+                w
+                for w in windows
+                if size[w] > self.cfg.outlier_ratio * max(1.0, float(np.median(size))) and not self.p.windows[w].smooth
+            ]
             if iterations == self.cfg.iterations
             else []
         )
@@ -239,7 +243,7 @@ class InitialStateSearch:
                 if w in known:
                     if not self._is_negligible(step, costs_before[w]):
                         there = self._damped(residuals[w], difference.columns, offsets[w], limit)[::2]
-                elif np.mean(residuals[w] ** 2) > outlying**2:
+                elif np.mean(residuals[w] ** 2) > outlying**2 and not self.p.windows[w].smooth:
                     there = self._damped(residuals[w], difference.columns, offsets[w], limit)
                     there += self._samples_about(residuals[w], difference.columns, offsets[w], there[0], limit, rng)
                 elif not self.p.windows[w].smooth:

@@ -301,8 +301,7 @@ class Solver:
             outlying = [
                 w
                 for w in mine
-                if np.mean(residuals[w] ** 2) > noise**2
-                and np.abs(begin[w] - offsets[w]).max() > self.cfg.same_state
+                if np.mean(residuals[w] ** 2) > noise**2 and np.abs(begin[w] - offsets[w]).max() > self.cfg.same_state
             ]
             upper_bounds = {w: start_cost(residuals[w], offsets[w], limit, self.cfg.robust) for w in outlying}
             if not outlying:
