@@ -88,6 +88,9 @@ class SearchCfg:
     those alone [-]. Empirical."""
     rivals: int = 3
     """Rivals whose initial states are tried on the baseline. Empirical."""
+    reconsidered: Count = 5
+    """Most candidates that are tried again in the place of an earlier addition once others are in the model.
+    Empirical."""
     min_fold_share: Share = 0.8
     """Share of the folds in which an accepted effect must gain [-]: 4 of 5."""
     equal_error: float = 0.02
@@ -235,6 +238,9 @@ class DiagnoseCfg:
     form_error_ratio: Positive = 2.0
     """RMS residual over noise up to which a remainder may be an error in the formulas of accepted effects [-], if it is
     less than `UnknownForceCfg.min_share` of the first discrepancy. Empirical."""
+    max_remainder: Share = 0.15
+    """Share of such a remainder that a further effect may leave, if it is to be named all the same [-]: one that is
+    missing explains nearly all of it, one that takes up an error in a formula a part. Empirical."""
     null_samples: Annotated[int, Bounds(1, 1_000_000)] = 400
     """Sign-flipped data sets from which the null distribution of the best candidate's gain is taken; the smallest
     p-value is 1 / (null_samples + 1)."""

@@ -46,9 +46,10 @@ from concent_warp.diagnosis.search.nominal_values import (
     without_nominal_values,
 )
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
+from concent_warp.diagnosis.search.reconsider import Rival, near_best, reconsider
 from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
-from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.time_step import at_given_step, finer_time_step, renew_defects
+from concent_warp.diagnosis.search.time_step import finding as time_step_finding
 from concent_warp.diagnosis.search.unknown_force import unknown_force
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE, TOGETHER_SHARE, TimeBudget, in_words
@@ -95,7 +96,10 @@ class Procedure:
         self.time_step: FinerTimeStep | None = None
         self.nominal_values: tuple[FittedParameter, ...] = ()
         self.provisional: int | None = None
-        """Index of an addition that stays only if it makes an earlier one superfluous."""
+        """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was
+        left: what takes up an error in a formula explains a part of it."""
+        self.rivals: dict[int, tuple[Rival, ...]] = {}
+        """Candidates that explained nearly as much as each addition, and that one itself."""
         self.budget = TimeBudget(cfg.seconds)
 
     def run(self) -> Diagnosis:
@@ -150,9 +154,12 @@ class Procedure:
             if (step or nominal_effects(fitted[-1].model)) and not self._is_lacking(fitted[-1]):
                 break
             if step and self._is_form_error(fitted[-1], first):
-                if step == 1 or self.provisional is not None:
+                if self.provisional is None:
+                    if step == 1 and is_adequate(fitted[-1], self.noise_factors, cfg):
+                        break
+                    self.provisional = step
+                elif step > self.provisional:
                     break
-                self.provisional = step
             finer = None if effects_alone else self._finer(fitted[-1])
             if finer is not None and not self._is_lacking(finer):
                 fitted = self._adopt(fitted, finer)
@@ -325,6 +332,7 @@ class Procedure:
             self.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
         group = group_indistinguishable(base, accepted, finding, self.runner, cfg, self.budget)
+        self.rivals[step] = near_best(base, fitted, findings, cfg)
         self._record(base, group, findings)
         return group[0][0], smallest
 
@@ -362,8 +370,11 @@ class Procedure:
 
     def simplified(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models without superfluous effects, and without one that takes up errors of formulas."""
-        found = self.remove_superfluous(fitted)
+        found = self.remove_superfluous(self.reconsidered(fitted))
         if len(found) > len(fitted) or self.provisional is None or len(fitted) <= self.provisional + 1:
+            return found
+        before, after = fitted[self.provisional], fitted[self.provisional + 1]
+        if after.ratio**2 - 1 <= self.cfg.max_remainder * (before.ratio**2 - 1):
             return found
         self.groups, self.hypotheses = self.groups[: self.provisional], self.hypotheses[: self.provisional]
         reason = "explains no more than errors in the formulas of the others"
@@ -372,6 +383,33 @@ class Procedure:
             for f in self.findings
         ]
         return found[: self.provisional + 1]
+
+    def reconsidered(self, fitted: list[FittedModel]) -> list[FittedModel]:
+        """Return the fitted models, in the last one the effect of each addition that explains most beside the others.
+
+        The last addition has just been compared with its rivals beside all others.
+        """
+        accepted = sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
+        for k, f in enumerate(accepted[:-1]):
+            if len(among := self.rivals.get(f.step, ())) < 2:
+                continue
+            self.runner.progress(self.runner.share, "trying earlier rivals beside later effects")
+            last, unsettled = fitted[-1], f"Open: whether another effect than {f.name} explains more beside the others."
+            index = len(last.model.effects) - len(accepted) + k
+            found = self.budget.attempt(partial(reconsider, last, index, among, self.cfg), None, unsettled)
+            if found is None:
+                continue
+            fitted = [*fitted[:-1], found.last]
+            names = [g.name for _, g in found.group]
+            self.groups[f.step] = tuple(names)
+            self.hypotheses[f.step] = {g.name: c.model for c, g in found.group}
+            if names[0] != f.name:
+                self.widening[f.step] = np.ones(len(found.group[0][1].parameters))
+                old = replace(f, accepted=False, reason="another one explains more beside the others")
+                self.findings[self.findings.index(f)] = old
+                self.findings = [g for g in self.findings if g.step != f.step or g.name != names[0]]
+                self.findings.append(found.group[0][1])
+        return fitted
 
     def remove_superfluous(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, with one more for each effect that is removed since later ones made it superfluous.

@@ -296,8 +296,8 @@ class Diagnosis:
             )
         if self.form_error is not None:
             said.append(
-                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no more "
-                "than errors in the formulas of the accepted effects."
+                f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no "
+                "more than errors in the formulas of the accepted effects."
             )
         if self.unknown_force is not None:
             said.append(self.unknown_force.sentence)

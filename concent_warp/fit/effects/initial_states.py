@@ -38,6 +38,9 @@ class InitialStateCfg:
     reliable_share: float = 0.9
     """Share of the predicted fall of a window's cost that the step with the first damping must reach to be taken
     without trying the others [-], where motion is smooth: the derivatives are then right to about a tenth."""
+    known_share: float = 0.5
+    """Share of the predicted fall that a step along derivatives from nearby must reach, or these are computed anew [-].
+    Empirical."""
     settled_fall: float = 0.01
     """Predicted fall of a window's cost below which its initial state counts as found without another simulation, where
     motion is smooth [cost]: a hundredth of the log likelihood's unit."""
@@ -277,7 +280,7 @@ class InitialStateSearch:
                         offsets[w], residuals[w] = there[best], seen[best]
                     if not tried[k]:
                         continue
-                    if fall < cfg.reliable_share * steps[k].fall:
+                    if fall < cfg.known_share * steps[k].fall:
                         del known[w]
                     moving.append(w)
                     continue

@@ -289,7 +289,7 @@ class Solver:
             others: Errors of the initial states to start from, besides those of the fit, in units of their spread.
             noise: Residual over noise of windows that need no others; by default `LeastSquaresCfg.noise_ratio`.
             windows: Indices of the windows to improve; by default all.
-            fresh: Whether derivatives by the initial states are computed anew; else only where those of the fit mislead.
+            fresh: Whether derivatives by the initial states are computed anew; else where those of the fit mislead.
         """
         mine = range(len(self.p.windows)) if windows is None else windows
         noise = self.cfg.noise_ratio if noise is None else noise
