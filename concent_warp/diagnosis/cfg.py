@@ -177,8 +177,13 @@ class TimeStepCfg:
     """Error of the time step over the noise that is left after a division of the step [-]: in squares, a tenth of what
     the noise itself leaves."""
     max_division: Annotated[int, Bounds(1, 1000)] = 8
-    """Most parts that a step is divided into; 1 leaves the model's time step as it is. The search takes as many times
-    longer."""
+    """Most parts that a step is divided into; 1 leaves the model's time step as it is."""
+    max_state_offset: Positive = 2.0
+    """Fitted error of an initial state, in units of its standard deviation, beyond which it is fitted again by
+    simulations with the shorter step, where more than noise is left: 95 % of a normal distribution."""
+    max_renewals: Count = 5
+    """Most times that what a shorter step changes is computed again about the fit to it, until it changes by less than
+    `max_error`."""
 
 
 @dataclass(frozen=True)

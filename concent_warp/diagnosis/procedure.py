@@ -184,7 +184,7 @@ class Procedure:
                 continue
             if best is None:
                 break
-            fitted.append(renew_defects(add_candidate(fitted[-1], best)))
+            fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
         return fitted, detectable
 
     def _is_lacking(self, one: FittedModel) -> bool:
@@ -478,7 +478,7 @@ class Procedure:
         self.runner.progress(self.runner.share, "fitting all effects together")
         attempt = self.budget.attempt
         unsettled = "Not refitted: all effects together."
-        last = attempt(lambda: renew_defects(refit_jointly(fitted[-1])), fitted[-1], unsettled, TOGETHER_SHARE)
+        last = attempt(lambda: self._joint(fitted[-1]), fitted[-1], unsettled, TOGETHER_SHARE)
         owned = len(last.model.effects) - len(accepted)
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         parameters = joint_parameters(last, widening)
@@ -494,6 +494,10 @@ class Procedure:
                 final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
         return [*fitted[:-1], with_intervals(last, parameters)]
+
+    def _joint(self, last: FittedModel) -> FittedModel:
+        """Return the last model with all that was accepted fitted together."""
+        return renew_defects(refit_jointly(last), self.cfg.time_step)
 
     def conclude(
         self,

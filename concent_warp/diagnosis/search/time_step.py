@@ -20,7 +20,7 @@ from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.screening import robust_sum
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
-from concent_warp.fit.effects.observation import TimeStepDefect
+from concent_warp.fit.effects.observation import TimeStepDefect, Window
 from concent_warp.fit.effects.robust import cauchy_weight
 
 
@@ -41,18 +41,59 @@ def finer_time_step(base: FittedModel, cfg: DiagnoseCfg) -> FittedModel | None:
     promised = 1 - robust_sum(base, _without_own(base, _projected(base, _residuals(finer)))) / max(before, 1e-12)
     if promised < cfg.search.min_expected_gain * cfg.min_gain:
         return None
-    found = renew_defects(_refitted(finer))
+    found = renew_defects(_refitted(finer), cfg.time_step)
+    if (begun := _at_states_of_shorter_step(found, cfg.time_step)) is not None:
+        again = renew_defects(_refitted(begun), cfg.time_step)
+        found = min(found, again, key=lambda one: one.errors.sum())
     return found if _explains_more(base, found, cfg) else None
 
 
-def renew_defects(one: FittedModel) -> FittedModel:
-    """Return a fitted model with a shorter time step with the defects of its own motion, fitted again.
+def renew_defects(one: FittedModel, cfg: TimeStepCfg) -> FittedModel:
+    """Return a fitted model with a shorter time step with the defects of its own motion, fitted again until they stay.
 
     Without a shorter time step it is returned as it is.
+
+    Args:
+        one: The fitted model.
+        cfg: Settings.
     """
-    if one.windows[0].defect is None:
-        return one
-    return _refitted(_with_defects(one, one.timestep))
+    for _ in range(cfg.max_renewals):
+        if one.windows[0].defect is None:
+            break
+        renewed = _with_defects(one, one.timestep)
+        change = [_defect(a) - _defect(b) for a, b in zip(renewed.windows, one.windows, strict=True)]
+        one = _refitted(renewed)
+        if noise_ratio(np.concatenate(change)) < cfg.max_error:
+            break
+    return one
+
+
+def _at_states_of_shorter_step(one: FittedModel, cfg: TimeStepCfg) -> FittedModel | None:
+    """Return a model at initial states fitted by simulations with the shorter step; None where no window needs that.
+
+    Where states were fitted to the error of a long step, they are far from the measured ones, and defects about them
+    mean little.
+    """
+    limit = one.cfg.least_squares.together_ratio
+    lost = [
+        w
+        for w, (piece, o) in enumerate(zip(one.pieces, one.fit.offsets, strict=True))
+        if np.mean(piece.residual**2) > limit**2 and np.abs(o).max() > cfg.max_state_offset
+    ]
+    if not lost:
+        return None
+    solver = _with_time_step(_without_defects(one), one.timestep).solver()
+    measured = [np.zeros_like(o) for o in one.fit.offsets]
+    iterations = one.cfg.least_squares.initial_states.iterations
+    found, starts, _ = solver.search.refined(one.fit.values, measured, lost, iterations)
+    offsets = tuple(found[w] if w in starts else o for w, o in enumerate(one.fit.offsets))
+    fit = replace(one.fit, offsets=offsets, starts=tuple(starts.get(w, a) for w, a in enumerate(one.fit.starts)))
+    return _with_defects(replace(one, fit=fit), one.timestep)
+
+
+def _defect(window: Window) -> np.ndarray:
+    """Return the correction of a window's residuals, shape (count,)."""
+    return np.zeros(window.count) if window.defect is None else window.defect.residual
 
 
 def at_given_step(last: FittedModel) -> FittedModel:

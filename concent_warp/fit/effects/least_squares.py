@@ -161,13 +161,15 @@ class Solver:
             offsets: Errors of the initial states in units of their spread, where to start.
             iterations: Most computations of the derivatives with respect to the initial states; by default
                 `InitialStateCfg.iterations`.
-            known: Derivatives by the initial states from a point nearby, one a window; see `InitialStateSearch`.
+            known: Derivatives by the initial states from a point nearby, one a window, for windows with contacts; see
+                `InitialStateSearch`.
 
         Returns:
             The errors of the initial states, and the residuals' derivatives with respect to them, see `Fit.starts`.
         """
         most = self.cfg.initial_states.iterations if iterations is None else iterations
-        found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), most, known=dict(enumerate(known)))
+        near = {w: a for w, a in enumerate(known) if not self.p.windows[w].smooth}
+        found, starts, _ = self.search.refined(values, offsets, range(len(offsets)), most, known=near)
         return found, tuple(starts[w] for w in range(len(offsets)))
 
     def polish(self, fit: Fit, *, thorough: bool = False, stuck: bool = False) -> Fit:
