@@ -21,7 +21,7 @@ from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, FinerTimeStep, Verdict
-from concent_warp.diagnosis.search.adequacy import is_adequate
+from concent_warp.diagnosis.search.adequacy import is_adequate, is_lacking
 from concent_warp.diagnosis.search.baseline import (
     add_candidate,
     fit_baseline,
@@ -151,7 +151,8 @@ class Procedure:
         cfg, runner, fitted, first = self.cfg, self.runner, list(fitted), fitted[0]
         while True:
             step = len(fitted) - 1
-            if (step or nominal_effects(fitted[-1].model)) and not self._is_lacking(fitted[-1]):
+            explained = step or nominal_effects(fitted[-1].model)
+            if explained and not is_lacking(fitted[-1], self.noise_factors, cfg):
                 break
             if step and self._is_form_error(fitted[-1], first):
                 if self.provisional is None:
@@ -161,7 +162,7 @@ class Procedure:
                 elif step > self.provisional:
                     break
             finer = None if effects_alone else self._finer(fitted[-1])
-            if finer is not None and not self._is_lacking(finer):
+            if finer is not None and not is_lacking(finer, self.noise_factors, cfg):
                 fitted = self._adopt(fitted, finer)
                 break
             if not effects_alone and (found := self._with_nominal(fitted, finer)) is not None:

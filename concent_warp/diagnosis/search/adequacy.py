@@ -28,9 +28,23 @@ def is_adequate(base: FittedModel, noise_factors: Mapping[str, float], cfg: Diag
         noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
         cfg: Settings.
     """
-    robust = base.cfg.least_squares.robust
-    scaled = {c: r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()}
-    worst = max(robust_noise_ratio([r], robust) for r in scaled.values())
-    return (
-        robust_noise_ratio(list(scaled.values()), robust) <= cfg.adequate_ratio and worst <= cfg.adequate_channel_ratio
-    )
+    robust, scaled = base.cfg.least_squares.robust, _scaled(base, noise_factors)
+    worst = max(robust_noise_ratio([r], robust) for r in scaled)
+    return robust_noise_ratio(scaled, robust) <= cfg.adequate_ratio and worst <= cfg.adequate_channel_ratio
+
+
+def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:
+    """Return whether the residual beyond what the noise may be is as much as an effect must remove.
+
+    Args:
+        base: The fitted model.
+        noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
+        cfg: Settings.
+    """
+    ratio = robust_noise_ratio(_scaled(base, noise_factors), base.cfg.least_squares.robust)
+    return ratio**2 >= 1 + cfg.min_gain
+
+
+def _scaled(base: FittedModel, noise_factors: Mapping[str, float]) -> list[np.ndarray]:
+    """Return the residuals of each channel in units of the largest noise that it may have, each (n,)."""
+    return [r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()]
