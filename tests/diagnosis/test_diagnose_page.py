@@ -10,6 +10,7 @@ import pytest
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import VERDICTS
+from concent_warp.effects.library.nominal import BOUND, CLOCK_TOLERANCE, TOLERANCE
 from tests.scenes.swinging import drawing, swung
 
 PAGE = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text()
@@ -59,5 +60,20 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert f"p ≤ {cfg.significance_level:g}; at least {100 * cfg.min_gain:.0f} % of the error removed" in PAGE
     assert cfg.max_additions == 3
     assert "up to three times (`--additions`)" in PAGE
+    least, rest = 100 * cfg.unknown_force.min_share, 100 * cfg.max_remainder
+    assert f"less than {least:.0f} % of the first discrepancy and at most {cfg.form_error_ratio:g} x noise" in PAGE
+    assert f"leaves at most {rest:.0f} % of that remainder" in PAGE
+    assert cfg.search.reconsidered == 5
+    assert "up to five that removed at least half as much" in PAGE
+    assert cfg.search.restart_min_gain == 0.5
+    assert f"odds of more than {cfg.search.max_odds:g}" in PAGE
+    assert PAGE.count(f"{cfg.time_step.max_error:g} x noise") == 2
+    assert f"shorter step (at most {cfg.time_step.max_division} times)" in PAGE
+    assert f"by more than {cfg.nominal.min_change:g} x noise within this tolerance" in PAGE
+    assert f"bound and more than {cfg.nominal.bounded_ratio:g} x noise is left" in PAGE
+    assert f"known to about {100 * TOLERANCE:.0f} %, the latency of a channel to {1e3 * CLOCK_TOLERANCE:g} ms" in PAGE
+    assert BOUND == 2.0
+    assert "bounds of two tolerances" in PAGE
+    assert f"at most {cfg.adequate_ratio:g} x noise altogether, and of {cfg.adequate_channel_ratio:g} x" in PAGE
     assert {f.name for f in fields(cfg)} >= {"jobs", "seed", "window", "effects"}
     assert np.isfinite(cfg.adequate_ratio)

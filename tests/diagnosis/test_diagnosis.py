@@ -7,7 +7,15 @@ import pytest
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.experiment.suggested import SuggestedExperiment, SuggestedMotion, TimeSeries
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.result import VERDICTS, Detectable, Diagnosis, Finding, _joined, _number
+from concent_warp.diagnosis.result import (
+    VERDICTS,
+    Detectable,
+    Diagnosis,
+    Finding,
+    UnknownForceFound,
+    _joined,
+    _number,
+)
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -75,6 +83,51 @@ def test_what_no_effect_explains_is_reported_with_its_share():
     said = diagnosis(verdict="none_of_these", unexplained=0.4, next_experiment=EXPERIMENT).sentences()
     assert any(s.startswith("40 % of the discrepancy stays unexplained") for s in said)
     assert said[-1] == "Next experiment: swing faster: a and b then differ by 4.0 x noise (angle)."
+
+
+def test_what_is_left_and_taken_for_errors_in_formulas_is_named_with_its_size():
+    force = UnknownForceFound("a force on rail that depends on its position", 0.4, 0.002, 0.02, form_error=True)
+    plain, with_form = diagnosis(), diagnosis(form_error=0.0287, ratio=(5.0, 1.3), unexplained=0.0287)
+    assert not any("formulas" in s for s in plain.sentences())
+    (said,) = (s for s in with_form.sentences() if "formulas" in s)
+    assert said == (
+        "What is left, 1.30 x noise, is 2.9 % of the discrepancy: no more than errors in the formulas of the accepted "
+        "effects."
+    )
+    both = replace(with_form, unknown_force=force, next_experiment=EXPERIMENT).sentences()
+    assert [k for k, s in enumerate(both) if "formulas" in s] == [1, 2]  # after the effects, before the experiment
+    assert both[0].startswith("Missing: joint_friction")
+    assert both[2].startswith("A force on rail that depends on its position explains 2.0 % of the discrepancy besides")
+    assert both[3].startswith("Next experiment")
+    assert with_form.headline == VERDICTS["effect"]
+
+
+def test_json_has_the_share_of_errors_in_formulas_and_null_where_there_is_none():
+    document = json.loads(json.dumps(diagnosis(form_error=0.0287).to_json(), allow_nan=False))
+    assert document["form_error"] == 0.0287
+    found = diagnosis().to_json()
+    assert found["form_error"] is None
+    keys = list(found)
+    assert keys.index("form_error") == keys.index("unknown_force") + 1 == keys.index("time_step") - 1
+
+
+def test_nominal_values_are_told_as_factors_and_latencies_with_their_unit():
+    values = (
+        FittedParameter("mass[arm]", 1.0124, 1.0101, 1.0149, "-", 1.0),
+        FittedParameter("delay[angle]", 4.2e-4, 3.1e-4, 5.3e-4, "s", 0.0),
+    )
+    found = diagnosis(nominal_values=values, issues=("a gap of 1 s.",))
+    assert found.sentences()[:2] == [
+        "a gap of 1 s.",
+        "Nominal values were fitted within their tolerances: mass[arm] x 1.012 [1.010, 1.015], "
+        "delay[angle] 0.00042 [0.00031, 0.00053] s.",
+    ]
+    assert [(p["name"], p["unit"], p["null"]) for p in found.to_json()["nominal_values"]] == [
+        ("mass[arm]", "-", 1.0),
+        ("delay[angle]", "s", 0.0),
+    ]
+    assert replace(found, effects=()).changes_model
+    assert not replace(found, effects=(), nominal_values=()).changes_model
 
 
 def test_the_headline_names_effects_beside_what_none_explains():

@@ -7,9 +7,12 @@ import pytest
 
 from concent_warp.effects.registry import NOMINAL, effect_class, effect_classes
 from concent_warp.errors import ModelError
+from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
 from tests.scenes.foreign import BALL, PUSHER
+from tests.scenes.swinging import NOISE, drawing, swung, windows_of
 
 
 def test_masses_lengths_and_gains_are_scaled_and_nothing_else():
@@ -43,11 +46,82 @@ def test_nominal_values_are_no_candidates_and_stay_within_two_tolerances(tmp_pat
     model = Model(Scene(PUSHER)).add_effect("nominal_mass", ["fore"], {"mass[fore]": 1.015})
     model.save(tmp_path / "model.toml")
     assert Model.load(tmp_path / "model.toml").effects[0].values == (1.015,)
+    assert {kind.name for kind in NOMINAL} >= {"nominal_velocity_gain", "nominal_latency"}
     for kind in NOMINAL:
         assert effect_class(kind.name) is kind
         assert kind.nominal
         for target in kind.targets(model.compile()):
             for p in kind(*target).parameters(model.compile()):
-                assert (p.null, p.low, p.high) == (1.0, pytest.approx(0.98), pytest.approx(1.02))
+                null, unit, tolerance = (0.0, "s", 5e-4) if kind.name == "nominal_latency" else (1.0, "-", 0.01)
+                assert (p.null, p.unit) == (null, unit)
+                assert (p.low, p.high) == pytest.approx((null - 2 * tolerance, null + 2 * tolerance))
+                assert p.scale * LeastSquaresCfg().prior == pytest.approx(tolerance)
     with pytest.raises(ModelError, match=r"1\.02"):
         Model(Scene(PUSHER)).add_effect("nominal_mass", ["fore"], {"mass[fore]": 1.1})
+
+
+def test_velocity_gains_are_those_of_actuators_with_velocity_feedback_and_scale_nothing_else():
+    kind = effect_class("nominal_velocity_gain")
+    model = Model(Scene(PUSHER))
+    assert kind.targets(model.compile()) == (("shoulder", "elbow"),)
+    without = Model(Scene(PUSHER.replace(' kv="0.25"', "")))
+    assert kind.targets(without.compile()) == (("shoulder",),)
+    assert kind.targets(Model(Scene(PUSHER.replace(' kv="0.6"', "").replace(' kv="0.25"', ""))).compile()) == ()
+    assert kind.targets(Model(Scene(BALL)).compile()) == ()
+    plain, changed = (
+        m.compile() for m in (model, model.add_effect(kind.name, ["elbow"], {"velocity_gain[elbow]": 1.02}))
+    )
+    np.testing.assert_allclose(changed.actuator_biasprm[:, :3], [[0, -12, -0.6], [0, -6, -0.255]])
+    np.testing.assert_array_equal(changed.actuator_gainprm, plain.actuator_gainprm)
+    np.testing.assert_array_equal(changed.dof_damping, plain.dof_damping)
+
+
+def test_a_latency_shifts_the_readings_of_its_sensor_alone():
+    kind = effect_class("nominal_latency")
+    m = Model(Scene(PUSHER)).compile()
+    assert kind.targets(m) == (("shoulder_position", "elbow_position"),)
+    effect, time = kind("shoulder_position", "elbow_position"), np.array([0.1, 0.4])
+    asked = []
+
+    def read(sensor: str, at: np.ndarray) -> np.ndarray:
+        asked.append((sensor, at.tolist()))
+        return at[:, None]
+
+    shifted = effect.measure(m, read, np.array([4e-4, -7e-4]))
+    for sensor, delay in (("shoulder_position", 4e-4), ("elbow_position", -7e-4), ("other", 0.0)):
+        np.testing.assert_allclose(shifted(sensor, time), time[:, None] - delay, rtol=1e-12)
+    assert [sensor for sensor, _ in asked] == ["shoulder_position", "elbow_position", "other"]
+
+
+def test_a_latency_moves_predictions_along_the_motion_without_another_simulation():
+    recording = swung(quaternion=True, seconds=1.0)
+    (window,) = windows_of(recording)
+    effect = effect_class("nominal_latency")("angle", "turned")
+    prediction = Prediction(drawing(recording), (effect,), [window])
+    assert prediction.measured_only.tolist() == [True, True]
+    rows = {r.channel: r.rows for r in window.readings}
+    plain, moved = (prediction.residuals([SimulationRequest(0, np.array([d, 0.0]))])[0] for d in (0.0, 1e-3))
+    assert prediction.simulated == pytest.approx(1.0)
+    np.testing.assert_array_equal(moved[rows["turned"]], plain[rows["turned"]])
+    angle = next(r for r in window.readings if r.channel == "angle")
+    (reader,) = prediction.readers([SimulationRequest(0, np.zeros(2))])
+    earlier = reader("angle", angle.time - 1e-3)
+    np.testing.assert_allclose(moved[rows["angle"]], (angle.value - earlier)[:, 0] / NOISE, atol=1e-9)
+    assert np.abs(moved - plain).max() > 1.0
+
+
+@pytest.mark.parametrize("delay", [6e-4, -4e-4])
+def test_the_delay_of_a_channel_is_found(delay):
+    recording = swung(damping=0.0)
+    (d,) = recording.demonstrations
+    d.measured["angle"].time[:] += delay
+    solver = Solver(Prediction(drawing(recording), (effect_class("nominal_latency")("angle"),), windows_of(recording)))
+    assert solver.fit().values[0] == pytest.approx(delay, abs=1e-4)
+
+
+def test_a_delay_beyond_the_tolerance_of_clocks_ends_at_the_bound():
+    recording = swung(damping=0.0)
+    (d,) = recording.demonstrations
+    d.measured["angle"].time[:] += 4e-3
+    solver = Solver(Prediction(drawing(recording), (effect_class("nominal_latency")("angle"),), windows_of(recording)))
+    assert solver.fit().values[0] == pytest.approx(1e-3)

@@ -15,14 +15,18 @@ NOISE = 1e-3
 """Standard deviation of an angle [rad]."""
 DAMPING = 0.02
 """What drawings of it lack [N m s/rad]."""
+TIMESTEP = 0.005
+"""Of the simulation [s]."""
+PERIOD = 0.01
+"""Time from one sample to the next [s]."""
 
 
-def swing_scene(damping: float = 0.0, *, kp: float = 1.0, quaternion: bool = False) -> str:
+def swing_scene(damping: float = 0.0, *, kp: float = 1.0, quaternion: bool = False, timestep: float = TIMESTEP) -> str:
     """Return the scene with some damping in the joint [N m s/rad]."""
     more = '<framequat name="turned" objtype="xbody" objname="arm"/>' if quaternion else ""
     return f"""
     <mujoco>
-      <option timestep="0.005" integrator="implicitfast"/>
+      <option timestep="{timestep}" integrator="implicitfast"/>
       <worldbody>
         <body name="arm" pos="0 0 1">
           <joint name="hinge" axis="0 1 0" damping="{damping}"/>
@@ -41,6 +45,7 @@ def swung(
     seed: int = 0,
     told: float = 0.0,
     quaternion: bool = False,
+    timestep: float = TIMESTEP,
 ) -> Recording:
     """Return a recording of one swing from 0.3 rad, commanded in steps.
 
@@ -50,9 +55,10 @@ def swung(
         seed: Of the noise.
         told: By how much the initial angle that the recording tells is off [rad].
         quaternion: Whether the orientation of the arm is measured too.
+        timestep: Of the simulation [s]; that of the recording's scene is `TIMESTEP`.
     """
     rng = np.random.default_rng(seed)
-    m = mujoco.MjModel.from_xml_string(swing_scene(damping, quaternion=quaternion))
+    m = mujoco.MjModel.from_xml_string(swing_scene(damping, quaternion=quaternion, timestep=timestep))
     d = mujoco.MjData(m)
     d.qpos[0] = 0.3
     steps = round(seconds / m.opt.timestep)
@@ -64,8 +70,8 @@ def swung(
         mujoco.mj_forward(m, d)
         rows.append(d.sensordata.copy())
         mujoco.mj_step(m, d)
-    rows = np.array(rows)[::2]
-    time = 2 * m.opt.timestep * np.arange(len(rows))
+    rows = np.array(rows)[:: round(PERIOD / timestep)]
+    time = PERIOD * np.arange(len(rows))
     measured = {"angle": Channel(time, rows[:, :1] + rng.normal(0, NOISE, (len(rows), 1)), NOISE)}
     if quaternion:
         turned = rows[:, 1:5].copy()

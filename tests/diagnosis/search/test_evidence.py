@@ -111,9 +111,9 @@ def test_an_interval_is_two_standard_deviations_and_the_formulas_own_error(base,
     assert (wide.low, wide.high) == (p.low, p.high)
 
 
-def order(base, pairs) -> list[str]:
+def order(base, pairs, cfg: SearchCfg | None = None) -> list[str]:
     """Return the names of those that are indistinguishable, in their order."""
-    return [f.name for _, f in indistinguishable(base, pairs, SearchCfg())]
+    return [f.name for _, f in indistinguishable(base, pairs, cfg or SearchCfg())]
 
 
 def pair(base, c, name, value=None) -> tuple[FittedCandidate, Finding]:
@@ -140,8 +140,28 @@ def test_of_two_with_the_same_errors_the_rarer_comes_second(base, damping, monke
 
 def test_of_two_with_the_same_errors_the_larger_value_comes_second(base, damping):
     scale = Prediction(base.model, (damping.effect,), base.windows).parameters[-1].scale
-    pairs = [pair(base, damping, "large", 9 * scale), pair(base, damping, "small", scale)]
+    pairs = [pair(base, damping, "large", 6 * scale), pair(base, damping, "small", scale)]
     assert order(base, pairs) == ["small", "large"]
+
+
+def test_of_two_with_the_same_errors_one_that_is_implausible_is_left_out(base, damping, monkeypatch):
+    p = Prediction(base.model, (damping.effect,), base.windows).parameters[-1]
+    # Under the Cauchy prior of sizes the odds of 1 and x times the scale are (1 + x^2) / 2.
+    for size, odds in ((6.24, 20.0), (6.25, 20.0), (9.0, 20.0), (9.0, 42.0), (3.0, 4.9), (3.0, 5.1)):
+        named = (1 + size**2) / 2 < odds
+        pairs = [pair(base, damping, "large", p.null + size * p.scale), pair(base, damping, "small", p.null + p.scale)]
+        assert order(base, pairs, SearchCfg(max_odds=odds)) == (["small", "large"] if named else ["small"])
+    # The rarity of an effect counts as much as the size of its value.
+    friction = fit_candidate(base, screen(base, effect_class("joint_friction")("hinge")))
+    null = Prediction(base.model, (friction.effect,), base.windows).parameters[-1].null
+    pairs = [
+        pair(base, replace(friction, errors=damping.errors), "friction", null),
+        pair(base, damping, "damping", p.null),
+    ]
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 0.0)
+    for rarity, named in ((2 * np.log(20) - 0.01, ["damping", "friction"]), (2 * np.log(20) + 0.01, ["damping"])):
+        monkeypatch.setattr(effect_class("joint_friction"), "rarity", rarity)
+        assert order(base, pairs) == named
 
 
 def test_errors_that_fall_are_shares_of_each_channel(base, damping):

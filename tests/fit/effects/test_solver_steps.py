@@ -244,8 +244,8 @@ def test_initial_states_are_fitted_anew_where_the_cost_falls_by_much_less_than_p
     solver, state, _ = stepper(lambda v: 100 - 10 * v)
     calls: list[Any] = []
 
-    def fit_initial_states(values: Any, begin: Any, iterations: int) -> Any:
-        calls.append((values.copy(), begin, iterations))
+    def fit_initial_states(values: Any, begin: Any, iterations: int, known: Any) -> Any:
+        calls.append((values.copy(), begin, iterations, known))
         return [np.ones(2)], (np.ones((1, 2)),)
 
     mocked: Any = solver
@@ -255,6 +255,7 @@ def test_initial_states_are_fitted_anew_where_the_cost_falls_by_much_less_than_p
     assert found.refits == 2 - refitted
     if refitted:
         assert (calls[0][0][0], calls[0][2]) == (1.0, solver.cfg.refit_iterations)
+        assert calls[0][3] is state.starts
         np.testing.assert_array_equal(found.offsets, [np.ones(2)])
         np.testing.assert_array_equal(found.starts[0], 1.0)
         assert (found.cost, damping) == (90.0, 1e-3)
@@ -271,8 +272,9 @@ def test_refits_begin_where_the_step_led_unless_the_cost_has_doubled(worse, fres
     plain = solver.solve
     mocked.solve = lambda *given: (plain(*given)[0], moves)
 
-    def fit_initial_states(values: Any, begin: Any, iterations: int) -> Any:
+    def fit_initial_states(values: Any, begin: Any, iterations: int, known: Any) -> Any:
         del values, iterations
+        assert known is state.starts
         begun.append(begin[0])
         return list(begin), state.starts
 
