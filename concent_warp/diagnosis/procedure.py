@@ -156,7 +156,7 @@ class Procedure:
                 break
             if step and self._is_form_error(fitted[-1], first):
                 if self.provisional is None:
-                    if step == 1 and is_adequate(fitted[-1], self.noise_factors, cfg):
+                    if effects_alone or (step == 1 and is_adequate(fitted[-1], self.noise_factors, cfg)):
                         break
                     self.provisional = step
                 elif step > self.provisional:
@@ -383,7 +383,10 @@ class Procedure:
             replace(f, accepted=False, reason=reason) if f.accepted and f.step == self.provisional else f
             for f in self.findings
         ]
-        return found[: self.provisional + 1]
+        if found[-1] is fitted[-1]:
+            return found[: self.provisional + 1]
+        # Another effect has taken the place of an earlier one since.
+        return [*found[: self.provisional], refit_without_effect(found[-1], len(found[-1].model.effects) - 1)]
 
     def reconsidered(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, in the last one the effect of each addition that explains most beside the others.

@@ -293,6 +293,28 @@ def test_an_effect_beside_an_error_of_form_stays_if_it_explains_that_or_makes_an
         assert len(made.hypotheses) == (2 if left == 3 else 3)
 
 
+def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monkeypatch):
+    monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
+    made, coarse = procedure(), [node(5.0), node(1.26), node(1.0)]
+    monkeypatch.setattr(made, "find_addition", lambda _base, step: (coarse[step + 1], ()))
+    assert made.add_effects(coarse[:1], (), effects_alone=True) == (coarse[:2], ())
+    assert made.provisional is None
+
+
+def test_a_dropped_addition_leaves_the_effects_that_were_reconsidered_beside_it(monkeypatch):
+    made, swapped, left = procedure(), node(1.0, effects=2), node(1.3, effects=1)
+    nodes = [node(5.0), node(1.3, effects=1), node(1.2, effects=2)]
+    made.provisional, made.groups, made.hypotheses = 1, [("b",), ("c",)], [{}, {}]
+    made.findings = [finding("b", 0.5), finding("c", 0.2, step=1)]
+    monkeypatch.setattr(made, "reconsidered", lambda fitted: [*fitted[:-1], swapped])
+    monkeypatch.setattr(made, "remove_superfluous", lambda fitted: fitted)
+    asked: list[Any] = []
+    monkeypatch.setattr(module, "refit_without_effect", lambda last, effect: asked.append((last, effect)) or left)
+    assert made.simplified(nodes) == [nodes[0], left]
+    assert asked == [(swapped, 1)]
+    assert [f.name for f in made.findings if f.accepted] == ["b"]
+
+
 def rivals(*names: str, step: int = 0) -> tuple[Rival, ...]:
     """Return effects that explained nearly as much as each other."""
     added: Any = "added"

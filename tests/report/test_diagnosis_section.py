@@ -49,6 +49,12 @@ def test_an_effect_is_named_with_its_gain_interval_p_and_parameter():
     assert "Next experiment" not in text
 
 
+def test_what_formulas_leave_is_named_as_their_error():
+    text = words_of(diagnosis_section({**NAMED, "form_error": 0.043}))
+    assert "What is left, 4 % of the error, is no more than errors in the formulas of the effects." in text
+    assert "stays unexplained" not in text
+
+
 def test_several_accepted_effects_are_all_named():
     both = {**NAMED, "effects": [effect("joint_friction", 0.4, 0.005), effect("load_friction", 0.3, 0.01)]}
     text = _headline(both)
