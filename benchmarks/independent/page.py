@@ -50,7 +50,7 @@ def page(rows: Sequence[Row], earlier: Sequence[Row], every: Sequence[DataSet], 
     before = {wanted: [r for r in earlier if r["locked"] is wanted] for wanted in (False, True)}
     revisions = ", ".join(f"`{c}`" for c in sorted({r.get("commit") or "-" for r in rows}))
     older = ", ".join(f"`{c}`" for c in sorted({r.get("commit") or "-" for r in earlier})) or "-"
-    seconds = np.array([r.get("processor_seconds", r["seconds"]) for r in rows] or [0.0])
+    seconds = np.array([r.get("processor_seconds", r["seconds"]) for r in rows if "seconds" in r] or [0.0])
     total = sum(c.name in {r["name"] for r in rows} for c in every)
     parts = [
         f"""# Diagnoses on independent worlds
@@ -137,7 +137,7 @@ def _wrong(rows: Sequence[Row], title: str) -> str:
             r.get("verdict", r.get("error", "error").strip().splitlines()[-1][:60].replace("|", "/")),
             named(r),
             " -> ".join(f"{x:.2f}" for x in r.get("ratio", ())),
-            f"{r['seconds']:.0f}",
+            f"{r['seconds']:.0f}" if "seconds" in r else "-",
         ]
         for r in sorted(rows, key=lambda r: (r["kind"], r["name"]))
         if not score(r)
