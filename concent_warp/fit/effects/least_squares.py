@@ -9,7 +9,7 @@ count by Huber's loss relative to their own spread, so that a few outliers have 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -58,6 +58,10 @@ class LeastSquaresCfg:
     target_change: Positive = 3.0
     """Mean change of the residuals that a finite difference aims at, in units of noise [-]: with contacts, residuals
     jump a little from value to value, and smaller steps measure the jumps."""
+    max_change: Positive = 10.0
+    """Mean change of the residuals above which a finite difference is taken again with a step for `target_change` where
+    there are contacts, in units of noise [-]: an orientation that turns by more than half a revolution, or a body that
+    comes to rest elsewhere, changes in the wrong direction. About three times `target_change`."""
     noise_ratio: float = 1.05
     """Residual over noise below which a window's initial state counts as found [-]."""
     same_state: float = 0.3
@@ -411,7 +415,44 @@ class Solver:
         for w, window in enumerate(known):
             jacobian[w][:, :first] = window.jacobian / self.scale[:first]
         self._adapt(jacobian)
+        self._retake(values, offsets, base, jacobian, {k: steps[k] for k in dynamic})
         return tuple(Linear(r, j * self.scale) for r, j in zip(base, jacobian, strict=True))
+
+    def _retake(
+        self,
+        values: np.ndarray,
+        offsets: Sequence[np.ndarray],
+        residuals: Sequence[np.ndarray],
+        jacobian: Sequence[np.ndarray],
+        taken: Mapping[int, float],
+    ) -> None:
+        """Take finite differences again whose steps change all residuals by more than `max_change`.
+
+        Only windows with contacts that change by more than that themselves are simulated again.
+
+        Args:
+            values: Parameters, shape (P,).
+            offsets: Errors of the initial states in units of their spread, one (2 nv,) a window.
+            residuals: Residuals there by window, each (n,).
+            jacobian: Their derivatives by the parameters, each (n, P); changed in place.
+            taken: Steps that were taken, by index of the parameter.
+        """
+        steps, share = self._steps(values), self.cfg.target_change / self.cfg.max_change
+        smaller = {k: steps[k] for k, h in taken.items() if abs(steps[k]) < share * abs(h)}
+        far = [
+            (k, w)
+            for k in smaller
+            for w, j in enumerate(jacobian)
+            if not self.p.windows[w].smooth and np.sqrt(np.mean(j[:, k] ** 2)) * abs(taken[k]) > self.cfg.max_change
+        ]
+        if not far:
+            return
+        moved = {k: values + h * (np.arange(len(values)) == k) for k, h in smaller.items()}
+        trials = {k: self.trials(moved[k], offsets) for k in {k for k, _ in far}}
+        found = self.p.residuals([trials[k][w] for k, w in far])
+        for (k, w), residual in zip(far, found, strict=True):
+            jacobian[w][:, k] = (residual - residuals[w]) / smaller[k]
+        self._adapt(jacobian)
 
     def _steps(self, values: np.ndarray) -> np.ndarray:
         """Return the steps of finite differences, away from the bounds."""
