@@ -97,6 +97,9 @@ class Effect:
     rarity: ClassVar[float] = 0.0
     """Twice the logarithm of how much rarer it is than a wrong friction or mass; orders effects that the data do
     not distinguish."""
+    special_cases: ClassVar[tuple[str, ...]] = ()
+    """Names of effects of fewer parameters that it equals at some of its values; it is not named beside one of them
+    that explains as much."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
     nominal: ClassVar[bool] = False

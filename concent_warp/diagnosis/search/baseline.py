@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, nominal_parameters
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
@@ -75,13 +75,13 @@ def fitted_model(
 ) -> FittedModel:
     """Return a fitted model with its residuals, the limit of its robust loss and its held-out errors."""
     settings = cfg.least_squares
-    pieces = tuple(_without_bounded(model, projected(fit, settings.robust)))
+    pieces = tuple(without_bounded(model, projected(fit, settings.robust)))
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
-    errors = HeldOut(block_sums(pieces, blocks, limit), blocks, settings.prior).own()
+    errors = HeldOut(block_sums(pieces, blocks, limit), blocks, settings.prior, nominal_parameters(model)).own()
     return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine, cfg)
 
 
-def _without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:
+def without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:
     """Return sensitivities of 0 to nominal values at their bounds, beyond which no linear step may lead.
 
     Args:

@@ -19,6 +19,12 @@ from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
 
 
+def nominal_parameters(model: Model) -> np.ndarray:
+    """Return which parameters of a model's effects are nominal values, shape (P,) bool."""
+    found = [np.full(len(added.values), added.effect.nominal) for added in model.effects]
+    return np.concatenate([np.zeros(0, dtype=bool), *found])
+
+
 @dataclass(frozen=True)
 class FittedModel:
     """A model with its own parameters and the initial states fitted: the baseline that a candidate must beat."""
@@ -69,8 +75,13 @@ class FittedModel:
         return Solver(self.prediction(*effects, windows=windows), self.cfg.least_squares)
 
     def held_out(self, pieces: Sequence[Linear]) -> HeldOut:
-        """Return the held-out errors of residuals and sensitivities by window, over the model's blocks."""
-        return HeldOut(block_sums(pieces, self.blocks, self.limit), self.blocks, self.cfg.least_squares.prior)
+        """Return the held-out errors of residuals and sensitivities by window, over the model's blocks.
+
+        Nominal values are those of all data in every fold: the gain is that of the effects.
+        """
+        sums, shared = block_sums(pieces, self.blocks, self.limit), nominal_parameters(self.model)
+        shared = np.pad(shared, (0, sums.slope.shape[1] - len(shared)))
+        return HeldOut(sums, self.blocks, self.cfg.least_squares.prior, shared)
 
     def projected(self, fit: Fit) -> list[Linear]:
         """Return residuals and sensitivities of a fit with the initial states eliminated, window by window."""

@@ -116,8 +116,10 @@ def indistinguishable(
     Their held-out errors differ from the best one's by less than `equal_standard_errors` standard errors, over blocks
     and including the roughness of the costs, or by less than the share `equal_error`. A candidate that leaves more also
     counts where the best is so much rarer that this outweighs it: the formula of a similar effect may fit slightly
-    better than that of the missing one, as simulations of the same formula differ too. One whose posterior odds against
-    the most plausible are worse than `max_odds` is left out.
+    better than that of the missing one, as simulations of the same formula differ too; it must not leave more than the
+    most plausible one by as much. One whose posterior odds against the most plausible are worse than `max_odds` is left
+    out, and so is one that has another one of them as a special case: what its further parameters explain is no
+    evidence.
 
     Args:
         base: The fitted baseline.
@@ -128,16 +130,31 @@ def indistinguishable(
     best = max(accepted, key=lambda pair: pair[1].gain)[0]
     group = []
     for c, f in accepted:
-        difference = c.errors - best.errors
-        # A cost is half a sum of squares, an error a whole one.
-        rough = 2 * np.hypot(c.cost_roughness, best.cost_roughness) if c is not best else 0.0
-        error = np.hypot(np.sqrt(len(difference)) * difference.std(), rough)
         rarer = best.effect.rarity - c.effect.rarity > _log_errors(base, c) - _log_errors(base, best)
-        bound = max(cfg.equal_standard_errors * error, cfg.equal_error * best.errors.sum())
-        if rarer or difference.sum() <= slack * bound:
+        if rarer or _leaves_as_little(c, best, cfg, slack):
             group.append((c, f))
     ranked = sorted(((_plausibility(base, *pair), pair) for pair in group), key=lambda found: -found[0])
-    return [pair for score, pair in ranked if score > ranked[0][0] - 2 * np.log(cfg.max_odds)]
+    (first, _), names = ranked[0][1], {c.effect.name for c, _ in group}
+    return [
+        (c, f)
+        for score, (c, f) in ranked
+        if c is first
+        or (
+            score > ranked[0][0] - 2 * np.log(cfg.max_odds)
+            and any(_leaves_as_little(c, other, cfg, slack) for other in (best, first))
+            and not names & set(c.effect.special_cases)
+        )
+    ]
+
+
+def _leaves_as_little(c: FittedCandidate, other: FittedCandidate, cfg: SearchCfg, slack: float) -> bool:
+    """Return whether the held-out error of a candidate exceeds another one's by no more than they may differ."""
+    difference = c.errors - other.errors
+    # A cost is half a sum of squares, an error a whole one.
+    rough = 2 * np.hypot(c.cost_roughness, other.cost_roughness) if c is not other else 0.0
+    error = np.hypot(np.sqrt(len(difference)) * difference.std(), rough)
+    bound = max(cfg.equal_standard_errors * error, cfg.equal_error * other.errors.sum())
+    return bool(difference.sum() <= slack * bound)
 
 
 def _log_errors(base: FittedModel, c: FittedCandidate) -> float:

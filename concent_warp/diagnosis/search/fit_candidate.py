@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.search.baseline import without_bounded
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.least_squares import Fit, Solver
@@ -20,10 +21,11 @@ def candidate_solver(base: FittedModel, effect: Effect, windows: Sequence[Window
 
 def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit) -> FittedCandidate:
     """Return a fit of a candidate with its residuals and held-out errors."""
-    pieces = tuple(base.projected(fit))
+    model = solver.p.model(fit.values)
+    pieces = tuple(without_bounded(model, base.projected(fit)))
     held_out = base.held_out(pieces)
     ratio = robust_noise_ratio([piece.residual for piece in pieces], base.cfg.least_squares.robust)
-    return FittedCandidate(effect, solver.p.model(fit.values), fit, held_out.sums, pieces, held_out.own(), ratio)
+    return FittedCandidate(effect, model, fit, held_out.sums, pieces, held_out.own(), ratio)
 
 
 def fit_candidate(base: FittedModel, screened: ScreenedCandidate) -> FittedCandidate:

@@ -12,6 +12,7 @@ from concent_warp.diagnosis.search.baseline import fitted_model
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
+from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model
 
@@ -41,7 +42,10 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
         FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)
     ]
     inside = found.ratio <= cfg.bounded_ratio or not any(p.at_bound for p in bounded)
-    return found if inside and found.errors.sum() < base.errors.sum() else None
+    sums, prior = block_sums(found.pieces, found.blocks, found.limit), base.cfg.least_squares.prior
+    # Here the values themselves are judged: each fold is predicted from those of the others.
+    errors = HeldOut(sums, found.blocks, prior).own()
+    return found if inside and errors.sum() < base.errors.sum() else None
 
 
 def nominal_effects(model: Model) -> list[int]:

@@ -146,6 +146,7 @@ class AnisotropicFriction(SurfaceEffect):
     source = "orthotropic Coulomb friction: Goyal, Ruina, Papadopoulos, Wear 143(2), 1991, as a force beside MuJoCo's"
     signature = "residual force against sliding in one direction of the table only"
     confusions = ("sliding_friction", "gravity_tilt")
+    rarity = 6.0
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one ratio."""

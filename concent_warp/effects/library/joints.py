@@ -174,6 +174,7 @@ class Stribeck(DryFriction):
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994"
     signature = "stick-slip and overshoot out of rest; residual torque near zero speed only"
     confusions = ("joint_friction", "backlash")
+    special_cases = ("joint_friction",)
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one torque for each joint, and the speed at which it has fallen to a third."""

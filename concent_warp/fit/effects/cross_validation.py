@@ -6,6 +6,7 @@ H_b = J_b' J_b, u_b = J_b' r_b and q_b = r_b' r_b.
 
 Cross-validation: the parameters are fitted without a fold of blocks by one Newton step from the fit to all of them,
 delta_f = -(H - H_f + prior)^-1 (u - u_f), and the fold's error is q_b + 2 delta_f' u_b + delta_f' H_b delta_f.
+Parameters that all folds share keep their part of H_f and u_f.
 
 Null distribution: under a complete model, residuals are noise. Blocks of what no candidate can explain, each with a
 random sign (wild bootstrap: Wu, Annals of Statistics 14, 1986; by blocks: Shao, J. Am. Stat. Assoc. 105, 2010), are
@@ -122,13 +123,24 @@ def block_sums(linear: Sequence[Linear], blocks: Blocks, limit: float) -> Sums:
 class HeldOut:
     """Held-out errors of one candidate, for its own residuals or for others."""
 
-    def __init__(self, sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior) -> None:
-        """Prepare the fits without each fold; `prior` is `LeastSquaresCfg.prior`."""
+    def __init__(
+        self, sums: Sums, blocks: Blocks, prior: float = LeastSquaresCfg.prior, shared: np.ndarray | None = None
+    ) -> None:
+        """Prepare the fits without each fold.
+
+        Args:
+            sums: Sums over the blocks.
+            blocks: The blocks.
+            prior: See `LeastSquaresCfg.prior`.
+            shared: Which parameters are those of all data in every fold, shape (P,) bool; by default none.
+        """
         self.sums, self.blocks = sums, blocks
         size = sums.slope.shape[1]
-        self._inverse = []
+        self._shared = np.zeros(size, dtype=bool) if shared is None else shared
+        both, self._inverse = np.outer(self._shared, self._shared), []
         for f in range(int(blocks.fold.max()) + 1):
-            kept = sums.normal[blocks.fold != f].sum(axis=0) + np.eye(size) / prior**2
+            out = blocks.fold == f
+            kept = sums.normal[~out].sum(axis=0) + np.eye(size) / prior**2 + both * sums.normal[out].sum(axis=0)
             self._inverse.append(np.linalg.pinv(kept, hermitian=True))
 
     def errors(self, slope: np.ndarray, square: np.ndarray) -> np.ndarray:
@@ -136,7 +148,8 @@ class HeldOut:
         errors = np.empty(np.broadcast_shapes(slope.shape[:-1], square.shape))
         for f, inverse in enumerate(self._inverse):
             out = self.blocks.fold == f
-            delta = -np.einsum("ij,...j->...i", inverse, slope[..., ~out, :].sum(axis=-2))
+            left = slope[..., ~out, :].sum(axis=-2) + self._shared * slope[..., out, :].sum(axis=-2)
+            delta = -np.einsum("ij,...j->...i", inverse, left)
             linear = 2 * np.einsum("...bi,...i->...b", slope[..., out, :], delta)
             curved = np.einsum("bij,...i,...j->...b", self.sums.normal[out], delta, delta)
             errors[..., out] = square[..., out] + linear + curved
