@@ -137,8 +137,8 @@ def indistinguishable(
     (first, _), names = ranked[0][1], {c.effect.name for c, _ in group}
     return [
         (c, f)
-        for score, (c, f) in ranked
-        if c is first
+        for place, (score, (c, f)) in enumerate(ranked)
+        if not place
         or (
             score > ranked[0][0] - 2 * np.log(cfg.max_odds)
             and any(_leaves_as_little(c, other, cfg, slack) for other in (best, first))

@@ -182,3 +182,38 @@ def test_the_detectable_size_adds_the_share_to_the_error(base):
     assert curvature * (found.size / p.scale) ** 2 == pytest.approx(0.1 * base.errors.sum())
     assert detectable_size(base, screened, 0.4).size == pytest.approx(2 * found.size)
     assert detectable_size(base, screened, 1e9) is None
+
+
+def test_of_two_with_the_same_errors_one_with_the_other_as_a_special_case_is_left_out(base, damping, monkeypatch):
+    friction = replace(
+        fit_candidate(base, screen(base, effect_class("joint_friction")("hinge"))), errors=damping.errors
+    )
+    null = {c.effect.name: base.prediction(c.effect).parameters[-1].null for c in (friction, damping)}
+    pairs = [
+        pair(base, friction, "friction", null["joint_friction"]),
+        pair(base, damping, "damping", null["joint_damping"]),
+    ]
+    monkeypatch.setattr(effect_class("joint_friction"), "rarity", 1.0)
+    assert order(base, pairs) == ["damping", "friction"]
+    monkeypatch.setattr(effect_class("joint_friction"), "special_cases", ("joint_damping",))
+    assert order(base, pairs) == ["damping"]
+    # The special case is not left out for the sake of what contains it.
+    monkeypatch.setattr(effect_class("joint_friction"), "special_cases", ())
+    monkeypatch.setattr(effect_class("joint_damping"), "special_cases", ("mass",))
+    assert order(base, pairs) == ["damping", "friction"]
+
+
+def test_one_that_a_rare_best_lets_in_must_not_leave_more_than_the_likeliest(base, damping, monkeypatch):
+    friction = fit_candidate(base, screen(base, effect_class("joint_friction")("hinge")))
+    armature = fit_candidate(base, screen(base, effect_class("armature")("hinge")))
+    monkeypatch.setattr(effect_class("joint_damping"), "rarity", 6.0)
+    more = np.exp(3.0 / base.blocks.count)
+    found = {}
+    for factor in (1.0, more):
+        pairs = [
+            pair(base, damping, "rare", None),
+            pair(base, replace(friction, errors=factor * damping.errors), "likeliest", 0.0),
+            pair(base, replace(armature, errors=more * damping.errors), "other", None),
+        ]
+        found[factor] = set(order(base, pairs, SearchCfg(max_odds=1e9, equal_standard_errors=0.1, equal_error=0.001)))
+    assert found == {1.0: {"rare", "likeliest"}, more: {"rare", "likeliest", "other"}}

@@ -69,7 +69,8 @@ class MadeUpModel(FittedModel):
 def base_of(owned: int = 1, **changes: Any) -> Any:
     """Return a fitted model with random residuals."""
     own = pieces(0, owned)
-    made = MadeUpModel(ANY, (), blocks(), ANY, own, LIMIT, np.zeros(COUNT))
+    bare = cast("Any", SimpleNamespace(effects=()))
+    made = MadeUpModel(bare, (), blocks(), ANY, own, LIMIT, np.zeros(COUNT))
     return replace(made, **{"errors": made.held_out(own).own(), **changes})
 
 
@@ -193,7 +194,8 @@ class OneEffect:
 
 def fitted(errors: np.ndarray, **changes: Any) -> Any:
     """Return a fitted candidate with held-out errors."""
-    effect = SimpleNamespace(rarity=changes.pop("rarity", 0.0), name="mass", target=("x",), family="objects")
+    rarity = changes.pop("rarity", 0.0)
+    effect = SimpleNamespace(rarity=rarity, special_cases=(), name="mass", target=("x",), family="objects")
     values = np.array([0.3, 1.7, -0.2, 5.0])
     base = FittedCandidate(
         cast("Any", effect),

@@ -165,3 +165,20 @@ def test_robust_losses_at_written_down_points():
     np.testing.assert_allclose(cauchy_weight(np.array([0.0, 2.0, -6.0])), [1.0, 0.5, 0.1])
     assert huber_limit([np.array([1.0, -5.0]), np.array([2.0])]) == pytest.approx(4 * 1.4826 * 2.0)
     assert huber_limit([np.array([0.1, -0.5])]) == 4.0
+
+
+def test_parameters_that_folds_share_are_estimated_from_all_blocks():
+    rng = np.random.default_rng(4)
+    rows = np.arange(60) // 6
+    blocks = Blocks((rows,), np.arange(10) % 5, np.zeros(10, int), np.arange(10.0), np.arange(10.0) + 1)
+    jacobian, noise = rng.normal(size=(60, 2)), rng.normal(size=60)
+    jacobian[:, 0] *= np.where(rows % 5 == 0, 50.0, 0.01)  # one fold alone determines the first parameter
+    sums = block_sums([Linear(noise, jacobian)], blocks, np.inf)
+    apart, together = HeldOut(sums, blocks).own(), HeldOut(sums, blocks, 10.0, np.array([True, False])).own()
+    assert apart.sum() > 10 * noise @ noise
+    assert together.sum() < 1.3 * noise @ noise
+    # Where all are shared, each fold has the least-squares step of all data.
+    step = -np.linalg.solve(jacobian.T @ jacobian + 0.01 * np.eye(2), jacobian.T @ noise)
+    left = (noise + jacobian @ step) ** 2
+    expected = [left[rows == b].sum() for b in range(10)]
+    assert HeldOut(sums, blocks, 10.0, np.ones(2, bool)).own() == pytest.approx(expected)
