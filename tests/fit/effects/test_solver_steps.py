@@ -188,6 +188,32 @@ def test_finite_differences_aim_at_a_change_of_the_residuals():
     np.testing.assert_allclose(solver.step, [3.0 / 200, 0.3, 0.3])
 
 
+@pytest.mark.parametrize("smooth", [False, True])
+def test_where_there_are_contacts_a_finite_difference_that_changes_too_much_is_taken_again(smooth):
+    solver = solver_of(2, start=(0.0,), low=(-10.0,), high=(10.0,))
+    prediction: Any = solver.p
+    prediction.windows = [replace(w, smooth=smooth) for w in prediction.windows]
+    # An angle that turns by 400 a unit, in units of noise, and wraps at +-6: its first step of 0.02 leads beyond.
+    wrapped = lambda x: (400.0 * x + 6.0) % 12.0 - 6.0  # noqa: E731
+    far = lambda x: 1000.0 * x  # noqa: E731
+    observed = lambda w, _, values: np.array([far(values[0]), wrapped(values[0])][w : w + 1])  # noqa: E731
+    prediction.observed = observed
+    prediction.readers = lambda trials: [None] * len(trials)
+    prediction.residuals = lambda trials: [observed(t.window, None, t.values) for t in trials]
+    first, second = solver.linearise(np.zeros(1), [np.zeros(2)] * 2)
+    scale = solver.scale[0]
+    assert first.jacobian[0, 0] == pytest.approx(1000.0 * scale)
+    wrong = wrapped(0.1 * scale) / 0.1
+    assert wrong < 0
+    # The second window changes by 4 alone, which is no more than is allowed: only the first is simulated again.
+    assert second.jacobian[0, 0] == pytest.approx(wrong)
+    prediction.observed = observed = lambda w, _, values: np.array([far(values[0]), 3 * wrapped(values[0])][w : w + 1])
+    prediction.residuals = lambda trials: [observed(t.window, None, t.values) for t in trials]
+    solver.step = np.array([0.1])
+    _, second = solver.linearise(np.zeros(1), [np.zeros(2)] * 2)
+    assert second.jacobian[0, 0] == pytest.approx(3 * wrong if smooth else 1200.0 * scale)
+
+
 def stepper(f: Any, **options: Any) -> tuple[Solver, _State, list[float]]:
     """Return a solver of one parameter whose cost is f(value), its state at 0, and the dampings that are tried."""
     solver = solver_of(1, start=(0.0,), low=(-10.0,), high=(10.0,), **options)
