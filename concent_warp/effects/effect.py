@@ -100,6 +100,11 @@ class Effect:
     special_cases: ClassVar[tuple[str, ...]] = ()
     """Names of effects of fewer parameters that it equals at some of its values; it is not named beside one of them
     that explains as much."""
+    formula_error: ClassVar[float] = 0.0
+    """Standard deviation of the effect's size between repeated measurements, relative to it [-]: by how much what the
+    formula leaves out (wear, temperature, place) changes its parameters. Part of their intervals."""
+    part_of: ClassVar[str] = ""
+    """Name of the effect that is the same quantity without a tolerance, for a nominal value."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")
     """Engines that can express it."""
     nominal: ClassVar[bool] = False

@@ -13,7 +13,7 @@ from concent_warp.diagnosis.search.candidates import label
 from concent_warp.diagnosis.search.null_distribution import null_p_value
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
-from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, formula_errors
 
 
 def assess(
@@ -68,14 +68,13 @@ def assess(
 def fitted_parameters(base: FittedModel, c: FittedCandidate) -> tuple[FittedParameter, ...]:
     """Return the parameters of a candidate with their 95 % intervals (normal, robust to correlation in blocks).
 
-    The error of the formula itself is included, see `discretisation_errors`.
+    The error of the formula itself is included, see `formula_errors`.
     """
     prediction = base.prediction(c.effect)
     std = np.sqrt(np.diag(covariance(c.sums, base.blocks, base.cfg.least_squares.prior))) if c.std is None else c.std
     fresh = range(prediction.owned, len(prediction.parameters))
-    formula = discretisation_errors(
-        [prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :], base.cfg.discretisation_error
-    )
+    parameters, values = [prediction.parameters[k] for k in fresh], c.fit.values[prediction.owned :]
+    formula = formula_errors(c.effect, parameters, values, base.cfg.discretisation_error)
     reaches = [
         NORMAL_QUANTILE * np.hypot(std[k] * prediction.parameters[k].scale, formula[k - prediction.owned])
         for k in fresh

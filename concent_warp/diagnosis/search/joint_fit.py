@@ -11,7 +11,7 @@ from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.baseline import fitted_model
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.fit.effects.cross_validation import block_sums, bootstrap_interval
-from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, clustered_std, formula_errors
 
 
 def refit_jointly(last: FittedModel) -> FittedModel:
@@ -26,27 +26,31 @@ def refit_jointly(last: FittedModel) -> FittedModel:
 
 
 def joint_parameters(
-    last: FittedModel, widening: Mapping[int, np.ndarray] | None = None
+    last: FittedModel, widening: Mapping[int, np.ndarray] | None = None, nominal: np.ndarray | None = None
 ) -> list[tuple[FittedParameter, ...]]:
     """Return the parameters of each effect of a fitted model with 95 % intervals, in the order of its effects.
 
-    The covariance is that of the joint fit, robust to correlation within blocks; the error of the formulas themselves
-    is included, see `discretisation_errors`.
+    The spread is that of the joint fit, robust to correlation within and between blocks, see `clustered_std`; the error
+    of the formulas themselves is included, see `formula_errors`.
 
     Args:
         last: The fitted model.
         widening: By how much the profile likelihood of an effect is wider than the linear fit, by the index of the
             effect, one factor a parameter.
+        nominal: Standard deviations of all parameters due to errors of nominal values, in units of their scale (P,),
+            see `nominal_errors`.
     """
     prediction = last.prediction()
     sums = block_sums(last.pieces, last.blocks, last.limit)
-    std = np.sqrt(np.diag(covariance(sums, last.blocks, last.cfg.least_squares.prior)))
+    std = clustered_std(sums, last.blocks, last.cfg.least_squares.prior)
+    nominal = np.zeros(len(std)) if nominal is None else nominal
     found = []
     for k, part in enumerate(prediction.split):
         parameters, values = prediction.parameters[part], last.fit.values[part]
-        formula = discretisation_errors(parameters, values, last.cfg.discretisation_error)
+        formula = formula_errors(last.model.effects[k].effect, parameters, values, last.cfg.discretisation_error)
         factors = np.ones(len(parameters)) if widening is None or k not in widening else widening[k]
-        reaches = NORMAL_QUANTILE * np.hypot(std[part] * factors * [p.scale for p in parameters], formula)
+        spread = np.hypot(std[part] * factors, nominal[part]) * [p.scale for p in parameters]
+        reaches = NORMAL_QUANTILE * np.hypot(spread, formula)
         found.append(
             tuple(
                 FittedParameter.within(p, float(value), float(reach))

@@ -11,7 +11,7 @@ import numpy as np
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.library.contact_forces import AdhesionForce, AnisotropicForce
 from concent_warp.effects.library.drives import GRIP_FACTORS
-from concent_warp.effects.library.joints import MUJOCO
+from concent_warp.effects.library.joints import FRICTION_SCATTER, MUJOCO
 from concent_warp.effects.select import (
     element_name,
     fingers,
@@ -97,6 +97,7 @@ class SlidingFriction(FrictionEffect):
     source = COULOMB
     signature = "residual force against sliding, whatever the speed, in proportion to the normal force"
     confusions = ("anisotropic_friction", "mass", "grip_force", "gravity_tilt", "torsional_friction")
+    formula_error = FRICTION_SCATTER
     column, condim = SLIDING, 3
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -113,6 +114,7 @@ class TorsionalFriction(FrictionEffect):
     source = COULOMB
     signature = "spin about the normal that dies away too soon, while sliding is right"
     confusions = ("sliding_friction", "inertia", "rolling_friction")
+    formula_error = FRICTION_SCATTER
     column, condim = TORSIONAL, 4
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -128,6 +130,7 @@ class RollingFriction(FrictionEffect):
     source = COULOMB
     signature = "rolling that slows down at a constant rate"
     confusions = ("sliding_friction", "air_drag", "gravity_tilt")
+    formula_error = FRICTION_SCATTER
     column, condim = ROLLING, 6
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -147,6 +150,7 @@ class AnisotropicFriction(SurfaceEffect):
     signature = "residual force against sliding in one direction of the table only"
     confusions = ("sliding_friction", "gravity_tilt")
     rarity = 6.0
+    formula_error = FRICTION_SCATTER
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one ratio."""
@@ -237,6 +241,7 @@ class PadFriction(Effect):
     source = f"Coulomb friction in MuJoCo's contacts, the pads' coefficient by priority ({MUJOCO})"
     signature = "the grasped object slips or does not"
     confusions = ("grip_force", "mass")
+    formula_error = FRICTION_SCATTER
     requirement = "bodies with geoms that collide"
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:

@@ -18,6 +18,10 @@ TIME_CONSTANT_STEPS = 1.5
 """Time constant of friction constraints in time steps [-]; with MuJoCo's default, joints at rest creep."""
 FRICTION_IMPEDANCE = 0.99
 """Impedance of friction constraints [-]: with MuJoCo's default, 0.9, a joint at rest creeps visibly in stick-slip."""
+FRICTION_SCATTER = 0.03
+"""Relative standard deviation of friction between repeated measurements [-]: several per cent, as it varies with place,
+time and temperature (joints: Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30(7), 1994; Bittencourt and
+Gunnarsson, J. Dyn. Sys. Meas. Control 134(5), 2012; contacts: Yu, Bauza, Fazeli and Rodriguez, IROS 2016)."""
 MUJOCO = "MuJoCo documentation, chapters Computation and Modeling"
 
 
@@ -52,6 +56,8 @@ class JointEffect(Effect):
 
 class DryFriction(JointEffect):
     """Friction that holds the joint at rest."""
+
+    formula_error = FRICTION_SCATTER
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Let it hold stiffly, where the joint has no friction of its own yet."""
@@ -97,6 +103,7 @@ class JointDamping(JointEffect):
     source = f"viscous friction; MuJoCo's joint damping ({MUJOCO})"
     signature = "residual torque in proportion to velocity"
     confusions = ("joint_friction", "actuator_gain", "air_drag")
+    formula_error = FRICTION_SCATTER
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
         """Return one coefficient for each joint."""

@@ -59,6 +59,7 @@ class NominalMass(NominalBodyValue):
     summary = "Mass and inertia are the model's times a factor within the tolerance of nominal values."
     signature = "residual force in proportion to acceleration and gravity"
     confusions = ("mass",)
+    part_of = "mass"
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor a body."""
@@ -122,6 +123,7 @@ class NominalSize(Size):
     summary = "The geoms of the body are the model's times a factor within the tolerance of nominal values."
     source = "tolerance of nominal values"
     confusions = ("size", "length_scale")
+    part_of = "size"
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor."""
@@ -135,6 +137,7 @@ class NominalGain(ActuatorGain):
     nominal = True
     summary = "The drive's force is the model's times a factor within the tolerance of nominal values."
     confusions = ("actuator_gain",)
+    part_of = "actuator_gain"
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one factor an actuator."""
@@ -177,6 +180,7 @@ class NominalLatency(MeasurementEffect):
     summary = "What a channel stamps t was seen at t - delay, with a delay within the tolerance of clocks."
     signature = "residuals in proportion to velocity, at the same delay in all phases"
     confusions = ("latency", "actuator_delay")
+    part_of = "latency"
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:

@@ -14,7 +14,13 @@ from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import block_sums, cut_blocks
 from concent_warp.fit.effects.initial_states import start_cost, start_step
-from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import (
+    NORMAL_QUANTILE,
+    FittedParameter,
+    clustered_std,
+    covariance,
+    formula_errors,
+)
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
@@ -229,19 +235,20 @@ def _fitted_parameters(
 ) -> tuple[list[FittedParameter], np.ndarray]:
     """Return the parameters with their 95 % intervals, P of them, and the correlations of these (P, P).
 
-    The intervals combine the covariance of the linear fit with `discretisation_errors`.
+    The intervals combine the spread of the linear fit, see `clustered_std`, with `formula_errors`.
     """
     settings, blocks = cfg.least_squares, cut_blocks(windows, cfg.blocks)
     limit = huber_limit([window_linear.residual for window_linear in linear], settings.robust)
-    covered = covariance(block_sums(linear, blocks, limit), blocks, settings.prior)
+    sums = block_sums(linear, blocks, limit)
+    covered = covariance(sums, blocks, settings.prior)
     std = np.sqrt(np.maximum(np.diag(covered), 1e-300))
-    force_model = np.zeros(len(std))
-    for part in solver.p.split:
+    formula = np.zeros(len(std))
+    for effect, part in zip(solver.p.effects, solver.p.split, strict=True):
         if part.stop > part.start:
-            force_model[part] = discretisation_errors(
-                solver.p.parameters[part], fit.values[part], cfg.discretisation_error
+            formula[part] = formula_errors(
+                effect, solver.p.parameters[part], fit.values[part], cfg.discretisation_error
             )
-    reaches = NORMAL_QUANTILE * np.hypot(std * solver.scale, force_model)
+    reaches = NORMAL_QUANTILE * np.hypot(clustered_std(sums, blocks, settings.prior) * solver.scale, formula)
     found = []
     for q, fitted, reach in zip(solver.p.parameters, fit.values, reaches, strict=True):
         value = float(fitted)

@@ -20,7 +20,7 @@ from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
-from concent_warp.fit.effects.intervals import covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import covariance, formula_errors
 from concent_warp.fit.effects.prediction import Prediction
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -99,7 +99,7 @@ def test_an_effect_whose_parameter_may_be_null_or_is_at_its_bound_is_not_accepte
 def test_an_interval_is_two_standard_deviations_and_the_formulas_own_error(base, damping):
     (found,) = fitted_parameters(base, damping)
     p = Prediction(base.model, (damping.effect,), base.windows).parameters[-1]
-    own = discretisation_errors([p], damping.fit.values[-1:], base.cfg.discretisation_error)[0]
+    own = formula_errors(damping.effect, [p], damping.fit.values[-1:], base.cfg.discretisation_error)[0]
     std = np.sqrt(covariance(damping.sums, base.blocks)[-1, -1]) * p.scale
     assert std > 0
     assert found.high - found.value == pytest.approx(1.96 * np.hypot(std, own), rel=1e-9)

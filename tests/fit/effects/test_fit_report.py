@@ -25,7 +25,7 @@ from concent_warp.fit.effects.fit import (
     fit_effects,
 )
 from concent_warp.fit.effects.initial_states import start_cost, start_step
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import FittedParameter, clustered_std, covariance, discretisation_errors
 from concent_warp.fit.effects.least_squares import Fit, LeastSquaresCfg, Linear
 from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from tests.fit.effects.test_fit_effects import model_with
@@ -42,7 +42,7 @@ PARAMETERS = (
 
 def solver_of(parameters: Any = PARAMETERS, split: Any = None, **options: Any) -> Any:
     split = split or [slice(k, k + 1) for k in range(len(parameters))]
-    names = [SimpleNamespace(name=f"effect_{k}") for k in range(len(split))]
+    names = [SimpleNamespace(name=f"effect_{k}", formula_error=0.0) for k in range(len(split))]
     prediction = SimpleNamespace(parameters=parameters, split=split, effects=names)
     scale = np.array([p.scale for p in parameters])
     high = np.array([p.high for p in parameters])
@@ -70,9 +70,9 @@ def test_intervals_combine_the_covariance_and_the_discretisation_error():
     values = [4.0, -3.0, 1.5]
     found, correlation = _fitted_parameters(solver_of(), fit_of(values), linear, windows, CFG)
     blocks = cut_blocks(windows)
-    covered = covariance(block_sums(linear, blocks, huber_limit([x.residual for x in linear])), blocks)
-    std = np.sqrt(np.diag(covered))
-    np.testing.assert_allclose(correlation, covered / np.outer(std, std))
+    sums = block_sums(linear, blocks, huber_limit([x.residual for x in linear]))
+    covered, std = covariance(sums, blocks), clustered_std(sums, blocks)
+    np.testing.assert_allclose(correlation, covered / np.sqrt(np.outer(np.diag(covered), np.diag(covered))))
     for k, (p, q) in enumerate(zip(PARAMETERS, found, strict=True)):
         model = discretisation_errors([p], np.array([values[k]]), CFG.discretisation_error)[0]
         reach = NORMAL * np.sqrt((std[k] * p.scale) ** 2 + model**2)
@@ -90,6 +90,15 @@ def test_an_effect_of_two_parameters_has_one_discretisation_error_and_one_of_non
     assert found[0].high - found[0].value == pytest.approx(NORMAL * largest * 1.0, rel=1e-3)
     assert found[1].high - found[1].value == pytest.approx(NORMAL * largest * 0.5, rel=1e-3)
     assert found[2].high - found[2].value == pytest.approx(NORMAL * 0.005 * 3.0, rel=1e-3)
+
+
+def test_an_interval_has_the_scatter_of_what_the_formula_leaves_out():
+    linear, windows = pieces((1e6, 1e6, 1e6))
+    solver = solver_of()
+    solver.p.effects[0].formula_error = 0.03
+    found, _ = _fitted_parameters(solver, fit_of([40.0, 2.0, 3.0]), linear, windows, CFG)
+    assert found[0].high - found[0].value == pytest.approx(NORMAL * np.hypot(0.03, 0.005) * 40.0, rel=1e-3)
+    assert found[1].high - found[1].value == pytest.approx(NORMAL * 0.005 * 2.0, rel=1e-3)
 
 
 def test_intervals_end_at_the_bounds_and_a_limit_that_is_hardly_determined_has_no_upper_end():

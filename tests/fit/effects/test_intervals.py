@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from concent_warp.effects.effect import Parameter
+from concent_warp.effects.library.joints import JointFriction
+from concent_warp.effects.library.measurement import LengthScale
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
-from concent_warp.fit.effects.intervals import FittedParameter, covariance, discretisation_errors
+from concent_warp.fit.effects.intervals import (
+    FittedParameter,
+    clustered_std,
+    covariance,
+    discretisation_errors,
+    formula_errors,
+)
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg
 
 PRIOR = LeastSquaresCfg.prior
@@ -71,6 +79,39 @@ def test_the_formulas_own_error_is_half_a_percent_of_the_largest_deviation():
     np.testing.assert_allclose(found, 0.005 * np.array([0.5, 2.0]) * (2.0 - 1.0) / 0.5)
     found = discretisation_errors(parameters, np.array([0.5, 6.0]), 0.005)
     np.testing.assert_allclose(found, 0.005 * np.array([0.5, 2.0]) * 6.0 / 2.0)
+
+
+def test_the_scatter_of_friction_adds_to_the_error_of_its_formula():
+    (p,) = parameters = (Parameter("torque", "N m", 0.0, 0.0, 9.0, 0.5),)
+    (friction,) = formula_errors(JointFriction("a"), parameters, np.array([2.0]), 0.005)
+    assert friction == pytest.approx(2.0 * np.hypot(0.005, 0.03))
+    two = (p, Parameter("torque", "N m", 0.0, 0.0, 99.0, 20.0))
+    each = formula_errors(JointFriction("a", "b"), two, np.array([2.0, 8.0]), 0.0)
+    assert each == pytest.approx([0.03 * 2.0, 0.03 * 8.0])
+    (exact,) = formula_errors(LengthScale("a"), (p,), np.array([2.0]), 0.005)
+    assert exact == pytest.approx(2.0 * 0.005)
+
+
+def test_scores_that_are_alike_in_neighbouring_blocks_widen_the_interval():
+    count = 48
+    alike = [*([10.0] * 12), *([-10.0] * 12)] * 2
+    turning = [10.0, -10.0] * (count // 2)
+    blocks = blocks_of(count)
+    few = clustered_std(sums_of(100.0, turning), blocks)[0] ** 2 / covariance(sums_of(100.0, turning), blocks)[0, 0]
+    assert 1.0 < few < 1.1
+    wide = clustered_std(sums_of(100.0, alike), blocks)[0] ** 2 / covariance(sums_of(100.0, alike), blocks)[0, 0]
+    lags, total = 3, 0.0  # 4 (48 / 100)^(2/9) = 3.4
+    for k in range(1, lags + 1):
+        total += 2 * (1 - k / 4) * sum(a * b for a, b in zip(alike[k:], alike[:-k], strict=True)) / (count * 100.0)
+    assert wide / few == pytest.approx(1 + total)
+    assert wide / few > 2.5
+
+
+def test_blocks_of_different_demonstrations_are_no_neighbours():
+    slope = [*([10.0] * 12), *([-10.0] * 12)] * 2
+    apart = Blocks((), np.arange(48) % 2, np.arange(48), np.arange(48.0), np.arange(48.0) + 1)
+    near, far = clustered_std(sums_of(100.0, slope), blocks_of(48)), clustered_std(sums_of(100.0, slope), apart)
+    assert far[0] < near[0]
 
 
 @pytest.mark.parametrize(
