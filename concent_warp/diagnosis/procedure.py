@@ -21,7 +21,7 @@ from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, FinerTimeStep, Verdict
-from concent_warp.diagnosis.search.adequacy import is_adequate, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
 from concent_warp.diagnosis.search.baseline import (
     add_candidate,
     fit_baseline,
@@ -42,6 +42,7 @@ from concent_warp.diagnosis.search.joint_fit import (
 )
 from concent_warp.diagnosis.search.nominal_values import (
     nominal_effects,
+    nominal_errors,
     with_nominal_values,
     without_nominal_values,
 )
@@ -165,7 +166,7 @@ class Procedure:
             if finer is not None and not is_lacking(finer, self.noise_factors, cfg):
                 fitted = self._adopt(fitted, finer)
                 break
-            if not effects_alone and (found := self._with_nominal(fitted, finer)) is not None:
+            if not effects_alone and (found := self._with_nominal(fitted, finer, first)) is not None:
                 fitted = found
                 continue
             if step >= cfg.max_additions:
@@ -197,7 +198,7 @@ class Procedure:
 
         Little is then left beside the discrepancy of the first model, and little beside the noise.
         """
-        left, lacked = one.ratio**2 - 1, first.ratio**2 - 1
+        left, lacked = discrepancies(one, first)
         return left < self.cfg.unknown_force.min_share * lacked and one.ratio <= self.cfg.form_error_ratio
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
@@ -208,22 +209,31 @@ class Procedure:
         unsettled = "Open: whether the model's time step is too long."
         return self.budget.attempt(lambda: finer_time_step(one, self.cfg), None, unsettled)
 
-    def _nominal(self, one: FittedModel) -> FittedModel | None:
-        """Return a fitted model with nominal values within their tolerance, None where that explains nothing more."""
+    def _nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None = None) -> FittedModel | None:
+        """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
+
+        Args:
+            one: The fitted model.
+            enough: Whether a model with values at their bounds leaves little enough.
+        """
         if not self.cfg.nominal.enabled or nominal_effects(one.model) or not self._is_lacking(one):
             return None
         self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
-        return self.budget.attempt(lambda: with_nominal_values(one, self.cfg.nominal), None, unsettled)
+        return self.budget.attempt(lambda: with_nominal_values(one, self.cfg.nominal, enough), None, unsettled)
 
-    def _with_nominal(self, fitted: list[FittedModel], finer: FittedModel | None) -> list[FittedModel] | None:
+    def _with_nominal(
+        self, fitted: list[FittedModel], finer: FittedModel | None, first: FittedModel
+    ) -> list[FittedModel] | None:
         """Return the fitted models, the last with nominal values and, where that explains as much, a shorter time step.
 
-        It is None where nominal values explain nothing more.
+        It is None where nominal values explain nothing more. Beside an effect they may be at their bounds where they
+        leave no more than an error in its formula, which they take up before another effect does.
         """
-        if finer is not None and (both := self._nominal(finer)) is not None:
+        enough = partial(self._is_form_error, first=first) if len(fitted) > 1 else None
+        if finer is not None and (both := self._nominal(finer, enough)) is not None:
             return [*self._adopt(fitted, finer)[:-1], both]
-        plain = self._nominal(fitted[-1])
+        plain = self._nominal(fitted[-1], enough)
         return None if plain is None else [*fitted[:-1], plain]
 
     def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
@@ -432,6 +442,7 @@ class Procedure:
             refit = partial(lambda given: list(run_tasks(refit_without_effect, given, self.cfg.jobs)), tasks)
             if (reduced := self.budget.attempt(refit, None, unsettled)) is None:
                 break
+            reduced = [self._with_nominal_instead(one, last) for one in reduced]
             shares = [_gain_over(one, last) for one in reduced]
             least = int(np.argmin(shares))
             if shares[least] >= self.cfg.min_gain:
@@ -447,6 +458,16 @@ class Procedure:
             ]
         self.groups = [group for group in self.groups if group]
         return fitted
+
+    def _with_nominal_instead(self, reduced: FittedModel, last: FittedModel) -> FittedModel:
+        """Return a model without one of the last model's effects, with nominal values within their tolerance if better.
+
+        They were not fitted while other effects were missing, and then an effect may stand for them.
+        """
+        if _gain_over(reduced, last) < self.cfg.min_gain:
+            return reduced
+        found = self._nominal(reduced)
+        return reduced if found is None else found
 
     def restore_given(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with time step and nominal values as given where others explain no more.
@@ -485,7 +506,9 @@ class Procedure:
         last = attempt(lambda: self._joint(fitted[-1]), fitted[-1], unsettled, TOGETHER_SHARE)
         owned = len(last.model.effects) - len(accepted)
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
-        parameters = joint_parameters(last, widening)
+        unsettled = "Left out of the intervals: errors of nominal values."
+        nominal = attempt(lambda: nominal_errors(last, self.cfg), None, unsettled, TOGETHER_SHARE)
+        parameters = joint_parameters(last, widening, nominal)
         self.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
@@ -518,12 +541,12 @@ class Procedure:
             detectable: Smallest detectable sizes.
             issues: Sentences on the data.
         """
-        cfg, first, last = self.cfg, given.ratio, fitted[-1].ratio
-        beyond = max(first**2 - 1.0, 1e-9)
-        unexplained = float(np.clip((last**2 - 1.0) / beyond, 0.0, 1.0)) if first > cfg.adequate_ratio else 0.0
-        adequate = is_adequate(fitted[-1], self.noise_factors, cfg)
+        cfg, last = self.cfg, fitted[-1]
+        left, lacked = discrepancies(last, given)
+        unexplained = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0)) if given.ratio > cfg.adequate_ratio else 0.0
+        adequate = is_adequate(last, self.noise_factors, cfg)
         form_error = None
-        if not adequate and any(f.accepted for f in self.findings) and self._is_form_error(fitted[-1], given):
+        if not adequate and any(f.accepted for f in self.findings) and self._is_form_error(last, given):
             adequate, form_error = True, unexplained
         unknown = None
         if adequate and any(f.accepted for f in self.findings):

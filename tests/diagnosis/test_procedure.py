@@ -15,7 +15,7 @@ from concent_warp.diagnosis.check_data import _is_white, check_data
 from concent_warp.diagnosis.failures import _force_entries, _span_entry, _with_starts
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.adequacy import is_adequate, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.cfg import EffectSolverCfg
@@ -47,6 +47,7 @@ def node(
     return SimpleNamespace(
         ratio=ratio, noise_ratio=10 * ratio, errors=np.array([errors / 2] * 2), model=model, windows=[window],
         fit=SimpleNamespace(offsets="o", cost=errors), pieces=[piece], cfg=EffectSolverCfg(), timestep=timestep,
+        limit=1e9,
         delivered=SimpleNamespace(name=f"delivered {name}", timestep=timestep),
     )  # fmt: skip
 
@@ -200,7 +201,7 @@ def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain
         ({}, given, False),
     ):
         made = procedure(seed=5)
-        monkeypatch.setattr(module, "with_nominal_values", lambda one, _cfg, answers=answers: answers.get(id(one)))
+        monkeypatch.setattr(module, "with_nominal_values", lambda one, *_, answers=answers: answers.get(id(one)))
         monkeypatch.setattr(made, "find_addition", lambda *_: (None, ()))
         fitted, _ = made.add_effects([given], ())
         if answers:
@@ -210,7 +211,7 @@ def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain
             assert fitted == [finer]
     disabled = procedure(nominal=NominalCfg(enabled=False))
     monkeypatch.setattr(module, "with_nominal_values", lambda *_: pytest.fail("nominal values stay as given"))
-    assert disabled._with_nominal([given], finer) is None
+    assert disabled._with_nominal([given], finer, given) is None
 
 
 def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at_the_end(monkeypatch):
@@ -394,6 +395,7 @@ def test_superfluous_effects_are_removed_the_least_needed_first(monkeypatch):
         return left[len(last.model.effects), effect]
 
     monkeypatch.setattr(module, "refit_without_effect", without)
+    monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
     after = made.remove_superfluous(list(fitted))
     assert asked == [(5, 2), (5, 3), (4, 2)]
     assert after == [*fitted, left[5, 3]]
@@ -403,7 +405,7 @@ def test_superfluous_effects_are_removed_the_least_needed_first(monkeypatch):
         ("a", True, ""), ("c", False, "made superfluous by effects added later"), ("d", True, ""),
         ("x", False, "no better than chance"),
     ]  # fmt: skip
-    assert made.seen == [(0.0, "removing one effect at a time")] * 2
+    assert [text for _, text in made.seen].count("removing one effect at a time") == 2
 
 
 def test_an_effect_that_removes_the_least_gain_stays(monkeypatch):
@@ -418,6 +420,7 @@ def test_an_effect_that_removes_the_least_gain_stays(monkeypatch):
         reduced.fit.cost = cost
         made.groups, made.hypotheses = [("a",), ("b",)], [{}, {}]
         monkeypatch.setattr(module, "refit_without_effect", lambda *_, reduced=reduced: reduced)
+        monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
         after = made.remove_superfluous([node(3), node(2), node(1.1, 100.0, 2)])
         assert (len(after) == 3) == kept
         assert made.groups == ([("a",), ("b",)] if kept else [("b",)])
@@ -425,6 +428,51 @@ def test_an_effect_that_removes_the_least_gain_stays(monkeypatch):
     monkeypatch.setattr(module, "refit_without_effect", lambda *_: pytest.fail("nothing to remove"))
     nodes = [node(3), node(2)]
     assert alone.remove_superfluous(nodes) is nodes
+
+
+def test_an_effect_is_superfluous_where_nominal_values_explain_as_much(monkeypatch):
+    for errors, found, dropped in ((150.0, 104.0, True), (150.0, 106.0, False), (104.0, None, True)):
+        made, last = procedure(), node(1.1, 100.0, 2)
+        reduced, instead = node(1.3, errors, 1), None if found is None else node(1.12, found, 1, nominal=2)
+        made.groups, made.hypotheses = [("a",), ("b",)], [{}, {}]
+        monkeypatch.setattr(module, "refit_without_effect", lambda *_, reduced=reduced: reduced)
+
+        def nominal(one, *_, reduced=reduced, instead=instead):
+            assert one is reduced
+            return instead if instead is not None else pytest.fail("the effect is superfluous without them")
+
+        monkeypatch.setattr(module, "with_nominal_values", nominal)
+        after = made.remove_superfluous([node(3), node(2), last])
+        assert made.groups == ([("b",)] if dropped else [("a",), ("b",)])
+        assert after[-1] is (last if not dropped else reduced if instead is None else instead)
+
+
+def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
+    given, after, asked = node(5.0), node(2.0, effects=1), []
+
+    def nominal(one, _cfg, enough):
+        asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
+        return one
+
+    monkeypatch.setattr(module, "with_nominal_values", nominal)
+    made = procedure()
+    made._with_nominal([given], None, given)
+    made._with_nominal([given, after], None, given)
+    # 5.2 % and 9.3 % of the discrepancy.
+    assert asked == [None, [True, False]]
+
+
+def test_large_residuals_that_a_model_explains_are_no_outliers():
+    one, first = node(1.0), node(3.0)
+    one.limit = 4.0
+    one.pieces[0].residual = np.array([1.0, -1.0, 2.0, 100.0])
+    first.pieces[0].residual = np.array([20.0, -1.0, 2.0, 100.0])
+    left, lacked = discrepancies(one, first)
+    outlier = 2 * 4.0 * (100.0 - 2.0)
+    assert left == pytest.approx((1 + 1 + 4 + outlier) / 4 - 1)
+    assert lacked == pytest.approx((400 + 1 + 4 + outlier) / 4 - 1)
+    first.pieces[0].residual, first.limit = np.array([3.0, 8.0]), 5.0
+    assert discrepancies(one, first)[1] == pytest.approx((9 + 2 * 5.0 * (8.0 - 2.5)) / 2 - 1)
 
 
 def test_noise_that_may_be_larger_than_its_estimate_leaves_a_model_adequate(monkeypatch):

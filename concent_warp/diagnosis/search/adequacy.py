@@ -8,7 +8,7 @@ import numpy as np
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.fit.effects.robust import robust_noise_ratio
+from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
 
 def channel_residuals(base: FittedModel) -> dict[str, np.ndarray]:
@@ -48,3 +48,22 @@ def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: Diagn
 def _scaled(base: FittedModel, noise_factors: Mapping[str, float]) -> list[np.ndarray]:
     """Return the residuals of each channel in units of the largest noise that it may have, each (n,)."""
     return [r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()]
+
+
+def discrepancies(base: FittedModel, first: FittedModel) -> tuple[float, float]:
+    """Return the mean squared residuals beyond the noise, over the squared noise, of a model and of the first one [-].
+
+    A residual counts as an outlier, by Huber's loss, only where the model leaves it: large
+    residuals of the first one alone, of an effect that acts now and then, are what the model explains. Where the two
+    have different windows, each has its own outliers.
+
+    Args:
+        base: The fitted model.
+        first: The fitted model as given.
+    """
+    after, before = (np.concatenate([piece.residual for piece in one.pieces]) for one in (base, first))
+    same = len(after) == len(before)
+    outlier = np.abs(after) > base.limit if same else np.abs(before) > first.limit
+    left = float(np.mean(2 * huber(after, base.limit))) - 1.0
+    limit = base.limit if same else first.limit
+    return left, float(np.mean(np.where(outlier, 2 * huber(before, limit), before**2))) - 1.0

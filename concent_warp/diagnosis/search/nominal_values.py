@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import NominalCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
 from concent_warp.diagnosis.search.baseline import fitted_model
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
+from concent_warp.fit.effects.robust import huber_weight
 from concent_warp.model import Model
 
 
-def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | None:
+def with_nominal_values(
+    base: FittedModel, cfg: NominalCfg, enough: Callable[[FittedModel], bool] | None = None
+) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
     It is None where none shows, where they predict held-out data no better, or where one runs to its bound and more
@@ -26,6 +29,7 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
     Args:
         base: The fitted model.
         cfg: Settings.
+        enough: Whether a model with values at their bounds leaves little enough; by default `NominalCfg.bounded_ratio`.
     """
     visible = _visible(base, cfg)
     if not visible:
@@ -41,7 +45,8 @@ def with_nominal_values(base: FittedModel, cfg: NominalCfg) -> FittedModel | Non
     bounded = [
         FittedParameter.within(p, v, 0.0) for p, v in zip(solver.p.parameters[:nominal], fit.values, strict=False)
     ]
-    inside = found.ratio <= cfg.bounded_ratio or not any(p.at_bound for p in bounded)
+    little = found.ratio <= cfg.bounded_ratio or (enough is not None and enough(found))
+    inside = little or not any(p.at_bound for p in bounded)
     sums, prior = block_sums(found.pieces, found.blocks, found.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).own()
@@ -62,24 +67,87 @@ def without_nominal_values(last: FittedModel) -> FittedModel:
     return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
 
 
+def nominal_errors(last: FittedModel, cfg: DiagnoseCfg) -> np.ndarray:
+    """Return standard deviations of a model's parameters due to errors of nominal values, in units of their scale (P,).
+
+    A nominal value that is off by d moves the other parameters by -(J' J)^-1 J' K d, with the sensitivities J of the
+    residuals to these and K to that one (consider covariance: Tapley, Schutz and Born, "Statistical Orbit
+    Determination", 2004, chapter 6). Errors d have their tolerance as a prior, and change the residuals, the parameters
+    adapted, by no more than what the model leaves beyond the noise, or than what counts as noise still
+    (`DiagnoseCfg.min_gain`): larger ones would show. Those that were fitted are known no better than that, as what is
+    left may be the error of a formula. Left out are those that an effect of the model stands for (`Effect.part_of`).
+
+    Args:
+        last: The fitted model.
+        cfg: Settings.
+    """
+    spread = np.zeros(len(last.fit.values))
+    parts = zip(last.model.effects, last.prediction().split, strict=True)
+    own = [k for added, part in parts if not added.effect.nominal for k in range(part.start, part.stop)]
+    kinds = _nominal_effects_of(last.model)
+    if not own or not kinds or not cfg.nominal.enabled:
+        return spread
+    weights = [np.sqrt(huber_weight(piece.residual, last.limit))[:, None] for piece in last.pieces]
+    j = np.concatenate([piece.jacobian[:, own] * w for piece, w in zip(last.pieces, weights, strict=True)])
+    k = np.concatenate(_sensitivities(last, kinds)) * np.concatenate(weights)
+    k = np.nan_to_num(k, posinf=0.0, neginf=0.0)
+    excess = max(last.ratio**2 - 1, cfg.min_gain)
+    spread[own] = considered_std(j, k, excess, last.cfg.least_squares.prior)
+    return spread
+
+
+def considered_std(j: np.ndarray, k: np.ndarray, excess: float, prior: float) -> np.ndarray:
+    """Return standard deviations of P fitted parameters due to errors of K others, of which each has the prior N(0, 1).
+
+    Args:
+        j: Sensitivities of the residuals to the fitted parameters, shape (n, P).
+        k: The same to the others, shape (n, K).
+        excess: Mean squared change of the residuals by these, fitted parameters adapted, that may go unseen [-].
+        prior: Standard deviation of the weak prior of the fitted parameters.
+    """
+    move = -np.linalg.pinv(j.T @ j + np.eye(j.shape[1]) / prior**2, hermitian=True) @ (j.T @ k)
+    left = k + j @ move
+    within = np.linalg.inv(np.eye(k.shape[1]) + left.T @ left / (len(left) * excess))
+    return np.sqrt(np.maximum(np.diag(move @ within @ move.T), 0.0))
+
+
+def _nominal_effects_of(model: Model) -> list[Effect]:
+    """Return all nominal values of a model as effects, less those that an effect of the model is."""
+    compiled, found = model.compile(), []
+    for kind in NOMINAL:
+        taken = {t for a in model.effects if a.effect.name == kind.part_of for t in a.effect.target}
+        for targets in kind.targets(compiled):
+            if names := [t for t in targets if t not in taken]:
+                found.append(kind(*names))
+    return found
+
+
+def _sensitivities(base: FittedModel, kinds: Sequence[Effect]) -> list[np.ndarray]:
+    """Return the sensitivities of the residuals to nominal values, initial states eliminated, one (n, K) a window.
+
+    They are in units of the tolerances, in the order of the effects and their targets.
+    """
+    columns: list[list[np.ndarray]] = []
+    for effect in kinds:
+        solver = base.solver(effect)
+        linear = solver.linearise(solver.p.start, base.fit.offsets)
+        pieces = base.projected(replace(base.fit, linear=linear))
+        columns.append([base.cfg.least_squares.prior * piece.jacobian[:, solver.p.owned :] for piece in pieces])
+    return [np.hstack(of_window) for of_window in zip(*columns, strict=True)]
+
+
 def _visible(base: FittedModel, cfg: NominalCfg) -> list[Effect]:
     """Return the nominal values that change the predictions measurably within their tolerance, as effects.
 
     Values whose changes the others can produce are left out, the least visible first.
     """
-    compiled, present = base.model.compile(), {a.effect.name for a in base.model.effects}
-    kinds = [kind(*names) for kind in NOMINAL if kind.name not in present for names in kind.targets(compiled)]
-    columns, owners = [], []
-    for effect in kinds:
-        solver = base.solver(effect)
-        linear = solver.linearise(solver.p.start, base.fit.offsets)
-        pieces = base.projected(replace(base.fit, linear=linear))
-        stacked = np.concatenate([piece.jacobian[:, solver.p.owned :] for piece in pieces])
-        columns.append(base.cfg.least_squares.prior * stacked)
-        owners += [(effect, target) for target in effect.target]
-    if not owners:
+    present = {a.effect.name for a in base.model.effects}
+    kinds = [e for e in _nominal_effects_of(base.model) if e.name not in present]
+    if not kinds:
         return []
-    chosen = _independent(np.hstack(columns), cfg)
+    columns = np.concatenate(_sensitivities(base, kinds))
+    owners = [(effect, target) for effect in kinds for target in effect.target]
+    chosen = _independent(columns, cfg)
     found = []
     for effect in kinds:
         names = [owners[k][1] for k in sorted(chosen) if owners[k][0] is effect]

@@ -20,6 +20,7 @@ import numpy as np
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg, UnknownForceCfg
 from concent_warp.diagnosis.result import UnknownForceFound
+from concent_warp.diagnosis.search.adequacy import discrepancies
 from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null, null_p_value
 from concent_warp.diagnosis.search.screening import screen, with_residuals
@@ -50,7 +51,7 @@ def unknown_force(nodes: Sequence[FittedModel], cfg: DiagnoseCfg, results: Resul
     runs = all("mujoco" in added.effect.engines for added in last.model.effects)
     if not runs:
         return None
-    lacked, beside = max(max(first.ratio, last.ratio) ** 2 - 1, min_gain), None
+    lacked, beside = max(*discrepancies(last, first), min_gain), None
     if last.ratio**2 >= 1 + min_gain:
         beside = _best_force(last, None, lacked, cfg, results)
     effects = [len(n.model.effects) for n in nodes]

@@ -7,7 +7,7 @@ import pytest
 
 import concent_warp as cw
 from concent_warp.diagnosis.cfg import NominalCfg
-from concent_warp.diagnosis.search.nominal_values import _independent
+from concent_warp.diagnosis.search.nominal_values import _independent, _nominal_effects_of, considered_std
 from tests.scenes.foreign import PUSHER, pusher
 
 
@@ -18,6 +18,57 @@ def test_columns_that_others_can_produce_are_left_out():
     assert list(_independent(columns, NominalCfg())) == [1, 2]
     assert list(_independent(columns, NominalCfg(max_values=1))) == [1]
     assert not _independent(columns, NominalCfg(min_change=2.0))
+
+
+def test_a_nominal_value_that_acts_like_a_parameter_gives_it_its_own_error():
+    rng = np.random.default_rng(0)
+    direction, other = rng.normal(size=(2, 2000))
+    # A tolerance of the nominal value changes the residuals as 0.3 of the parameter does.
+    like = considered_std(5.0 * direction[:, None], 1.5 * direction[:, None], 0.05, 10.0)
+    assert like == pytest.approx([0.3], rel=1e-3)
+    apart = considered_std(
+        5.0 * direction[:, None],
+        1.5 * (other - direction * (other @ direction) / (direction**2).sum())[:, None],
+        1e9,
+        10.0,
+    )
+    assert apart == pytest.approx([0.0], abs=1e-6)
+
+
+def test_a_nominal_value_whose_error_would_show_counts_by_what_may_go_unseen():
+    rng = np.random.default_rng(1)
+    direction, other = rng.normal(size=(2, 4000))
+    other -= direction * (other @ direction) / (direction @ direction)
+    j, k = 5.0 * direction[:, None], (1.5 * direction + 4.0 * other)[:, None]
+    change = float(np.mean((4.0 * other) ** 2))
+    for excess in (0.05, 1.0):
+        found = considered_std(j, k, excess, 10.0)
+        assert found == pytest.approx([0.3 / np.sqrt(1 + change / excess)], rel=1e-2)
+    assert considered_std(j, k, 1e9, 10.0) == pytest.approx([0.3], rel=1e-2)
+
+
+def test_a_nominal_value_is_not_considered_beside_the_effect_that_it_is():
+    model = cw.Model(cw.Scene(PUSHER))
+    gains = {t for e in _nominal_effects_of(model) if e.name == "nominal_gain" for t in e.target}
+    assert len(gains) == 2
+    first = sorted(gains)[0]
+    with_gain = model.add_effect("actuator_gain", target=[first])
+    assert {t for e in _nominal_effects_of(with_gain) if e.name == "nominal_gain" for t in e.target} == gains - {first}
+    assert any(e.name == "nominal_velocity_gain" and first in e.target for e in _nominal_effects_of(with_gain))
+
+
+def test_the_tolerance_of_a_drive_widens_the_interval_of_a_damping_unless_nominal_values_are_exact():
+    recording, without = pusher(damping=0.15, delay=0.0), cw.Model(cw.Scene(PUSHER))
+    halves = []
+    for enabled in (True, False):
+        cfg = cw.DiagnoseCfg(
+            jobs=1, explain=False, effects=("joint_damping",), nominal=NominalCfg(enabled=enabled, min_change=1e9)
+        )
+        found = cw.diagnose(without, recording, cfg)
+        (p, *_) = found.accepted[0].parameters
+        halves.append(p.high - p.value)
+        assert not found.nominal_values
+    assert halves[0] > 1.2 * halves[1]
 
 
 def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():

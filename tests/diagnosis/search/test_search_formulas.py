@@ -222,7 +222,7 @@ def test_plausibility_is_schwarzs_criterion_with_a_cauchy_prior():
 
 
 def test_intervals_of_parameters_end_at_their_bounds(monkeypatch):
-    monkeypatch.setattr(evidence, "discretisation_errors", lambda *_: np.array([0.3, 0.0, 0.0]))
+    monkeypatch.setattr(evidence, "formula_errors", lambda *_: np.array([0.3, 0.0, 0.0]))
     base = base_of()
     found = {p.name: p for p in fitted_parameters(base, fitted(np.ones(COUNT)))}
     assert list(found) == ["a", "b", "c"]
@@ -395,6 +395,7 @@ def test_forces_are_tested_on_the_last_model_and_against_the_effects_added_befor
         return answers.pop(0) if answers else None
 
     monkeypatch.setattr(module, "_best_force", best)
+    monkeypatch.setattr(module, "discrepancies", lambda *both: tuple(one.ratio**2 - 1 for one in both))
     answers: list[Any] = []
     nodes = chain(3.0, 2.0, 1.5, 1.1)
     assert unknown_force(nodes, cfg, ANY) is None
