@@ -158,34 +158,46 @@ def test_play_makes_room_for_the_lead_of_each_rotor():
         assert vars(force)["actuators"].tolist() == [1]
 
 
-def test_compliance_weakens_the_drive_as_a_spring_in_series():
-    before, after = written(JointCompliance("b", "a"), 0.02, -1.0)
-    factor = np.array([1.0, 1 / (1 + 50 * 0.02), 1.0])[:, None]
-    for field in ("actuator_gainprm", "actuator_biasprm"):
-        np.testing.assert_allclose(getattr(after, field), getattr(before, field) * factor)
-
-
-def test_compliance_adds_one_force_sensor_a_drive_and_reads_the_twist():
+def test_compliance_makes_room_for_rotors_beside_those_with_play_and_adds_one_sensor_a_drive():
     model = world(TWO).add(JointCompliance("b"), [0.02]).add(JointCompliance("a"), [0.0])
     m = model.compile()
     names = [m.sensor(i).name for i in range(m.nsensor)]
-    assert names == ["qa", "qb", "vb", "concent_force_b", "concent_force_a"]
-    assert m.sensor_type[3] == mujoco.mjtSensor.mjSENS_ACTUATORFRC
-    assert m.sensor_objid[3] == 1
+    assert names == ["qa", "qb", "vb", "concent_twist_b", "concent_twist_a"]
+    assert m.sensor_type[3] == mujoco.mjtSensor.mjSENS_FRAMEPOS
+    assert m.site(m.sensor_objid[3]).name == "concent_twist_b"
+    assert m.site_sameframe[m.sensor_objid[3]] not in (
+        mujoco.mjtSameFrame.mjSAMEFRAME_BODY,
+        mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA,
+    )
     again = m.nsensor
     spec = model.scene.spec()
     for _ in range(2):
         JointCompliance("b", "a").prepare(spec)
     assert spec.compile().nsensor == again
+    m = world(TWO).add(JointCompliance("b")).add(Backlash("a")).compile()
+    elastic, loose = JointCompliance("b").force_model(m), Backlash("a").force_model(m)
+    assert (vars(elastic)["first"], vars(loose)["first"]) == (3, 15)
+    assert m.nuserdata == 18
+
+
+def test_encoders_of_a_compliant_joint_read_the_rotor():
+    more = """<actuatorpos name="pb" actuator="b"/><actuatorvel name="rb" actuator="b"/>
+        <actuatorfrc name="fb" actuator="b"/><jointactuatorfrc name="tb" joint="b"/></sensor>"""
+    xml = TWO.replace("</sensor>", more)
+    m = world(xml).add(JointCompliance("b", "a")).compile()
+    time = np.array([1.0, 2.0])
 
     def read(sensor, time):
-        return {"concent_force_b": 5.0, "concent_force_a": 7.0}.get(sensor, 1.0) * time[:, None]
+        twist = {"concent_twist_b": [5.0, 6.0, 7.0], "concent_twist_a": [8.0, 9.0, 10.0]}
+        return np.array(twist.get(sensor, [1.0])) * time[:, None]
 
-    time = np.array([1.0, 2.0])
     bent = JointCompliance("b", "a").measure(m, read, np.array([0.02, 0.03]))
-    np.testing.assert_allclose(bent("qb", time)[:, 0], time * (1 + 0.02 / 2 * 5))
-    np.testing.assert_allclose(bent("qa", time)[:, 0], time * (1 + 0.03 * 7))
-    np.testing.assert_array_equal(bent("vb", time), read("vb", time))
+    gear = m.actuator("b").gear[0]
+    expected = {"qb": 1 + 5, "vb": 1 + 6, "qa": 1 + 8, "pb": 1 + 5 * gear, "rb": 1 + 6 * gear, "fb": 7, "tb": 7 * gear}
+    for sensor, factor in expected.items():
+        np.testing.assert_allclose(bent(sensor, time)[:, 0], factor * time)
+    stiff = JointCompliance("b", "a").measure(m, read, np.array([0.0, 0.03]))
+    np.testing.assert_array_equal(stiff("qb", time), read("qb", time))
 
 
 def test_gravity_compensation_adds_to_that_of_the_links():

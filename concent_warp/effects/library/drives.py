@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
+from concent_warp.effects.library.elastic_forces import SLOTS, ElasticGearForce
 from concent_warp.effects.library.gear_forces import BacklashForce
 from concent_warp.effects.library.joints import MUJOCO
 from concent_warp.effects.select import (
@@ -24,8 +25,22 @@ from concent_warp.effects.select import (
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
 
-FORCE_SENSOR = "concent_force_{}"
-"""Sensor that is added for an actuator whose force an effect needs to know."""
+TWIST_SENSOR = "concent_twist_{}"
+"""Site and sensor that are added for an actuator with an elastic gear: twist, its rate and the servo's force."""
+SERVO_FORCE = 2
+"""Its last column."""
+OF_JOINT = {
+    mujoco.mjtSensor.mjSENS_JOINTPOS: 0,
+    mujoco.mjtSensor.mjSENS_JOINTVEL: 1,
+    mujoco.mjtSensor.mjSENS_JOINTACTFRC: SERVO_FORCE,
+}
+"""Sensors of a joint that are on the rotor's side of an elastic gear, and the column that changes them."""
+OF_ACTUATOR = {
+    mujoco.mjtSensor.mjSENS_ACTUATORPOS: 0,
+    mujoco.mjtSensor.mjSENS_ACTUATORVEL: 1,
+    mujoco.mjtSensor.mjSENS_ACTUATORFRC: SERVO_FORCE,
+}
+"""Those of an actuator."""
 
 GRIP_FACTORS = (0.2, 0.3, *(round(0.36 * 1.1**k, 3) for k in range(11)), 1.5, 3.0)
 """Factors on the grip force that are scanned [-]: the object slips only in a narrow range of them."""
@@ -255,27 +270,35 @@ class Backlash(ServoEffect):
 
 
 class JointCompliance(ServoEffect):
-    """Elasticity between motor and link; the encoder is on the motor's side."""
+    """Elasticity between rotor and link; the encoder is on the rotor's side."""
 
     name = "joint_compliance"
     summary = (
-        "A spring between motor and link, without rotor inertia: the drive acts through kp / (1 + kp c), and the "
-        "encoder reads the link's angle plus c tau."
+        "The servo turns a rotor with the joint's armature J, and a spring the link: J r'' = f(r) - T, with the torque "
+        "T = (r - q) / c on the link; encoders read the rotor's angle r."
     )
-    source = "elastic joints after Spong, J. Dyn. Sys. Meas. Control 109(4), 1987, in the limit of no rotor inertia"
+    source = (
+        "elastic joints: Spong, J. Dyn. Sys. Meas. Control 109(4), 1987; damping ratio of the rotor on its spring 0.05"
+    )
     signature = "what the robot carries sags and swings; the encoder reads less of it"
-    confusions = ("actuator_gain", "joint_offset", "backlash")
+    confusions = ("actuator_gain", "joint_offset", "backlash", "armature")
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Add a sensor of each drive's force."""
+        """Make room for the state of each rotor, and add a site and a sensor that show it."""
+        spec.nuserdata += (SLOTS + 1) * len(spec.actuators)
         known = {sensor.name for sensor in spec.sensors}
         for n in self.target:
-            if FORCE_SENSOR.format(n) not in known:
+            # Else MuJoCo takes the inertia of a joint on its own as compiled, whatever its armature.
+            spec.joint(spec.actuator(n).target).parent.simple = False
+            name = TWIST_SENSOR.format(n)
+            if name not in known:
+                # Off the origin, for MuJoCo does not look at the position of a site that is compiled there.
+                spec.worldbody.add_site(name=name, pos=[1.0, 0.0, 0.0], size=[1e-4, 1e-4, 1e-4], rgba=[0, 0, 0, 0])
                 spec.add_sensor(
-                    name=FORCE_SENSOR.format(n),
-                    type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
-                    objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
-                    objname=n,
+                    name=name,
+                    type=mujoco.mjtSensor.mjSENS_FRAMEPOS,
+                    objtype=mujoco.mjtObj.mjOBJ_SITE,
+                    objname=name,
                 )
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
@@ -288,33 +311,33 @@ class JointCompliance(ServoEffect):
             for t, kp in zip(self.target, gains, strict=True)
         )
 
-    def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002
-        """Gain and bias."""
-        return ("actuator_gainprm", "actuator_biasprm")
-
-    def write(self, m: mujoco.MjModel, values: np.ndarray) -> None:
-        """Weaken the drives by the spring in series."""
-        ids = self.ids(m)
-        share = 1 / (1 + m.actuator_gainprm[ids, 0] * np.maximum(values, 0.0))
-        m.actuator_gainprm[ids, :3] *= share[:, None]
-        m.actuator_biasprm[ids, :3] *= share[:, None]
+    def force_model(self, m: mujoco.MjModel) -> ForceModel:
+        """Torque of the spring on the link."""
+        kind = mujoco.mjtObj.mjOBJ_SITE
+        sites = np.array([mujoco.mj_name2id(m, kind, TWIST_SENSOR.format(n)) for n in self.target])
+        return ElasticGearForce(self.ids(m), sites, m.nuserdata - (SLOTS + 1) * m.nu)
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:
-        """Add the twist of the spring to what encoders read."""
-        springs = {}
+        """Let encoders read the rotor: sensors of the joint's and the actuator's position, velocity and force."""
+        found: dict[str, tuple[str, int, float]] = {}
         for n, a, c in zip(self.target, self.ids(m), values, strict=True):
-            joint = driven_joints(m, a)[0]
-            for i in range(m.nsensor):
-                encoder = m.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_JOINTPOS) and m.sensor_objid[i] == joint
-                if encoder:
-                    springs[m.sensor(i).name] = (FORCE_SENSOR.format(n), c / float(m.actuator_gear[a, 0]))
+            joint, gear = driven_joints(m, a)[0], float(m.actuator_gear[a, 0])
+            for i in range(m.nsensor if c > 0 else 0):
+                kind, of = mujoco.mjtSensor(int(m.sensor_type[i])), m.sensor_objid[i]
+                if kind in OF_JOINT and of == joint:
+                    column = OF_JOINT[kind]
+                    found[m.sensor(i).name] = TWIST_SENSOR.format(n), column, gear if column == SERVO_FORCE else 1.0
+                elif kind in OF_ACTUATOR and of == a:
+                    column = OF_ACTUATOR[kind]
+                    found[m.sensor(i).name] = TWIST_SENSOR.format(n), column, 1.0 if column == SERVO_FORCE else gear
 
         def reading(sensor: str, time: np.ndarray) -> np.ndarray:
             value = read(sensor, time)
-            if sensor not in springs:
+            if sensor not in found:
                 return value
-            force, c = springs[sensor]
-            return value + c * read(force, time)
+            twist, column, factor = found[sensor]
+            shown = factor * read(twist, time)[:, column : column + 1]
+            return shown if column == SERVO_FORCE else value + shown
 
         return reading
 

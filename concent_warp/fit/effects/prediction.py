@@ -114,7 +114,8 @@ class Prediction:
         self._edits = [i for i, e in enumerate(self.effects) if e.edits]
         self.measured_only = np.zeros(len(self.parameters), dtype=bool)
         for e, part in zip(self.effects, self.split, strict=True):
-            pure = e.measures and not e.edits and not e.commands and type(e).write is Effect.write
+            moves = e.edits or e.commands or type(e).write is not Effect.write
+            pure = e.measures and not moves and type(e).force_model is Effect.force_model
             self.measured_only[part] = pure
         self._kept: dict[tuple[int, bytes, bytes], tuple[Reader, int]] = {}
         self.simulated = 0
