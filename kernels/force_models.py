@@ -108,7 +108,8 @@ def apply_elastic_gear(
         actuators: Position-controlled actuators of single hinges and slides, shape (n,) int.
         sites: Sites that show twist, its rate and the servo's force, shape (n,) int.
         first: Place of actuator 0 in the user data, four places each.
-        values: Compliances of the springs at the joints, shape (N, n).
+        values: Compliances of the springs at the joints, and the share of the servos' damping on the rotors, shape
+            (N, n + 1).
         damping_ratio: Of a rotor on its spring [-].
         least_damping: Least damping over stiffness of a spring in time steps [-].
     """
@@ -404,7 +405,7 @@ def elastic_gear_kernel(
         actuators: Shape (n,).
         sites: Shape (n,).
         first: Place of actuator 0 in the user data.
-        values: Shape (N, n).
+        values: Shape (N, n + 1).
         damping_ratio: [-].
         least_damping: [-].
         implicit: 1 where the integrator takes the servo's velocity at the end of a step, else 0.
@@ -441,7 +442,8 @@ def elastic_gear_kernel(
     rotor = armature[world, dof]
     stiffness = 1.0 / values[world, i]
     kp = -ratio * ratio * b[1]
-    kv = -ratio * ratio * b[2]
+    whole = -ratio * ratio * b[2]
+    kv = values[world, actuators.shape[0]] * whole
     centred = 2.0 * damping_ratio * wp.sqrt(stiffness * rotor)
     late = wp.max(least_damping * dt * stiffness - centred, 0.0)
     damping = centred + late
@@ -466,20 +468,23 @@ def elastic_gear_kernel(
         rate = userdata[world, slot + 1] + userdata[world, slot + 2] - userdata[world, slot + 3] * speed
         twist = userdata[world, slot] + dt * rate
     torque = stiffness * twist + damping * rate
-    servo = free - (kp * twist + kv * rate) / ratio
+    back = kp * twist + kv * rate
+    brake = 0.25 * dt * dt * kp + 0.5 * dt * wp.max(kv, 0.0)
+    total = rotor + spring + brake
+    push = ratio * free - back - torque
+    servo = free - (back + brake * push / total) / ratio
     drive = ratio * free
-    total = rotor + spring + 0.25 * dt * dt * kp + 0.5 * dt * kv
-    moved = rotor + implicit * dt * kv
+    moved = rotor + implicit * dt * whole
     if force_limited[a] and (servo < limits[0] or servo > limits[1]):
         servo = wp.clamp(servo, limits[0], limits[1])
         drive = 0.0
         total = rotor + spring
+        push = ratio * servo - torque
         moved = rotor
         g[0] = 0.0
         for k in range(3):
             b[k] = 0.0
     share = spring / total
-    push = ratio * servo - torque
     follow = moved / total
     userdata[world, slot] = twist
     userdata[world, slot + 1] = rate

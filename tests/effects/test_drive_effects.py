@@ -103,17 +103,17 @@ def test_link_flies_freely_within_the_play_undamped_by_the_drive():
 
 def test_compliant_joint_sags_by_spring_and_drive_and_its_encoder_shows_the_drive_alone():
     c = 0.001
-    model = world(WEIGHT, JointCompliance("drive"), c)
+    model = world(WEIGHT, JointCompliance("drive"), c, 1.0)
     cart = move(model, 5.0, ctrl=0.1)
     assert cart.qpos[-1, 0] == pytest.approx(0.1 - LOAD / KP - LOAD * c, abs=1e-6)
-    read = model.effects[0].effect.measure(model.compile(), cart.read, np.array([c]))
+    read = model.effects[0].effect.measure(model.compile(), cart.read, np.array([c, 1.0]))
     assert read("encoder", cart.time[-1:])[0, 0] == pytest.approx(0.1 - LOAD / KP, abs=1e-6)
 
 
 def test_compliant_joint_without_damping_swings_at_the_frequency_of_both_springs_in_series():
     xml = SERVO.replace('kv="40"', "")
     c = 0.002
-    x = move(world(xml, JointCompliance("drive"), c), 1.0, qpos=[0.01]).qpos[:, 0]
+    x = move(world(xml, JointCompliance("drive"), c, 1.0), 1.0, qpos=[0.01]).qpos[:, 0]
     k = 1 / (1 / KP + c)
     np.testing.assert_allclose(x, 0.01 * np.cos(np.sqrt(k / MASS) * np.arange(1001) * 0.001), atol=2e-4)
 

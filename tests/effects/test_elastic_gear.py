@@ -45,9 +45,9 @@ def two_masses(
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
 @pytest.mark.parametrize(("stiffness", "rotor"), [(1e3, 0.5), (4e3, 0.5), (1e5, 0.5), (1e3, 0.05)])
 def test_link_and_encoder_move_like_two_masses_on_a_spring(integrator, stiffness, rotor):
-    effect, values, error = JointCompliance("drive"), np.array([1 / stiffness]), []
+    effect, values, error = JointCompliance("drive"), np.array([1 / stiffness, 1.0]), []
     for timestep in (0.002, 0.0005):
-        model = world(servo(timestep=timestep, integrator=integrator, rotor=rotor), effect, values[0])
+        model = world(servo(timestep=timestep, integrator=integrator, rotor=rotor), effect, *values)
         cart = move(model, 0.6, ctrl=0.1)
         expected = two_masses(stiffness, 0.1, cart.time, rotor=rotor)
         encoder = effect.measure(model.compile(), cart.read, values)("encoder", cart.time)[:, 0]
@@ -58,7 +58,7 @@ def test_link_and_encoder_move_like_two_masses_on_a_spring(integrator, stiffness
 
 def test_servo_at_its_limit_turns_the_rotor_by_that_limit():
     stiffness, effect = 2e3, JointCompliance("drive")
-    model = world(servo(more='forcerange="-15 15"'), effect, 1 / stiffness)
+    model = world(servo(more='forcerange="-15 15"'), effect, 1 / stiffness, 1.0)
     cart = move(model, 0.6, ctrl=0.2)
     expected = two_masses(stiffness, 0.2, cart.time, limit=15.0)
     assert np.abs(cart.qpos[:, 0] - expected[0]).max() < 0.001
@@ -74,11 +74,12 @@ def test_servo_at_its_limit_turns_the_rotor_by_that_limit():
 def test_stiff_joint_is_the_model_without_the_effect(integrator, kv, rotor, more):
     xml = servo(integrator=integrator, kv=kv, rotor=rotor, more=more)
     plain = move(world(xml), 1.0, ctrl=0.1).qpos
-    rigid = move(world(xml, JointCompliance("drive"), 0.0), 1.0, ctrl=0.1).qpos
+    rigid = move(world(xml, JointCompliance("drive"), 0.0, 1.0), 1.0, ctrl=0.1).qpos
     np.testing.assert_allclose(rigid, plain, rtol=0, atol=1e-12)
     # Twice as far off for twice the compliance: no jump at zero.
     off = [
-        np.abs(move(world(xml, JointCompliance("drive"), c), 1.0, ctrl=0.1).qpos - plain).max() for c in (1e-9, 2e-9)
+        np.abs(move(world(xml, JointCompliance("drive"), c, 1.0), 1.0, ctrl=0.1).qpos - plain).max()
+        for c in (1e-9, 2e-9)
     ]
     assert off[1] < 1e-5
     assert off[1] == pytest.approx(2 * off[0], rel=0.05, abs=1e-9)
@@ -88,7 +89,9 @@ def test_stiff_joint_is_the_model_without_the_effect(integrator, kv, rotor, more
 @pytest.mark.parametrize("rotor", [0.0, 1e-3, 0.5, 20.0])
 @pytest.mark.parametrize("timestep", [0.002, 0.01])
 def test_any_stiffness_is_stable_at_the_step_of_the_model(stiffness, rotor, timestep):
-    cart = move(world(servo(timestep=timestep, rotor=rotor), JointCompliance("drive"), 1 / stiffness), 5.0, ctrl=0.1)
+    cart = move(
+        world(servo(timestep=timestep, rotor=rotor), JointCompliance("drive"), 1 / stiffness, 1.0), 5.0, ctrl=0.1
+    )
     tail = cart.qpos[-len(cart.qpos) // 5 :, 0]
     assert np.abs(cart.qpos).max() < 0.3
     assert np.abs(tail - 0.1).max() < (0.12 if rotor == 20.0 else 0.03)
@@ -103,7 +106,7 @@ def test_steps_neither_take_energy_out_of_the_swing_of_rotor_against_link_nor_ad
     xml = servo(timestep=0.001, kv=0.0).replace(f'kp="{KP}"', 'kp="1e-3"')
     command = start * stiffness * 1e3  # stretches the spring at first, where the rotor is at rest on the servo's force
     command = np.where(np.arange(1000) < 1, command, 0.0)[:, None]
-    cart = move(world(xml, JointCompliance("drive"), 1 / stiffness), 1.0, ctrl=command)
+    cart = move(world(xml, JointCompliance("drive"), 1 / stiffness, 1.0), 1.0, ctrl=command)
     twist = cart.sensor["concent_twist_drive"][:, 0]
     free = slice(2, None)
     time = cart.time[free]
@@ -114,8 +117,17 @@ def test_steps_neither_take_energy_out_of_the_swing_of_rotor_against_link_nor_ad
 
 def test_armature_beside_compliance_is_the_rotor_s_in_either_order():
     xml, c = servo(rotor=0.1), 1e-3
-    first = move(world(xml, JointCompliance("drive"), c).add(Armature("rail"), [ROTOR]), 0.5, ctrl=0.1).qpos
-    last = move(world(xml, Armature("rail"), ROTOR).add(JointCompliance("drive"), [c]), 0.5, ctrl=0.1).qpos
-    given = move(world(servo(), JointCompliance("drive"), c), 0.5, ctrl=0.1).qpos
+    first = move(world(xml, JointCompliance("drive"), c, 1.0).add(Armature("rail"), [ROTOR]), 0.5, ctrl=0.1).qpos
+    last = move(world(xml, Armature("rail"), ROTOR).add(JointCompliance("drive"), [c, 1.0]), 0.5, ctrl=0.1).qpos
+    given = move(world(servo(), JointCompliance("drive"), c, 1.0), 0.5, ctrl=0.1).qpos
     np.testing.assert_allclose(first, given, rtol=0, atol=1e-12)
     np.testing.assert_allclose(last, given, rtol=0, atol=1e-12)
+
+
+def test_damping_from_an_encoder_on_the_link_acts_on_the_link():
+    """Without a rotor's inertia, the spring carries kp (u - r) - kv q' then."""
+    stiffness, effect = 1e3, JointCompliance("drive")
+    cart = move(world(servo(timestep=5e-4, rotor=0.0), effect, 1 / stiffness, 0.0), 0.6, ctrl=0.1)
+    share = stiffness / (stiffness + KP)
+    weaker = servo(timestep=5e-4, kv=share * KV, rotor=0.0).replace(f'kp="{KP}"', f'kp="{share * KP}"')
+    np.testing.assert_allclose(cart.qpos, move(world(weaker), 0.6, ctrl=0.1).qpos, rtol=0, atol=2e-4)

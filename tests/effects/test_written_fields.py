@@ -159,7 +159,7 @@ def test_play_makes_room_for_the_lead_of_each_rotor():
 
 
 def test_compliance_makes_room_for_rotors_beside_those_with_play_and_adds_one_sensor_a_drive():
-    model = world(TWO).add(JointCompliance("b"), [0.02]).add(JointCompliance("a"), [0.0])
+    model = world(TWO).add(JointCompliance("b"), [0.02, 1.0]).add(JointCompliance("a"), [0.0, 1.0])
     m = model.compile()
     names = [m.sensor(i).name for i in range(m.nsensor)]
     assert names == ["qa", "qb", "vb", "concent_twist_b", "concent_twist_a"]
@@ -191,12 +191,12 @@ def test_encoders_of_a_compliant_joint_read_the_rotor():
         twist = {"concent_twist_b": [5.0, 6.0, 7.0], "concent_twist_a": [8.0, 9.0, 10.0]}
         return np.array(twist.get(sensor, [1.0])) * time[:, None]
 
-    bent = JointCompliance("b", "a").measure(m, read, np.array([0.02, 0.03]))
+    bent = JointCompliance("b", "a").measure(m, read, np.array([0.02, 0.03, 1.0]))
     gear = m.actuator("b").gear[0]
     expected = {"qb": 1 + 5, "vb": 1 + 6, "qa": 1 + 8, "pb": 1 + 5 * gear, "rb": 1 + 6 * gear, "fb": 7, "tb": 7 * gear}
     for sensor, factor in expected.items():
         np.testing.assert_allclose(bent(sensor, time)[:, 0], factor * time)
-    stiff = JointCompliance("b", "a").measure(m, read, np.array([0.0, 0.03]))
+    stiff = JointCompliance("b", "a").measure(m, read, np.array([0.0, 0.03, 1.0]))
     np.testing.assert_array_equal(stiff("qb", time), read("qb", time))
 
 

@@ -275,7 +275,7 @@ class JointCompliance(ServoEffect):
     name = "joint_compliance"
     summary = (
         "The servo turns a rotor with the joint's armature J, and a spring the link: J r'' = f(r) - T, with the torque "
-        "T = (r - q) / c on the link; encoders read the rotor's angle r."
+        "T = (r - q) / c on the link; encoders read the rotor's angle r. A share of the servo's damping acts on the rotor."
     )
     source = (
         "elastic joints: Spong, J. Dyn. Sys. Meas. Control 109(4), 1987; damping ratio of the rotor on its spring 0.05"
@@ -302,14 +302,18 @@ class JointCompliance(ServoEffect):
                 )
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """Return one compliance for each joint."""
+        """Return one compliance for each joint, and the share of the servos' damping that acts on the rotors.
+
+        It is 1 for a servo that takes the speed from its rotor, 0 for one that takes it from an encoder on the link.
+        """
         gains = np.array([servo_gain(m, a) for a in self.ids(m)])
         slide = all(m.jnt_type[driven_joints(m, a)[0]] == int(mujoco.mjtJoint.mjJNT_SLIDE) for a in self.ids(m))
         unit = "m/N" if slide else "rad/(N m)"
-        return tuple(
+        compliances = (
             Parameter(f"compliance[{t}]", unit, 0.0, 0.0, 10 / kp, 0.2 / kp)
             for t, kp in zip(self.target, gains, strict=True)
         )
+        return (*compliances, Parameter("rotor_damping", "-", 1.0, -0.5, 1.5, 0.5))
 
     def force_model(self, m: mujoco.MjModel) -> ForceModel:
         """Torque of the spring on the link."""
@@ -320,7 +324,7 @@ class JointCompliance(ServoEffect):
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:
         """Let encoders read the rotor: sensors of the joint's and the actuator's position, velocity and force."""
         found: dict[str, tuple[str, int, float]] = {}
-        for n, a, c in zip(self.target, self.ids(m), values, strict=True):
+        for n, a, c in zip(self.target, self.ids(m), values[:-1], strict=True):
             joint, gear = driven_joints(m, a)[0], float(m.actuator_gear[a, 0])
             for i in range(m.nsensor if c > 0 else 0):
                 kind, of = mujoco.mjtSensor(int(m.sensor_type[i])), m.sensor_objid[i]

@@ -50,8 +50,11 @@ class ElasticGearForce(ForceModel):
     model without the effect, to the last term. A servo at a limit of its force gives that one, whatever x and q' are in
     the step: kp and kv are then left out, and its share is applied as a force too.
 
-    The parameters are compliances 1 / K at the joints, shape (n,). The user data have x, x', and what makes the next
-    x' of the link's velocity; a site for each actuator has x, x' and the servo's force as its position.
+    Of the servo's damping, a share may act on the rotor and the rest on the link, where a servo takes the speed from an
+    encoder behind the gear: kv in the terms with x' and S is then that share of it.
+
+    The parameters are compliances 1 / K at the joints and that share, shape (n + 1,). The user data have x, x', and what
+    makes the next x' of the link's velocity; a site for each actuator has x, x' and the servo's force as its position.
     """
 
     edits = ("dof_armature", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "site_pos")
@@ -75,8 +78,8 @@ class ElasticGearForce(ForceModel):
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""
-        every = zip(self.actuators, self.sites, values, strict=True)
-        gears = [ElasticGear.of(m, int(a), int(site), 1 / float(c)) for a, site, c in every if c > 0]
+        every, side = zip(self.actuators, self.sites, values[:-1], strict=True), float(values[-1])
+        gears = [ElasticGear.of(m, int(a), int(site), 1 / float(c), side) for a, site, c in every if c > 0]
         if not gears:
             return lambda: None
         ctrl, qpos, qvel, kept, applied = d.ctrl, d.qpos, d.qvel, d.userdata, d.qfrc_applied
@@ -146,6 +149,7 @@ class ElasticGear:
     bias: tuple[float, float, float]
     kp: float
     kv: float
+    """Of the servo's damping, what acts on the rotor."""
     stiffness: float
     damping: float
     inertia: float
@@ -159,8 +163,11 @@ class ElasticGear:
     timestep: float
 
     @classmethod
-    def of(cls, m: mujoco.MjModel, actuator: int, site: int, stiffness: float) -> ElasticGear:
-        """Return those of an actuator of a compiled model, with a stiffness [N m/rad or N/m] at the joint."""
+    def of(cls, m: mujoco.MjModel, actuator: int, site: int, stiffness: float, on_rotor: float) -> ElasticGear:
+        """Return those of an actuator of a compiled model, with a stiffness [N m/rad or N/m] at the joint.
+
+        `on_rotor` is the share of the servo's damping that acts on the rotor [-].
+        """
         joint = driven_joints(m, actuator)[0]
         dof, dt = int(m.jnt_dofadr[joint]), float(m.opt.timestep)
         gear, gain = float(m.actuator_gear[actuator, 0]), float(m.actuator_gainprm[actuator, 0])
@@ -183,13 +190,13 @@ class ElasticGear:
             gain,
             (constant, position, velocity),
             kp,
-            kv,
+            on_rotor * kv,
             stiffness,
             centred + late,
             inertia,
             dt * kv if m.opt.integrator in IMPLICIT else 0.0,
             0.25 * dt**2 * stiffness + 0.5 * dt * centred + dt * late,
-            0.25 * dt**2 * kp + 0.5 * dt * kv,
+            0.25 * dt**2 * kp + 0.5 * dt * max(on_rotor, 0.0) * kv,
             dt,
         )
 
@@ -217,12 +224,15 @@ class ElasticGear:
             rate = last[1] + last[2] - last[3] * velocity
             twist = last[0] + self.timestep * rate
         torque = self.stiffness * twist + self.damping * rate
-        force = free - (self.kp * twist + self.kv * rate) / self.gear
+        back = self.kp * twist + self.kv * rate
+        total = self.inertia + self.spring + self.servo
+        push = self.gear * free - back - torque
+        force = free - (back + self.servo * push / total) / self.gear  # its mean over the step
         servo = min(max(force, self.weakest), self.strongest)
         limited = servo != force
-        total = self.inertia + self.spring + (0.0 if limited else self.servo)
+        if limited:
+            total, push = self.inertia + self.spring, self.gear * servo - torque
         share = self.spring / total
-        push = self.gear * servo - torque
         follow = (self.inertia + (0.0 if limited else self.implicit)) / total
         kept = (twist, rate, push * self.timestep / total + follow * velocity, follow)
         return Turn(kept, torque + share * (push - (0.0 if limited else self.gear * free)), servo, share, limited)
