@@ -275,7 +275,7 @@ class JointCompliance(ServoEffect):
     name = "joint_compliance"
     summary = (
         "The servo turns a rotor with the joint's armature J, and a spring the link: J r'' = f(r) - T, with the torque "
-        "T = (r - q) / c on the link; encoders read the rotor's angle r. A share of the servo's damping acts on the rotor."
+        "T = (r - q) / c on the link; encoders read r. A share of the servo's damping acts on the rotor."
     )
     source = (
         "elastic joints: Spong, J. Dyn. Sys. Meas. Control 109(4), 1987; damping ratio of the rotor on its spring 0.05"

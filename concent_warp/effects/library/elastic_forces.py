@@ -53,8 +53,8 @@ class ElasticGearForce(ForceModel):
     Of the servo's damping, a share may act on the rotor and the rest on the link, where a servo takes the speed from an
     encoder behind the gear: kv in the terms with x' and S is then that share of it.
 
-    The parameters are compliances 1 / K at the joints and that share, shape (n + 1,). The user data have x, x', and what
-    makes the next x' of the link's velocity; a site for each actuator has x, x' and the servo's force as its position.
+    The parameters are compliances 1 / K at the joints and that share, shape (n + 1,). The user data have x, x' and
+    what makes the next x' of the link's velocity; a site for each actuator shows x, x' and the servo's force.
     """
 
     edits = ("dof_armature", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "site_pos")
