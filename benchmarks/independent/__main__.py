@@ -6,7 +6,7 @@ python -m benchmarks.independent --locked --out runs/locked       # the locked s
 python -m benchmarks.independent --report                         # the page from what is done
 python -m benchmarks.independent --report --earlier OTHER/results.jsonl --locked-results LOCKED/results.jsonl
 
-Each set is diagnosed by a process of its own, one of `--jobs`, within `--limit` seconds of processor time. Results are
+Each set is diagnosed by `--cores` processes of its own, `--jobs` sets at a time, within `--limit` seconds. Results are
 kept in `--out`, one file a set and `results.jsonl` with all, so that the command may be stopped and called again.
 """
 
@@ -32,7 +32,7 @@ from benchmarks.independent.data_set import KINDS, DataSet, Kind, World
 from benchmarks.independent.page import read_results, write_page_from
 from benchmarks.independent.scoring import line
 from benchmarks.independent.split import locked_names
-from benchmarks.independent.study import PROCESSOR_SECONDS, WALL_SECONDS, described, path
+from benchmarks.independent.study import CORES, SECONDS, described, path
 from benchmarks.independent.worlds import all_sets
 from benchmarks.pages import ROOT, machine, machine_line
 from concent_warp.files import write_text
@@ -55,12 +55,12 @@ class Args:
     """Only data sets of these names."""
     locked: bool = False
     """Diagnose the locked sets, and no others."""
-    jobs: int = len(os.sched_getaffinity(0))
+    jobs: int = max(len(os.sched_getaffinity(0)) // CORES, 1)
     """Data sets at a time."""
-    limit: float = PROCESSOR_SECONDS
-    """Processor time of a diagnosis from which on it counts as wrong [s]."""
-    wall: float = WALL_SECONDS
-    """Duration from which on it counts as wrong, whatever the processor was given to [s]."""
+    cores: int = CORES
+    """Processes of a diagnosis."""
+    limit: float = SECONDS
+    """Duration of a diagnosis from which on it counts as wrong [s]."""
     out: Path = OUT
     """Folder of the results."""
     report: bool = False
@@ -136,14 +136,14 @@ def in_process(case: DataSet, args: Args, commit: str) -> tuple[dict[str, Any], 
     """Return the result of one set, diagnosed by a process of its own, and the time that all took [s]."""
     begun = time.monotonic()
     command = [sys.executable, "-m", "benchmarks.independent.study", case.name, str(args.out), "--commit", commit]
-    command += ["--limit", str(args.limit), "--wall", str(args.wall)]
+    command += ["--limit", str(args.limit), "--cores", str(args.cores)]
     places = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     said = ""
     try:
         ended = subprocess.run(
             command, env=os.environ | threads | {"PYTHONPATH": places}, capture_output=True, text=True,
-            timeout=2 * args.wall + 600, check=False,
+            timeout=2 * args.limit + 600, check=False,
         )  # fmt: skip
         said = f"ended with {ended.returncode}: {ended.stderr.strip()[-1000:]}"
     except subprocess.TimeoutExpired:

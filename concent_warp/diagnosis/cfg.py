@@ -88,6 +88,8 @@ class SearchCfg:
     those alone [-]. Empirical."""
     rivals: int = 3
     """Rivals whose initial states are tried on the baseline. Empirical."""
+    polished_first: Count = 1
+    """Most fits whose initial states are fitted again before the others start from those of the best. Empirical."""
     reconsidered: Count = 5
     """Most candidates that are tried again in the place of an earlier addition once others are in the model.
     Empirical."""
@@ -197,6 +199,9 @@ class NominalCfg:
     states fitted [-]. In squares, 1 % of what the noise itself leaves."""
     max_values: Count = 16
     """Most values that are fitted, the most visible ones. Empirical."""
+    promised_share: Share = 0.5
+    """Share of the least gain that a linear step must promise, or the values are not fitted [-]: within the tolerance
+    residuals are in proportion to the values, right to a factor of 2."""
     bounded_ratio: Positive = 1.1
     """Noise ratio up to which a fit with values at their bounds counts [-]; where more is left, something larger than a
     tolerance is missing. That of `SearchCfg.explained_ratio`."""

@@ -220,7 +220,9 @@ class Procedure:
             return None
         self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
-        return self.budget.attempt(lambda: with_nominal_values(one, self.cfg.nominal, enough), None, unsettled)
+        return self.budget.attempt(
+            lambda: with_nominal_values(one, self.cfg.nominal, self.cfg.min_gain, enough), None, unsettled
+        )
 
     def _with_nominal(
         self, fitted: list[FittedModel], finer: FittedModel | None, first: FittedModel

@@ -60,6 +60,8 @@ class CandidateFits:
         if not self.fits:
             return []
         expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, fitted, strict=True)])
+        if expected.max() < self.cfg.min_gain:  # none explains enough to be accepted, however well it is fitted
+            return self.fits
         best = self._best()
         self._restart_lagging(best, expected)
         self._polish_near(best, expected)
@@ -186,7 +188,7 @@ class CandidateFits:
             and c.ratio > search.noise_level_ratio
             and not (restarted and c.share(self.base) > search.close_min_gain * gain)
         ]
-        chosen = sorted(chosen, key=lambda k: -expected[k])[: search.rivals]
+        chosen = sorted(chosen, key=lambda k: -expected[k])[: search.polished_first]
         self._refit(chosen, polish_candidate, "refining initial states", search)
 
     def _initialise_by_multiple_shooting(self, short_windows: Callable[[], Sequence[Window]]) -> None:

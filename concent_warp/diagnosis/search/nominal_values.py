@@ -19,20 +19,21 @@ from concent_warp.model import Model
 
 
 def with_nominal_values(
-    base: FittedModel, cfg: NominalCfg, enough: Callable[[FittedModel], bool] | None = None
+    base: FittedModel, cfg: NominalCfg, min_gain: float, enough: Callable[[FittedModel], bool] | None = None
 ) -> FittedModel | None:
     """Return a fitted model with the nominal values that the data show within their tolerance, before other effects.
 
-    It is None where none shows, where they predict held-out data no better, or where one runs to its bound and more
-    than noise is left: then something larger is missing.
+    It is None where none shows, where they remove too little of the held-out error, or where one runs to its bound and
+    more than noise is left: then something larger is missing.
 
     Args:
         base: The fitted model.
         cfg: Settings.
+        min_gain: Share of the held-out error that they must remove [-].
         enough: Whether a model with values at their bounds leaves little enough; by default `NominalCfg.bounded_ratio`.
     """
-    visible = _visible(base, cfg)
-    if not visible:
+    visible, promised = _visible(base, cfg)
+    if not visible or promised < cfg.promised_share * min_gain:
         return None
     compiled = base.model.compile()
     added = [AddedEffect(e, tuple(p.null for p in e.parameters(compiled))) for e in visible]
@@ -50,7 +51,7 @@ def with_nominal_values(
     sums, prior = block_sums(found.pieces, found.blocks, found.limit), base.cfg.least_squares.prior
     # Here the values themselves are judged: each fold is predicted from those of the others.
     errors = HeldOut(sums, found.blocks, prior).own()
-    return found if inside and errors.sum() < base.errors.sum() else None
+    return found if inside and errors.sum() <= (1 - min_gain) * base.errors.sum() else None
 
 
 def nominal_effects(model: Model) -> list[int]:
@@ -130,33 +131,43 @@ def _sensitivities(base: FittedModel, kinds: Sequence[Effect]) -> list[np.ndarra
     columns: list[list[np.ndarray]] = []
     for effect in kinds:
         solver = base.solver(effect)
-        linear = solver.linearise(solver.p.start, base.fit.offsets)
+        linear = solver.linearise(solver.p.start, base.fit.offsets, base.fit.linear, residual_known=not effect.prepares)
         pieces = base.projected(replace(base.fit, linear=linear))
         columns.append([base.cfg.least_squares.prior * piece.jacobian[:, solver.p.owned :] for piece in pieces])
     return [np.hstack(of_window) for of_window in zip(*columns, strict=True)]
 
 
-def _visible(base: FittedModel, cfg: NominalCfg) -> list[Effect]:
+def _visible(base: FittedModel, cfg: NominalCfg) -> tuple[list[Effect], float]:
     """Return the nominal values that change the predictions measurably within their tolerance, as effects.
 
-    Values whose changes the others can produce are left out, the least visible first.
+    Values whose changes the others can produce are left out, the least visible first. With them comes the share of the
+    held-out error that a linear step within their prior promises to remove.
     """
     present = {a.effect.name for a in base.model.effects}
     kinds = [e for e in _nominal_effects_of(base.model) if e.name not in present]
     if not kinds:
-        return []
-    columns = np.concatenate(_sensitivities(base, kinds))
+        return [], 0.0
+    by_window = _sensitivities(base, kinds)
     owners = [(effect, target) for effect in kinds for target in effect.target]
-    chosen = _independent(columns, cfg)
+    chosen, prior = _independent(np.concatenate(by_window), cfg), base.cfg.least_squares.prior
+    seen = [
+        replace(piece, jacobian=np.hstack([piece.jacobian, np.nan_to_num(of[:, chosen]) / prior]))
+        for piece, of in zip(base.pieces, by_window, strict=True)
+    ]
+    promised = float(
+        1
+        - HeldOut(block_sums(seen, base.blocks, base.limit), base.blocks, prior).own().sum()
+        / max(base.errors.sum(), 1e-12)
+    )
     found = []
     for effect in kinds:
         names = [owners[k][1] for k in sorted(chosen) if owners[k][0] is effect]
         if names:
             found.append(type(effect)(*names))
-    return found
+    return found, promised
 
 
-def _independent(columns: np.ndarray, cfg: NominalCfg) -> Sequence[int]:
+def _independent(columns: np.ndarray, cfg: NominalCfg) -> list[int]:
     """Return which columns (n, K) change the residuals by more than `min_change` beyond those chosen before them.
 
     Gram-Schmidt with pivoting (Golub and Van Loan, "Matrix Computations", 2013, section 5.4).

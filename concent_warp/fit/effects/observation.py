@@ -66,6 +66,10 @@ class ObservationCfg:
     """Shortest window [s]. Empirical."""
     max_length: PositiveDuration = 20.0
     """Longest window [s], for the simulations' memory."""
+    max_contact_length: PositiveDuration = 0.5
+    """Longest window of a body that moves freely and can be touched [s]: contacts that are made and broken give a long
+    window's cost many local minima, in which errors of its initial state stand in for a wrong friction or mass
+    (multiple shooting: Bock 1983). Long enough for a fall of a metre."""
     default_position_noise: Positive = 1e-3
     """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
     default_noise: Positive = 1e-2

@@ -150,12 +150,17 @@ def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName)
     return True
 
 
+def _has_touchable_free_body(m: mujoco.MjModel) -> bool:
+    """Return whether a body moves freely in a scene in which something can touch."""
+    return bool((m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any() and (m.geom_contype | m.geom_conaffinity).any())
+
+
 def keeps_close(
     source: ObservedRecording, d: Demonstration, start: float, last: float, engine: EngineName, seed: int
 ) -> float:
     """Return for how long [s] the effects of errors of an initial state stay in proportion to them."""
     cfg, m = source.cfg, source.model.compile()
-    span = min(last - start, cfg.max_length)
+    span = min(last - start, cfg.max_contact_length if _has_touchable_free_body(m) else cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
     state = source.state(d, start)
     qpos, qvel = state.qpos, state.qvel
