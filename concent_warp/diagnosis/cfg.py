@@ -55,6 +55,10 @@ class SearchCfg:
     batch_size: Count = 3
     """Candidates fitted before the search decides whether others are worth a fit. The truth is among the first three in
     most scenes. Empirical."""
+    far_min_gain: Share = 0.2
+    """Share of the held-out error that a shorter time step, or nominal values within their tolerance, must remove while
+    more than `DiagnoseCfg.form_error_ratio` is left [-]; where they remove less, an effect is looked for first, and
+    they are tried again beside it. Empirical."""
     explained_ratio: float = 1.1
     """Noise ratio below which a fitted candidate leaves little to others [-]. Empirical."""
     noise_level_ratio: float = 1.03

@@ -193,6 +193,11 @@ class Procedure:
         """Return whether the residual beyond the noise is as much as an effect must remove."""
         return one.ratio**2 >= 1 + self.cfg.min_gain
 
+    def _least_gain(self, one: FittedModel) -> float:
+        """Return the share of a model's held-out error that a shorter time step or nominal values must remove."""
+        near = one.ratio <= self.cfg.form_error_ratio
+        return self.cfg.min_gain if near else max(self.cfg.min_gain, self.cfg.search.far_min_gain)
+
     def _is_form_error(self, one: FittedModel, first: FittedModel) -> bool:
         """Return whether a model with added effects leaves no more than errors in their formulas.
 
@@ -207,7 +212,8 @@ class Procedure:
             return None
         self.runner.progress(self.runner.share, "halving the time step")
         unsettled = "Open: whether the model's time step is too long."
-        return self.budget.attempt(lambda: finer_time_step(one, self.cfg), None, unsettled)
+        cfg = replace(self.cfg, min_gain=self._least_gain(one))
+        return self.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled)
 
     def _nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None = None) -> FittedModel | None:
         """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
@@ -221,7 +227,7 @@ class Procedure:
         self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
         return self.budget.attempt(
-            lambda: with_nominal_values(one, self.cfg.nominal, self.cfg.min_gain, enough), None, unsettled
+            lambda: with_nominal_values(one, self.cfg.nominal, self._least_gain(one), enough), None, unsettled
         )
 
     def _with_nominal(
