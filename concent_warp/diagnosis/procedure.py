@@ -43,6 +43,7 @@ from concent_warp.diagnosis.search.joint_fit import (
 from concent_warp.diagnosis.search.nominal_values import (
     nominal_effects,
     nominal_errors,
+    nominal_sensitivities,
     with_nominal_values,
     without_nominal_values,
 )
@@ -365,7 +366,7 @@ class Procedure:
             base = self.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
         if explained:
-            findings = [self._if_established(base, c, f) for c, f in zip(fitted, findings, strict=True)]
+            findings = self._established(base, fitted, findings)
         accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not accepted:
             self.findings += sorted(findings, key=lambda f: -f.gain)
@@ -375,18 +376,29 @@ class Procedure:
         self._record(base, group, findings)
         return group[0][0], smallest
 
-    def _if_established(self, base: FittedModel, c: FittedCandidate, f: Finding) -> Finding:
-        """Return an accepted candidate with the intervals of the answer, refused if they include its null values."""
-        if not f.accepted:
-            return f
-        added = add_candidate(base, c)
-        widening = {len(added.model.effects) - 1: profile_widening(base, c)}
-        unsettled = f"Left out of the interval of {f.name}: errors of nominal values."
-        nominal = self.budget.attempt(lambda: nominal_errors(added, self.cfg), None, unsettled)
-        f = replace(f, parameters=joint_parameters(added, widening, nominal)[-1])
-        if any(p.excludes_null for p in f.parameters):
-            return f
-        return replace(f, accepted=False, reason="its parameters may be at their null values")
+    def _established(
+        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding]
+    ) -> list[Finding]:
+        """Return findings, accepted ones with the intervals of the answer, refused if these include the null values.
+
+        Sensitivities to nominal values are those of the model that the candidates are added to.
+        """
+        found = list(findings)
+        if not any(f.accepted for f in findings):
+            return found
+        unsettled = "Left out of the intervals of candidates: errors of nominal values."
+        shared = self.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
+        for k, (c, f) in enumerate(zip(fitted, findings, strict=True)):
+            if not f.accepted:
+                continue
+            added = add_candidate(base, c)
+            widening = {len(added.model.effects) - 1: profile_widening(base, c)}
+            nominal = None if shared is None else nominal_errors(added, self.cfg, shared)
+            parameters = joint_parameters(added, widening, nominal)[-1]
+            found[k] = replace(f, parameters=parameters)
+            if not any(p.excludes_null for p in parameters):
+                found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
+        return found
 
     def _screened(self, base: FittedModel, effects: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return all candidates with their expected gains."""

@@ -537,10 +537,12 @@ def test_effects_are_removed_one_at_a_time_and_the_rest_fitted_together(monkeypa
 def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_candidate(monkeypatch):
     ends = {"a": [OPEN], "b": [OPEN, CLEAR], "c": [CLEAR]}
     monkeypatch.setattr(module, "add_candidate", lambda _base, c: c)
-    monkeypatch.setattr(module, "nominal_errors", lambda c, _cfg: f"nominal {c.name}")
+    monkeypatch.setattr(module, "nominal_errors", lambda c, _cfg, shared: f"nominal {c.name} {shared}")
+    simulated = []
+    monkeypatch.setattr(module, "nominal_sensitivities", lambda base: simulated.append(base) or "at base")
 
     def answer(c, widening, nominal):
-        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name}")
+        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} at base")
         return [(CLEAR,), tuple(ends[c.name])]
 
     monkeypatch.setattr(module, "joint_parameters", answer)
@@ -553,6 +555,7 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
         first = next(f for f in made.findings if f.name == "a")
         assert first.accepted is not explained
         assert (first.reason == "its parameters may be at their null values") is explained
+        assert len(simulated) == explained
 
 
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
