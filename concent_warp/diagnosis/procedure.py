@@ -43,6 +43,7 @@ from concent_warp.diagnosis.search.joint_fit import (
 from concent_warp.diagnosis.search.nominal_values import (
     nominal_effects,
     nominal_errors,
+    nominal_sensitivities,
     with_nominal_values,
     without_nominal_values,
 )
@@ -101,6 +102,8 @@ class Procedure:
         left: what takes up an error in a formula explains a part of it."""
         self.rivals: dict[int, tuple[Rival, ...]] = {}
         """Candidates that explained nearly as much as each addition, and that one itself."""
+        self.with_unestablished: list[FittedModel] = []
+        """The fitted models with all effects, where some are removed that are not established."""
         self.budget = TimeBudget(cfg.seconds)
 
     def run(self) -> Diagnosis:
@@ -174,7 +177,8 @@ class Procedure:
             runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
             recorded = len(self.findings), len(self.groups)
             try:
-                best, smallest = self.find_addition(fitted[-1], step)
+                explained = not effects_alone and self._explains(fitted[-1], first, added=step > 0)
+                best, smallest = self.find_addition(fitted[-1], step, explained=explained)
             except TimeUpError:
                 self.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
                 break
@@ -205,6 +209,20 @@ class Procedure:
         """
         left, lacked = discrepancies(one, first)
         return left < self.cfg.unknown_force.min_share * lacked and one.ratio <= self.cfg.form_error_ratio
+
+    def _explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
+        """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
+
+        Args:
+            one: The fitted model.
+            first: The model as given.
+            added: Whether it has effects that the first one lacks.
+        """
+        return is_adequate(one, self.noise_factors, self.cfg) or (added and self._is_form_error(one, first))
+
+    def _accepted(self) -> list[Finding]:
+        """Return the accepted effects in the order of their addition."""
+        return sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
@@ -318,8 +336,17 @@ class Procedure:
             cfg=self.cfg.fits.observation,
         )
 
-    def find_addition(self, base: FittedModel, step: int) -> tuple[FittedCandidate | None, tuple[Detectable, ...]]:
-        """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all."""
+    def find_addition(
+        self, base: FittedModel, step: int, *, explained: bool = False
+    ) -> tuple[FittedCandidate | None, tuple[Detectable, ...]]:
+        """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all.
+
+        Args:
+            base: The fitted model.
+            step: Index of the addition.
+            explained: Whether the model explains the data already. An effect is then accepted only if the intervals
+                that the answer would state, see `joint_parameters`, exclude its null values too.
+        """
         cfg = self.cfg
         effects = candidates(base.model, self.channels, cfg.effects)
         screened = self._screened(base, effects, step)
@@ -346,6 +373,8 @@ class Procedure:
             unsettled = "Open: whether other initial states let the model explain more without an effect."
             base = self.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
             findings = [finding(c) for c in fitted]
+        if explained:
+            findings = self._established(base, fitted, findings)
         accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
         if not accepted:
             self.findings += sorted(findings, key=lambda f: -f.gain)
@@ -354,6 +383,30 @@ class Procedure:
         self.rivals[step] = near_best(base, fitted, findings, cfg)
         self._record(base, group, findings)
         return group[0][0], smallest
+
+    def _established(
+        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding]
+    ) -> list[Finding]:
+        """Return findings, accepted ones with the intervals of the answer, refused if these include the null values.
+
+        Sensitivities to nominal values are those of the model that the candidates are added to.
+        """
+        found = list(findings)
+        if not any(f.accepted for f in findings):
+            return found
+        unsettled = "Left out of the intervals of candidates: errors of nominal values."
+        shared = self.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
+        for k, (c, f) in enumerate(zip(fitted, findings, strict=True)):
+            if not f.accepted:
+                continue
+            added = add_candidate(base, c)
+            widening = {len(added.model.effects) - 1: profile_widening(base, c)}
+            nominal = None if shared is None else nominal_errors(added, self.cfg, shared)
+            parameters = joint_parameters(added, widening, nominal)[-1]
+            found[k] = replace(f, parameters=parameters)
+            if not any(p.excludes_null for p in parameters):
+                found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
+        return found
 
     def _screened(self, base: FittedModel, effects: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return all candidates with their expected gains."""
@@ -411,7 +464,7 @@ class Procedure:
 
         The last addition has just been compared with its rivals beside all others.
         """
-        accepted = sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
+        accepted = self._accepted()
         for k, f in enumerate(accepted[:-1]):
             if len(among := self.rivals.get(f.step, ())) < 2:
                 continue
@@ -503,11 +556,25 @@ class Procedure:
     def final_values(self, fitted: list[FittedModel]) -> list[FittedModel]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
 
-        The gain of each effect is then that over the same model without it.
+        Effects that are not established beside the others are removed one at a time, the rest fitted again.
         """
-        accepted = sorted((f for f in self.findings if f.accepted), key=lambda f: f.step)
+        while True:
+            found, without = self._fitted_together(fitted)
+            if (fewer := self.remove_unestablished(found, without)) is None:
+                return found
+            self.with_unestablished = self.with_unestablished or found
+            fitted = fewer
+
+    def _fitted_together(self, fitted: list[FittedModel]) -> tuple[list[FittedModel], list[FittedModel | None]]:
+        """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
+
+        The gain of each effect is then that over the same model without it. These models are returned too, one for each
+        accepted effect, None where there was no time.
+        """
+        accepted, reduced = self._accepted(), []
         if not accepted and not nominal_effects(fitted[-1].model):
-            return fitted
+            self.nominal_values = ()
+            return fitted, reduced
         self.runner.progress(self.runner.share, "fitting all effects together")
         attempt = self.budget.attempt
         unsettled = "Not refitted: all effects together."
@@ -528,7 +595,42 @@ class Procedure:
             if without is not None:
                 final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
-        return [*fitted[:-1], with_intervals(last, parameters)]
+            reduced.append(without)
+        return [*fitted[:-1], with_intervals(last, parameters)], reduced
+
+    def remove_unestablished(
+        self, fitted: list[FittedModel], without: Sequence[FittedModel | None]
+    ) -> list[FittedModel] | None:
+        """Return the fitted models without one effect that is not established, None where all are.
+
+        All intervals of such an effect include the null values, and the data are explained without it, if need be with
+        nominal values within their tolerance in its place. Of several it is the one with the smallest gain. One that
+        the data need stays: its gain is the evidence, even where a rough cost or what else is missing widens its
+        interval.
+
+        Args:
+            fitted: The fitted models, the last with all that was accepted.
+            without: The last one without each accepted effect, in the order of their addition.
+        """
+        accepted, first, last = self._accepted(), fitted[0], fitted[-1]
+        pairs = sorted(zip(accepted, without, strict=True), key=lambda pair: pair[0].gain)
+        for f, refitted in pairs:
+            if refitted is None or any(p.excludes_null for p in f.parameters):
+                continue
+            reduced = self._with_nominal_instead(refitted, last)
+            if not self._explains(reduced, first, added=len(accepted) > 1):
+                continue
+            reason = "its parameters may be at their null values beside the others"
+            if len(accepted) == 1:
+                reason = "its parameters may be at their null values"
+            self.findings[self.findings.index(f)] = replace(f, accepted=False, reason=reason)
+            place = accepted.index(f)
+            self.groups = [group for k, group in enumerate(self.groups) if k != place]
+            self.hypotheses = [h for k, h in enumerate(filter(None, self.hypotheses)) if k != place]
+            if len(accepted) > 1:
+                return [*fitted, reduced]
+            return [reduced] if _is_other([first, reduced]) else [first]
+        return None
 
     def _joint(self, last: FittedModel) -> FittedModel:
         """Return the last model with all that was accepted fitted together."""
@@ -558,7 +660,9 @@ class Procedure:
             adequate, form_error = True, unexplained
         unknown = None
         if adequate and any(f.accepted for f in self.findings):
-            nodes = [given, *(fitted[1:] or fitted)]
+            # What an effect explains with values that may be its null values needs no force of unknown form.
+            tested = self.with_unestablished or fitted
+            nodes = [given, *(tested[1:] or tested)]
             unknown = self.budget.attempt(
                 lambda: unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs)),
                 None,

@@ -19,6 +19,7 @@ from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, i
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.recording.recording import Channel
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -78,7 +79,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         made, asked = procedure(), []
         nodes = [node(r) for r in ratios]
 
-        def find(base, step, asked=asked, answers=answers, nodes=nodes, made=made):
+        def find(base, step, *, asked=asked, answers=answers, nodes=nodes, made=made, **_):
             asked.append((step, base, made.runner.share))
             return (nodes[step + 1] if step < answers else None), (f"size {step}",)
 
@@ -119,7 +120,7 @@ def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch)
     ):
         made, nodes = procedure(), [node(r) for r in ratios]
         made.noise_factors = {"angle": factor}
-        monkeypatch.setattr(made, "find_addition", lambda _base, step, nodes=nodes: (nodes[step + 1], ()))
+        monkeypatch.setattr(made, "find_addition", lambda _base, step, nodes=nodes, **_: (nodes[step + 1], ()))
         assert made.add_effects(nodes[:1], ())[0] == nodes[:count]
         assert is_lacking(node(1.02 * factor), made.noise_factors, made.cfg) is False
         assert is_lacking(node(1.03 * factor), made.noise_factors, made.cfg)
@@ -136,7 +137,7 @@ def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
         made, finer, calls = procedure(max_additions=1), node(ratio, errors, timestep=FINER), []
         rivals = {id(given): finer}
 
-        def find(base, step, calls=calls, made=made):
+        def find(base, step, calls=calls, made=made, **_):
             calls.append(base)
             made.groups.append(("effect",))
             made.findings.append(finding("effect", 0.6, step=step))
@@ -175,7 +176,9 @@ def test_over_short_windows_time_step_and_nominal_values_stay_as_given(monkeypat
     monkeypatch.setattr(module, "with_nominal_values", lambda *_: pytest.fail("nominal values are fitted"))
     monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
     made, coarse, given = procedure(), [node(5.0), node(3.0), node(2.0)], node(30.0)
-    monkeypatch.setattr(made, "find_addition", lambda _base, step: (coarse[step + 1] if step < 2 else None, ("size",)))
+    monkeypatch.setattr(
+        made, "find_addition", lambda _base, step, **_: (coarse[step + 1] if step < 2 else None, ("size",))
+    )
     assert made.add_effects(coarse[:1], (), effects_alone=True) == (coarse, ("size",))
     asked: list[Any] = []
 
@@ -202,7 +205,7 @@ def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain
     ):
         made = procedure(seed=5)
         monkeypatch.setattr(module, "with_nominal_values", lambda one, *_, answers=answers: answers.get(id(one)))
-        monkeypatch.setattr(made, "find_addition", lambda *_: (None, ()))
+        monkeypatch.setattr(made, "find_addition", lambda *_, **_k: (None, ()))
         fitted, _ = made.add_effects([given], ())
         if answers:
             assert fitted == [left]
@@ -258,7 +261,7 @@ def test_an_effect_beside_an_error_of_form_stays_if_it_explains_that_or_makes_an
         nodes = [node(50, effects=0), node(7, effects=1), node(1.15, effects=2), node(ratio, 100.0, effects=3)]
         names, reduced = iter("abc"), node(ratio, errors, effects=2)
 
-        def find(_base, step, made=made, nodes=nodes, names=names):
+        def find(_base, step, made=made, nodes=nodes, names=names, **_):
             name = next(names)
             made.groups.append((name,))
             made.hypotheses.append({})
@@ -297,7 +300,7 @@ def test_an_effect_beside_an_error_of_form_stays_if_it_explains_that_or_makes_an
 def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monkeypatch):
     monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
     made, coarse = procedure(), [node(5.0), node(1.26), node(1.0)]
-    monkeypatch.setattr(made, "find_addition", lambda _base, step: (coarse[step + 1], ()))
+    monkeypatch.setattr(made, "find_addition", lambda _base, step, **_: (coarse[step + 1], ()))
     assert made.add_effects(coarse[:1], (), effects_alone=True) == (coarse[:2], ())
     assert made.provisional is None
 
@@ -445,6 +448,114 @@ def test_an_effect_is_superfluous_where_nominal_values_explain_as_much(monkeypat
         after = made.remove_superfluous([node(3), node(2), last])
         assert made.groups == ([("b",)] if dropped else [("a",), ("b",)])
         assert after[-1] is (last if not dropped else reduced if instead is None else instead)
+
+
+def interval(low: float, null: float = 0.0) -> FittedParameter:
+    """Return a parameter of value 1 with the lower end of its interval."""
+    return FittedParameter("size", 1.0, low, 2.0, "", null)
+
+
+OPEN, CLEAR = interval(-0.1), interval(0.1)
+"""A parameter whose interval includes its null value, and one whose interval does not."""
+
+
+def test_an_effect_that_may_be_at_its_null_values_is_removed_where_the_data_are_explained_without_it():
+    for parameters, ratios, removed in (
+        (([OPEN], [OPEN, OPEN], [CLEAR]), (1.2, 1.2, 1.2), "b"),  # the one with the smaller gain
+        (([OPEN], [OPEN, CLEAR], [CLEAR]), (1.2, 1.2, 1.2), "a"),  # one parameter is enough
+        (([OPEN], [OPEN], [CLEAR]), (1.2, 2.4, 1.2), "a"),  # the data need the other one
+        (([OPEN], [OPEN], [CLEAR]), (1.2, 1.9, 1.2), "b"),  # an error in the formulas of the others
+        (([OPEN], [OPEN], [CLEAR]), (2.4, None, 1.2), None),  # there was no time for the model without the other one
+        (([CLEAR], [CLEAR], [CLEAR]), (1.0, 1.0, 1.0), None),
+        (([interval(0.5, np.inf)], [CLEAR], [CLEAR]), (1.0, 1.0, 1.0), None),  # a limit that is finite
+    ):
+        made = procedure()
+        made.findings = [
+            replace(finding(name, gain, step=step), parameters=tuple(own))
+            for name, gain, step, own in zip("abc", (0.5, 0.3, 0.2), (0, 1, 2), parameters, strict=True)
+        ] + [finding("x", 0.1, accepted=False, reason="no better than chance")]
+        made.groups = [("a",), ("b", "y"), ("c",)]
+        made.hypotheses = [{"a": 1}, {}, {"b": 2, "y": 3}, {"c": 4}]  # one was superfluous
+        made.cfg = replace(made.cfg, nominal=NominalCfg(enabled=False))
+        fitted = [node(9), node(5, effects=1), node(3, effects=2), node(1.0, effects=3)]
+        without = [r and node(r, 1.0, 2) for r in ratios]
+        after = made.remove_unestablished(fitted, without)
+        if removed is None:
+            assert after is None
+            assert [f.accepted for f in made.findings] == [True] * 3 + [False]
+            continue
+        assert after == [*fitted, without["abc".index(removed)]]
+        dropped = next(f for f in made.findings if f.name == removed)
+        assert (dropped.accepted, dropped.reason) == (
+            False,
+            "its parameters may be at their null values beside the others",
+        )
+        assert [f.name for f in made._accepted()] == [name for name in "abc" if name != removed]
+        assert made.groups == [g for g in (("a",), ("b", "y"), ("c",)) if g[0] != removed]
+        assert made.hypotheses == [h for h in ({"a": 1}, {"b": 2, "y": 3}, {"c": 4}) if removed not in h]
+
+
+def test_an_only_effect_that_may_be_at_its_null_value_leaves_the_model_as_given(monkeypatch):
+    for ratio, nominal, left in ((1.2, None, "given"), (1.3, None, None), (1.3, 1.2, "nominal")):
+        made, given, reduced = procedure(), node(ratio), node(ratio, 150.0)
+        instead = None if nominal is None else node(nominal, 104.0, nominal=1)
+        monkeypatch.setattr(module, "with_nominal_values", lambda *_, instead=instead: instead)
+        made.findings = [replace(finding("a", 0.1), parameters=(OPEN,))]
+        made.groups, made.hypotheses = [("a",)], [{"a": 1}]
+        after = made.remove_unestablished([given, node(1.0, 100.0, effects=1)], [reduced])
+        # Beside no other effect, more than noise is no error of form.
+        assert after == {"given": [given], "nominal": [instead], None: None}[left]
+        assert made.groups == ([] if left else [("a",)])
+        reason = "its parameters may be at their null values" if left else ""
+        assert [(f.accepted, f.reason) for f in made.findings] == [(not left, reason)]
+
+
+def test_effects_are_removed_one_at_a_time_and_the_rest_fitted_together(monkeypatch):
+    made, asked = procedure(), []
+    answers = iter([["first", "second"], ["third"], None])
+
+    def together(fitted):
+        asked.append(list(fitted))
+        return [*fitted[:-1], f"joint {fitted[-1]}"], ["without"]
+
+    monkeypatch.setattr(made, "_fitted_together", together)
+    monkeypatch.setattr(made, "remove_unestablished", lambda *_: next(answers))
+    assert made.final_values(["given", "all"]) == ["joint third"]
+    assert asked == [["given", "all"], ["first", "second"], ["third"]]
+    # What the removed ones explain needs no force of unknown form.
+    assert made.with_unestablished == ["given", "joint all"]
+    tested = []
+    monkeypatch.setattr(module, "unknown_force", lambda nodes, *_: tested.append(nodes))
+    made.findings, made.with_unestablished = [finding("a", 0.1)], [node(3), node(1.2), node(1.0)]
+    given, last = node(3), node(1.1)
+    assert made.conclude(given, [given, last], (), ()).verdict == "effect"
+    made.with_unestablished, second = [], list(made.with_unestablished)
+    made.conclude(given, [given, last], (), ())
+    assert tested == [[given, *second[1:]], [given, last]]
+
+
+def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_candidate(monkeypatch):
+    ends = {"a": [OPEN], "b": [OPEN, CLEAR], "c": [CLEAR]}
+    monkeypatch.setattr(module, "add_candidate", lambda _base, c: c)
+    monkeypatch.setattr(module, "nominal_errors", lambda c, _cfg, shared: f"nominal {c.name} {shared}")
+    simulated = []
+    monkeypatch.setattr(module, "nominal_sensitivities", lambda base: simulated.append(base) or "at base")
+
+    def answer(c, widening, nominal):
+        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} at base")
+        return [(CLEAR,), tuple(ends[c.name])]
+
+    monkeypatch.setattr(module, "joint_parameters", answer)
+    gains = {"a": (0.9, True), "b": (0.7, True), "c": (0.6, False)}
+    for explained, added, seen in ((False, "a", ["a", "b"]), (True, "b", ["b"])):
+        made = procedure()
+        (best, _), _ = searched(monkeypatch, made, gains, np.zeros(10), explained=explained)
+        assert best.name == added
+        assert made.groups == [tuple(seen)]
+        first = next(f for f in made.findings if f.name == "a")
+        assert first.accepted is not explained
+        assert (first.reason == "its parameters may be at their null values") is explained
+        assert len(simulated) == explained
 
 
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
@@ -630,7 +741,7 @@ class MadeUp(SimpleNamespace):
         return self.gain - getattr(base, "less", 0.0)
 
 
-def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0):
+def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, **given):
     """Return what a search adds whose candidates have these gains, and notes of what is asked for."""
     notes: dict[str, Any] = {"bases": []}
     fitted = [
@@ -670,7 +781,7 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
     monkeypatch.setattr(module, "refit_from_rivals", refit)
     monkeypatch.setattr(module, "profile_widening", lambda _base, c: f"width of {c.name}")
     monkeypatch.setattr(module, "group_indistinguishable", lambda _base, accepted, *_: accepted[:2])
-    return made.find_addition(node(ratio), 1), notes
+    return made.find_addition(node(ratio), 1, **given), notes
 
 
 def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,7 +68,33 @@ def without_nominal_values(last: FittedModel) -> FittedModel:
     return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
 
 
-def nominal_errors(last: FittedModel, cfg: DiagnoseCfg) -> np.ndarray:
+@dataclass(frozen=True)
+class NominalSensitivities:
+    """Sensitivities of a fitted model's residuals to nominal values, initial states eliminated."""
+
+    names: tuple[tuple[str, str], ...]
+    """Name of the effect and its target."""
+    columns: np.ndarray
+    """Sensitivities in units of the tolerances, shape (n, K)."""
+
+    def of(self, kinds: Sequence[Effect]) -> np.ndarray:
+        """Return the sensitivities to some nominal values alone, shape (n, k)."""
+        wanted = {(effect.name, target) for effect in kinds for target in effect.target}
+        return self.columns[:, [name in wanted for name in self.names]]
+
+
+def nominal_sensitivities(base: FittedModel) -> NominalSensitivities:
+    """Return the sensitivities of a fitted model's residuals to all its nominal values."""
+    kinds = _nominal_effects_of(base.model)
+    names = tuple((effect.name, target) for effect in kinds for target in effect.target)
+    rows = sum(len(piece.residual) for piece in base.pieces)
+    columns = np.concatenate(_sensitivities(base, kinds)) if kinds else np.zeros((rows, 0))
+    return NominalSensitivities(names, columns)
+
+
+def nominal_errors(
+    last: FittedModel, cfg: DiagnoseCfg, sensitivities: NominalSensitivities | None = None
+) -> np.ndarray:
     """Return standard deviations of a model's parameters due to errors of nominal values, in units of their scale (P,).
 
     A nominal value that is off by d moves the other parameters by -(J' J)^-1 J' K d, with the sensitivities J of the
@@ -81,6 +107,8 @@ def nominal_errors(last: FittedModel, cfg: DiagnoseCfg) -> np.ndarray:
     Args:
         last: The fitted model.
         cfg: Settings.
+        sensitivities: Those to its nominal values, or of the model without its last effect, which differ little where
+            that explains the data; by default they are simulated.
     """
     spread = np.zeros(len(last.fit.values))
     parts = zip(last.model.effects, last.prediction().split, strict=True)
@@ -90,7 +118,7 @@ def nominal_errors(last: FittedModel, cfg: DiagnoseCfg) -> np.ndarray:
         return spread
     weights = [np.sqrt(huber_weight(piece.residual, last.limit))[:, None] for piece in last.pieces]
     j = np.concatenate([piece.jacobian[:, own] * w for piece, w in zip(last.pieces, weights, strict=True)])
-    k = np.concatenate(_sensitivities(last, kinds)) * np.concatenate(weights)
+    k = (sensitivities or nominal_sensitivities(last)).of(kinds) * np.concatenate(weights)
     k = np.nan_to_num(k, posinf=0.0, neginf=0.0)
     excess = max(last.ratio**2 - 1, cfg.min_gain)
     spread[own] = considered_std(j, k, excess, last.cfg.least_squares.prior)

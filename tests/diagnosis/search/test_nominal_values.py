@@ -7,8 +7,20 @@ import pytest
 
 import concent_warp as cw
 from concent_warp.diagnosis.cfg import NominalCfg
-from concent_warp.diagnosis.search.nominal_values import _independent, _nominal_effects_of, considered_std
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.nominal_values import (
+    _independent,
+    _nominal_effects_of,
+    considered_std,
+    nominal_errors,
+    nominal_sensitivities,
+)
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.effects.cross_validation import cut_blocks
 from tests.scenes.foreign import PUSHER, pusher
+from tests.scenes.swinging import drawing, swung, windows_of
 
 
 def test_columns_that_others_can_produce_are_left_out():
@@ -55,6 +67,29 @@ def test_a_nominal_value_is_not_considered_beside_the_effect_that_it_is():
     with_gain = model.add_effect("actuator_gain", target=[first])
     assert {t for e in _nominal_effects_of(with_gain) if e.name == "nominal_gain" for t in e.target} == gains - {first}
     assert any(e.name == "nominal_velocity_gain" and first in e.target for e in _nominal_effects_of(with_gain))
+
+
+def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_they_are_added_to():
+    recording = swung(seconds=2.0)
+    windows = windows_of(recording)
+    base, cfg = fit_baseline(drawing(recording), windows, cut_blocks(windows), "mujoco"), cw.DiagnoseCfg(jobs=1)
+
+    def plus(base, name):
+        return add_candidate(base, fit_candidate(base, screen(base, effect_class(name)("hinge"))))
+
+    base = plus(base, "joint_damping")  # explains the data
+    assert base.ratio < 1.25
+    shared = nominal_sensitivities(base)
+    kinds = _nominal_effects_of(base.model)
+    assert shared.names == tuple((e.name, t) for e in kinds for t in e.target)
+    assert shared.columns.shape == (sum(len(p.residual) for p in base.pieces), len(shared.names))
+    for k, effect in enumerate(kinds):
+        one = shared.of([effect])
+        assert one == pytest.approx(shared.columns[:, [name == effect.name for name, _ in shared.names]]), k
+    added = plus(base, "joint_friction")
+    exact = nominal_errors(added, cfg)
+    assert exact.min() > 0
+    assert nominal_errors(added, cfg, shared) == pytest.approx(exact, rel=0.2)
 
 
 def test_the_tolerance_of_a_drive_widens_the_interval_of_a_damping_unless_nominal_values_are_exact():
