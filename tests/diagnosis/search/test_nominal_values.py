@@ -162,6 +162,7 @@ def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
     assert [v for a in kept for v in a.values] == pytest.approx([p.value for p in found.nominal_values])
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_nominal_values_stay_as_given_where_that_is_asked_for():
     wrong = cw.Model(cw.Scene(PUSHER.replace('kp="12"', 'kp="11.8"')))
     cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=("actuator_gain",), nominal=NominalCfg(enabled=False))
