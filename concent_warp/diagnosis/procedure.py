@@ -350,6 +350,8 @@ class Procedure:
         cfg = self.cfg
         effects = candidates(base.model, self.channels, cfg.effects)
         screened = self._screened(base, effects, step)
+        if not screened:  # the model has all that were asked for
+            return None, ()
         null = max_gain_under_null(base, screened, cfg.null_samples, cfg.seed)
         critical = float(np.quantile(null, 1 - cfg.significance_level))
         needed = max(critical, cfg.min_gain)

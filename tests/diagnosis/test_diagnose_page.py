@@ -72,6 +72,15 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert f"by more than {cfg.nominal.min_change:g} x noise within this tolerance" in PAGE
     assert f"bound and more than {cfg.nominal.bounded_ratio:g} x noise is left" in PAGE
     assert f"known to about {100 * TOLERANCE:.0f} %, the latency of a channel to {1e3 * CLOCK_TOLERANCE:g} ms" in PAGE
+    assert cfg.nominal.promised_share == 0.5
+    least = f"{100 * cfg.min_gain:.0f} %"
+    assert f"promises to remove half of the {least} of 8, and kept only where they remove {least} of the" in PAGE
+    assert f"none can remove the {least} that an effect must (8), none is refined" in PAGE
+    assert cfg.search.polished_first == 1
+    assert "one fit, the most promising\n   that is above the noise, is refined first" in PAGE
+    assert f"that can be touched last {cfg.fits.observation.max_contact_length:g} s at most" in PAGE
+    assert f"changes the residuals by more than {cfg.fits.least_squares.max_change:g} x noise is taken again" in PAGE
+    assert f"multiple shooting over windows of {cfg.search.shooting_window:g} s" in PAGE
     assert BOUND == 2.0
     assert "bounds of two tolerances" in PAGE
     assert f"at most {cfg.adequate_ratio:g} x noise altogether, and of {cfg.adequate_channel_ratio:g} x" in PAGE

@@ -561,12 +561,13 @@ def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_ca
 def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
     given, after, asked = node(5.0), node(2.0, effects=1), []
 
-    def nominal(one, _cfg, enough):
+    def nominal(one, cfg, min_gain, enough):
+        assert (cfg, min_gain) == (made.cfg.nominal, made.cfg.min_gain)
         asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
         return one
 
     monkeypatch.setattr(module, "with_nominal_values", nominal)
-    made = procedure()
+    made = procedure(min_gain=0.04)
     made._with_nominal([given], None, given)
     made._with_nominal([given, after], None, given)
     # 5.2 % and 9.3 % of the discrepancy.

@@ -96,7 +96,8 @@ def observe(
     Args:
         model: The model that is to follow them.
         recording: What was commanded and measured.
-        length: Length of a window [s]; by default as long as the model's motion keeps close to where it started.
+        length: Length of a window [s]; by default as long as the model's motion keeps close to where it started, with
+            free bodies that can be touched at most `ObservationCfg.max_contact_length`.
         noise: Standard deviation of a component of each channel; by default stated or estimated.
         engine: Which engine simulates.
         seed: Seed of the disturbances from which the growth of differences is estimated.
@@ -108,6 +109,7 @@ def observe(
     cfg = cfg or ObservationCfg()
     source = ObservedRecording(model, recording, noise or channel_noises(model, recording, cfg), cfg)
     windows: list[Window] = []
+    longest = cfg.max_contact_length if _has_touchable_free_body(model.compile()) else cfg.max_length
     for number, d in enumerate(recording.demonstrations):
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
@@ -116,7 +118,9 @@ def observe(
         while start < last - 1e-6:
             end = last
             if measured is not None:
-                reach = length if length is not None else keeps_close(source, d, start, last, engine, seed)
+                reach = length
+                if reach is None:
+                    reach = keeps_close(source, d, start, min(last, start + longest), engine, seed)
                 end = last if last - start - reach < cfg.min_length else _calmest(measured, start, reach, cfg)
             if (window := source.window(number, start, end)) is not None:
                 windows.append(window)
@@ -134,7 +138,7 @@ def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName)
     m = model.compile()
     if (m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any():
         return False
-    if not (m.geom_contype | m.geom_conaffinity).any():
+    if not _can_touch(m):
         return True
     simulator = make_engine(engine, model)
     for w in windows:
@@ -150,9 +154,14 @@ def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName)
     return True
 
 
+def _can_touch(m: mujoco.MjModel) -> bool:
+    """Return whether something in a scene can touch, by the masks of its geoms or as a stated pair."""
+    return bool(m.npair or (m.geom_contype | m.geom_conaffinity).any())
+
+
 def _has_touchable_free_body(m: mujoco.MjModel) -> bool:
     """Return whether a body moves freely in a scene in which something can touch."""
-    return bool((m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any() and (m.geom_contype | m.geom_conaffinity).any())
+    return bool((m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any()) and _can_touch(m)
 
 
 def keeps_close(
@@ -160,7 +169,7 @@ def keeps_close(
 ) -> float:
     """Return for how long [s] the effects of errors of an initial state stay in proportion to them."""
     cfg, m = source.cfg, source.model.compile()
-    span = min(last - start, cfg.max_contact_length if _has_touchable_free_body(m) else cfg.max_length)
+    span = min(last - start, cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
     state = source.state(d, start)
     qpos, qvel = state.qpos, state.qvel

@@ -191,15 +191,44 @@ def test_fits_near_the_best_that_have_not_reached_the_noise_are_polished(monkeyp
     best = made("best", 0.8, ratio=1.04)
     fits = [best, made("near", 0.7), made("low", 0.5), made("done", 0.75, ratio=1.03), made("far", 0.1)]
     expected = np.array([0.8, 0.7, 0.57, 0.75, 0.55])
-    fits_of(fits)._polish_near(best, expected)
+    fits_of(fits, polished_first=9)._polish_near(best, expected)
     assert [d[:2] for d in tasks.done] == [("polish", "best"), ("polish", "near"), ("polish", "low")]
     tasks.done.clear()
     reached = replace(best, ratio=1.02)
-    fits_of([reached, made("a", 0.69), made("b", 0.68), made("c", 0.3)])._polish_near(
+    fits_of([reached, made("a", 0.69), made("b", 0.68), made("c", 0.3)], polished_first=9)._polish_near(
         reached,
         np.array([0.8, 0.7, 0.7, 0.7]),
     )
     assert [d[1] for d in tasks.done] == ["b", "c"]  # those above 0.85 of 0.8 are left to the rivals
+
+
+def test_few_fits_are_polished_before_rivals_start_from_the_best_the_most_promising_first(monkeypatch):
+    assert SearchCfg().polished_first == 1
+    gains = (("a", 0.7), ("b", 0.8), ("c", 0.75))
+    for changes, polished in (({}, "b"), ({"polished_first": 2}, "bc"), ({"polished_first": 9}, "bca")):
+        tasks = Tasks(monkeypatch, {name: made(name, gain) for name, gain in gains})
+        search = fits_of([], **changes)
+        search.fit([screened(name, gain) for name, gain in gains], 0.1, list)
+        kinds = [d[0] for d in tasks.done]
+        before = tasks.done[: kinds.index("restart")]
+        assert [d[1] for d in before if d[0] == "polish"] == list(polished)
+        # All of them start from the best one's states after that.
+        assert {d[1:3] for d in tasks.done if d[0] == "restart"} == {("c", "b"), ("a", "b")}
+
+
+def test_candidates_that_cannot_explain_enough_to_be_accepted_are_not_refined(monkeypatch):
+    least = DiagnoseCfg().min_gain
+    for fitted, promised, refined in (
+        (0.9 * least, 0.9 * least, False),
+        (1.1 * least, 0.9 * least, True),
+        (0.9 * least, 1.1 * least, True),  # it may have ended in a local minimum
+        (least, 0.0, True),
+    ):
+        tasks = Tasks(monkeypatch, {n: made(n, gain, ratio=1.3) for n, gain in (("a", fitted), ("b", 0.8 * least))})
+        search = fits_of([])
+        found = search.fit([screened("a", promised), screened("b", 0.5 * least)], -1.0, list)
+        assert {c.name for c in found} == {"a", "b"}
+        assert any(d[0] != "fit" for d in tasks.done) is refined
 
 
 def test_rivals_are_refitted_as_long_as_a_cost_falls(monkeypatch):

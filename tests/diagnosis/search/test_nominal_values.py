@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import concent_warp as cw
 from concent_warp.diagnosis.cfg import NominalCfg
+from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.nominal_values import (
     _independent,
     _nominal_effects_of,
+    _visible,
     considered_std,
     nominal_errors,
     nominal_sensitivities,
+    with_nominal_values,
 )
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.registry import effect_class
-from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
+from concent_warp.fit.effects.least_squares import Solver
 from tests.scenes.foreign import PUSHER, pusher
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -106,10 +112,63 @@ def test_the_tolerance_of_a_drive_widens_the_interval_of_a_damping_unless_nomina
     assert halves[0] > 1.2 * halves[1]
 
 
+SLIGHTLY_WRONG = (
+    PUSHER.replace('mass="0.8"', 'mass="0.806"')
+    .replace('kp="12"', 'kp="11.9"')
+    .replace('"0.12 0 0" mass', '"0.121 0 0" mass')
+)
+
+
+@pytest.fixture(scope="module")
+def slightly_wrong():
+    model, cfg = cw.Model(cw.Scene(SLIGHTLY_WRONG)), cw.DiagnoseCfg(jobs=1)
+    return Procedure(model, pusher(damping=0.05, delay=0.0), cfg).baseline()
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """Models that are fitted, one entry each."""
+    done, fit = [], Solver.fit
+
+    def watched(solver, *args, **kwargs):
+        done.append([a.name for a in solver.p.effects])
+        return fit(solver, *args, **kwargs)
+
+    monkeypatch.setattr(Solver, "fit", watched)
+    return done
+
+
+def test_nominal_values_are_fitted_only_where_a_linear_step_promises_a_share_of_the_least_gain(slightly_wrong, fits):
+    cfg = NominalCfg()
+    visible, promised = _visible(slightly_wrong, cfg)
+    assert 0.6 < promised < 0.8
+    assert cfg.promised_share == 0.5
+    fits.clear()
+    for share, min_gain, fitted in (
+        (0.5, 2.02 * promised, False),
+        (0.5, 1.98 * promised, True),
+        (1.0, 1.01 * promised, False),
+        (0.0, 2.02 * promised, True),
+    ):
+        # None of these least gains is reached.
+        assert with_nominal_values(slightly_wrong, replace(cfg, promised_share=share), min_gain) is None
+        assert fits == ([[e.name for e in visible]] if fitted else [])
+        fits.clear()
+
+
+def test_nominal_values_that_remove_less_than_the_least_gain_stay_as_given(slightly_wrong):
+    found = with_nominal_values(slightly_wrong, NominalCfg(), 0.05)
+    assert found is not None
+    sums = block_sums(found.pieces, found.blocks, found.limit)
+    errors = HeldOut(sums, found.blocks, found.cfg.least_squares.prior).own()
+    removed = 1 - errors.sum() / slightly_wrong.errors.sum()
+    assert 0.6 < removed < 0.8
+    assert with_nominal_values(slightly_wrong, NominalCfg(), 0.99 * removed) is not None
+    assert with_nominal_values(slightly_wrong, NominalCfg(), 1.01 * removed) is None
+
+
 def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
-    wrong = PUSHER.replace('mass="0.8"', 'mass="0.806"').replace('kp="12"', 'kp="11.9"')
-    wrong = wrong.replace('"0.12 0 0" mass', '"0.121 0 0" mass')
-    model, recording = cw.Model(cw.Scene(wrong)), pusher(damping=0.05, delay=0.0)
+    model, recording = cw.Model(cw.Scene(SLIGHTLY_WRONG)), pusher(damping=0.05, delay=0.0)
     found = cw.diagnose(model, recording, cw.DiagnoseCfg(jobs=1, explain=False))
     assert found.verdict == "none_needed"
     assert not found.accepted
@@ -133,6 +192,7 @@ def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
     assert [v for a in kept for v in a.values] == pytest.approx([p.value for p in found.nominal_values])
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_nominal_values_stay_as_given_where_that_is_asked_for():
     wrong = cw.Model(cw.Scene(PUSHER.replace('kp="12"', 'kp="11.8"')))
     cfg = cw.DiagnoseCfg(jobs=1, explain=False, effects=("actuator_gain",), nominal=NominalCfg(enabled=False))

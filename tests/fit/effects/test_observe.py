@@ -39,6 +39,68 @@ def test_a_motion_that_forgets_its_start_is_one_window_and_one_with_impacts_is_s
     assert len(observe(Model(Scene(toss_scene(EDGE))), tossed)) > 2
 
 
+FLYING = """<mujoco>
+  <option timestep="0.002"/>
+  <worldbody><geom type="plane" size="1 1 .1" {}/><body name="ball" pos="0 0 3"><freejoint/><geom size=".05" {}/></body>
+  </worldbody>
+  <contact>{}</contact>
+  <sensor>
+    <framepos name="place" objtype="xbody" objname="ball"/><framequat name="turned" objtype="xbody" objname="ball"/>
+  </sensor>
+</mujoco>"""
+NO_MASK = 'contype="0" conaffinity="0"'
+
+
+def thrown(scene: str, kick: float = 6.0) -> tuple[Model, Recording]:
+    """Return a model of a ball and a recording of its flight of 1.5 s, in which it touches nothing."""
+    model, time = Model(Scene(scene)), 0.01 * np.arange(151)
+    m = model.compile()
+    qvel = np.zeros(6)
+    qvel[2] = kick
+    place = np.stack([0 * time, 0 * time, 3 + kick * time - 9.81 / 2 * time**2], axis=1)
+    measured = {
+        "place": Channel(time, place + NOISE * np.random.default_rng(0).normal(size=place.shape), NOISE),
+        "turned": Channel(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), NOISE),
+    }
+    return model, Recording(scene, (Demonstration("demo_0", qpos=m.qpos0, qvel=qvel, measured=measured),))
+
+
+@pytest.mark.parametrize(
+    ("scene", "touchable"),
+    [
+        (FLYING.format("", "", ""), True),
+        (FLYING.format('name="floor" ' + NO_MASK, 'name="hull" ' + NO_MASK, ""), False),
+        (
+            FLYING.format('name="floor" ' + NO_MASK, 'name="hull" ' + NO_MASK, '<pair geom1="floor" geom2="hull"/>'),
+            True,
+        ),
+    ],
+)
+def test_windows_of_free_bodies_that_can_be_touched_last_half_a_second_at_most(scene, touchable):
+    model, recording = thrown(scene)
+    longest = ObservationCfg().max_contact_length
+    assert longest == 0.5
+    windows = observe(model, recording)
+    if not touchable:
+        assert [(w.start, w.end) for w in windows] == [(0.0, 1.5)]
+        return
+    assert len(windows) >= 3
+    # The last may take over a rest that is shorter than the shortest window.
+    assert all(w.end - w.start <= longest + 1e-9 for w in windows[:-1])
+    assert windows[-1].end - windows[-1].start <= longest + ObservationCfg().min_length
+    assert windows[-1].end == pytest.approx(1.5)
+    (asked,) = observe(model, recording, length=1.5)
+    assert asked.end == pytest.approx(1.5)
+    shorter = observe(model, recording, cfg=ObservationCfg(max_contact_length=0.3))
+    assert max(w.end - w.start for w in shorter[:-1]) <= 0.3 + 1e-9
+
+
+def test_errors_of_a_free_bodys_state_stay_in_proportion_for_longer_than_its_windows():
+    model, recording = thrown(FLYING.format("", "", ""))
+    source = ObservedRecording(model, recording, {"place": NOISE, "turned": NOISE})
+    assert keeps_close(source, recording[0], 0.0, 1.5, "mujoco", 0) == pytest.approx(1.5)
+
+
 def test_the_state_at_the_start_of_a_window_is_the_measured_one():
     recording = swung(damping=0.0)
     later = windows_of(recording, 0.5)[1]
@@ -127,6 +189,12 @@ def test_a_few_samples_are_too_little(count):
 TOUCHING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2"><joint type="slide" axis="0 0 1"/>
 <geom size=".05" {}/></body></worldbody></mujoco>"""
 
+TOUCHING_PAIR = (
+    TOUCHING.format('name="ball" contype="0" conaffinity="0"')
+    .replace('type="plane"', 'name="floor" type="plane" contype="0" conaffinity="0"')
+    .replace("</mujoco>", '<contact><pair geom1="floor" geom2="ball"/></contact></mujoco>')
+)
+
 
 @pytest.mark.parametrize(
     ("scene", "seconds", "untouched"),
@@ -134,6 +202,8 @@ TOUCHING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 
         (TOUCHING.format(""), 0.1, True),
         (TOUCHING.format(""), 0.3, False),
         (TOUCHING.format('contype="0" conaffinity="0"'), 0.3, True),
+        (TOUCHING_PAIR, 0.1, True),
+        (TOUCHING_PAIR, 0.3, False),
         (TOUCHING.format("").replace('type="slide" axis="0 0 1"', 'type="free"'), 0.1, False),
     ],
 )
