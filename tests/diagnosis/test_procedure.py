@@ -562,7 +562,8 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
     given, after, asked = node(5.0), node(2.0, effects=1), []
 
     def nominal(one, cfg, min_gain, enough):
-        assert (cfg, min_gain) == (made.cfg.nominal, made.cfg.min_gain)
+        # Far from the noise they must explain a fifth; as near as an error of form leaves, what an effect must.
+        assert (cfg, min_gain) == (made.cfg.nominal, 0.2 if one is given else 0.04)
         asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
         return one
 
@@ -572,6 +573,18 @@ def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of
     made._with_nominal([given, after], None, given)
     # 5.2 % and 9.3 % of the discrepancy.
     assert asked == [None, [True, False]]
+
+
+def test_far_from_the_noise_a_shorter_time_step_must_explain_a_fifth(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(module, "finer_time_step", lambda one, cfg: asked.setdefault(one.ratio, cfg.min_gain))
+    made = procedure(min_gain=0.04)
+    for ratio in (5.0, 2.01, 2.0, 1.5):
+        made._finer(node(ratio))
+    assert asked == {5.0: 0.2, 2.01: 0.2, 2.0: 0.04, 1.5: 0.04}
+    made = procedure(min_gain=0.3)
+    made._finer(node(6.0))
+    assert asked[6.0] == 0.3
 
 
 def test_large_residuals_that_a_model_explains_are_no_outliers():
