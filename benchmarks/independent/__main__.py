@@ -75,8 +75,9 @@ class Args:
 
 def main(args: Args) -> None:
     """Diagnose what is not done yet, and write the page where all was asked for."""
-    args.out.mkdir(parents=True, exist_ok=True)
     every = all_sets()
+    check(args, every)
+    args.out.mkdir(parents=True, exist_ok=True)
     chosen = [c for c in every if wanted(c, args)]
     if not args.report:
         run(chosen, args)
@@ -87,6 +88,26 @@ def main(args: Args) -> None:
             rows += read_results(args.locked_results)
         earlier = [] if args.earlier is None else read_results(args.earlier)
         write_page_from(rows, earlier, every, args.host or machine_line(machine()))
+
+
+def check(args: Args, every: Sequence[DataSet]) -> None:
+    """End with a sentence where the command line asks for what there is not."""
+    for option, asked, known in (
+        ("--names", args.names, {c.name for c in every}),
+        ("--rigs", args.rigs, {c.rig for c in every}),
+    ):
+        if unknown := sorted(set(asked) - known):
+            wrong = ", ".join(unknown)
+            raise SystemExit(
+                f"independent benchmark: {option} has no {wrong}; python -m benchmarks.independent.data_sets --list"
+                " prints all"
+            )
+    for option, number in (("--jobs", args.jobs), ("--cores", args.cores), ("--limit", args.limit)):
+        if not 0 < number < float("inf"):
+            raise SystemExit(f"independent benchmark: {option} must be a positive number; found {number:g}")
+    for option, file in (("--earlier", args.earlier), ("--locked-results", args.locked_results)):
+        if file is not None and not file.is_file():
+            raise SystemExit(f"independent benchmark: {option} {file}: no such file; give the results.jsonl of a run")
 
 
 def wanted(case: DataSet, args: Args) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,6 +55,11 @@ def page(rows: Sequence[Row], earlier: Sequence[Row], every: Sequence[DataSet], 
     older = ", ".join(f"`{c}`" for c in sorted({r.get("commit") or "-" for r in earlier})) or "-"
     seconds = np.array([r.get("processor_seconds", r["seconds"]) for r in rows if "seconds" in r] or [0.0])
     total = sum(c.name in {r["name"] for r in rows} for c in every)
+    measured = (
+        f"{host} {total} of {len(every)} data sets, revision {revisions}; earlier state of the method: revision"
+        f" {older}. Processor time of a diagnosis: median {np.median(seconds):.0f} s, longest {seconds.max():.0f} s;"
+        f" more than {CORE_SECONDS:.0f} s in {int((seconds > CORE_SECONDS).sum())}."
+    )
     parts = [
         f"""# Diagnoses on independent worlds
 
@@ -69,9 +75,7 @@ their names, fixed before any result: `benchmarks/independent/split.json`.
 *Exactly right*: the effects that are there and nothing else, each named alone or in a group of at most two. No effect
 counts for another one. Square brackets have Wilson's 95 % intervals.
 
-{host} {total} of {len(every)} data sets, revision {revisions}; earlier state of the method: revision {older}. Processor
-time of a diagnosis: median {np.median(seconds):.0f} s, longest {seconds.max():.0f} s; more than {CORE_SECONDS:.0f} s in
-{int((seconds > CORE_SECONDS).sum())}.
+{textwrap.fill(measured, 120)}
 """,
         _figures(development, locked, before),
     ]

@@ -48,7 +48,7 @@ class Scene:
             SceneError: The file is missing, MuJoCo cannot compile it, or it asks for more than `Limits` allow.
         """
         if not path.is_file():
-            raise SceneError("no such MJCF file", where=path, fix="check the path given with --scene or --robot")
+            raise SceneError("no such MJCF file", where=path, fix="check the path")
         return _standalone(spec_from_file(path, warn_outside=warn_outside), str(path))
 
     @staticmethod

@@ -3,6 +3,7 @@
 import json
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -221,6 +222,24 @@ def test_a_study_that_takes_too_long_ends_as_time_out(script):
         time.sleep(5)
     with study.limited(30.0):
         pass
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"names": ("pendulum-nul-0",)}, "--names has no pendulum-nul-0"),
+        ({"rigs": ("arm", "leg")}, "--rigs has no leg"),
+        ({"cores": 0}, "--cores must be a positive number; found 0"),
+        ({"limit": -3.0}, "--limit must be a positive number; found -3"),
+        ({"limit": float("nan")}, "--limit must be a positive number; found nan"),
+        ({"earlier": Path("nothere.jsonl")}, "--earlier nothere.jsonl: no such file"),
+    ],
+)
+def test_what_there_is_not_is_refused_before_anything_is_written(script, tmp_path, asked, said):
+    program = script("benchmarks.independent.__main__")
+    with pytest.raises(SystemExit, match=said):
+        program.main(program.Args(out=tmp_path / "results", **asked))
+    assert not (tmp_path / "results").exists()
 
 
 def test_remaining_time_follows_the_sets_that_are_done(script, worlds):
