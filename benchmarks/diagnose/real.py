@@ -8,23 +8,29 @@ Two sets of measurements, neither of which anything here was tuned to:
   controller. The model has the motor's constants as they are roughly known, no friction, and a drive strength that is
   fitted from the start. Logs at one gain are diagnosed; those at the other judge, in a model with that gain.
 
-    python -m benchmarks.diagnose.real --data ../shared/data       # both, about half an hour on one core
+    python -m benchmarks.diagnose.real --data ../shared/data       # both
     python -m benchmarks.diagnose.real --parts servo               # one of them; the page keeps the other's figures
     python -m benchmarks.diagnose.real --table                     # the page again, from the figures
 
-What is killed goes on from its finished pieces, in runs/diagnose_real; empty that folder after a change of the method.
+What is stopped goes on from its finished pieces, in runs/diagnose_real, in a folder named after the code: pieces of
+other code are not used again. The page is written after each diagnosis.
 
-What judges shares nothing with the diagnosis but the simulator: windows of the recordings that were held out, see
-`held_out.py`. After each addition the model predicts them; so it does with each decoy added to the final model, fitted
-to the same data as the diagnosis had.
+What judges shares nothing with the diagnosis but the simulator: windows of the recordings that were held out, and
+these as a whole, see `held_out.py`. After each addition the model predicts them, and so does the model that
+`concent diagnose --apply` saves, which is the last; so it does with each decoy added to it, fitted to the same data as
+the diagnosis had.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,11 +42,12 @@ from benchmarks.fit.held_out import Spans, by_demonstration, change, cut_spans, 
 from benchmarks.pages import ROOT, machine, read_data, write_data
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.registry import effect_class
+from concent_warp.files import write_text
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver
 from concent_warp.fit.effects.observation import Window
+from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.formats.bam import DRIVE, JOINT, SENSOR, read_bam
@@ -60,14 +67,21 @@ SERVO_SPAN = (0.4, 0.1)
 """Windows of swings: 0.3 s are predicted."""
 MOVING = 0.02
 """A window in which nothing moves by more than this [m or rad] is rest."""
+DEGREES = 180 / np.pi
 DECOYS: dict[Part, tuple[str, ...]] = {
     "tosses": ("air_drag", "torsional_friction", "rolling_friction"),
     "servo": ("stribeck_friction", "actuator_delay"),
 }
-ADDITIONS: dict[Part, int] = {"tosses": 2, "servo": 3}
-"""Most effects that a diagnosis adds."""
-LADDER = ((), ("joint_friction", "joint_damping"), ("load_friction",), ("stribeck_friction",), ("actuator_delay",))
-"""Effects of servos in the order of the literature, each fitted on top of those before it; the last two each alone."""
+LADDERS: dict[Part, tuple[str, tuple[tuple[str, ...], ...], tuple[tuple[str, ...], ...]]] = {
+    "tosses": ("as given", (("sliding_friction",), ("contact_compliance",), ("time_base", "length_scale")), ()),
+    "servo": (
+        "drive strength alone",
+        (("joint_friction", "joint_damping"), ("load_friction",)),
+        (("stribeck_friction",), ("actuator_delay",)),
+    ),
+}
+"""The model at the start, effects in the order of the literature, each fitted on top of those before it, and effects
+that are added alone on top of all these."""
 
 
 @dataclass(frozen=True)
@@ -77,18 +91,16 @@ class Args:
     data: Path = ROOT.parent / "shared" / "data"
     """Folder with the folders contactnets_cube and bam_xl330."""
     parts: tuple[Part, ...] = ("tosses", "servo")
-    fitted: int = 16
+    fitted: int = 12
     """Tosses that are diagnosed."""
     judged: int = 60
     """Tosses that judge."""
     seed: int = 0
     """Of the split of the tosses."""
-    jobs: int = 1
+    jobs: int = len(os.sched_getaffinity(0))
     """Processes of a diagnosis."""
     pieces: Path = ROOT / "runs" / "diagnose_real"
-    """Where finished pieces of diagnoses are kept."""
-    contrast: bool = False
-    """Fit decoys and the ladder again, for the diagnoses that there are."""
+    """Where finished pieces are kept."""
     table: bool = False
     """Write the page from the figures that there are."""
 
@@ -107,11 +119,43 @@ class Judge:
     """Turns a model of the diagnosed data into one of these data."""
     grouped: bool
     """Whether demonstrations are the units of tests; else windows."""
+    held_out: bool = True
+    """Whether these data were not diagnosed."""
 
     def errors(self, model: Model) -> np.ndarray:
         """Return the error of each unit."""
         found = prediction_errors(self.to(model), self.spans, [self.channel])[self.channel] * self.per_unit
         return by_demonstration(found, self.spans.group) if self.grouped else found
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model, what it is diagnosed on, and what judges."""
+
+    title: str
+    part: Part
+    model: Model
+    seen: Recording
+    judges: list[Judge]
+
+
+class Stopwatch:
+    """Wall and processor time of a diagnosis, over all runs that it took."""
+
+    def __init__(self, path: Path) -> None:
+        """Go on from the times in a file."""
+        self.path = path
+        self.before = json.loads(path.read_text()) if path.is_file() else [0.0, 0.0]
+        self.begun = time.perf_counter(), processor_seconds()
+
+    def read(self) -> tuple[float, float]:
+        """Return wall and processor time so far [s]."""
+        wall, processor = time.perf_counter() - self.begun[0], processor_seconds() - self.begun[1]
+        return self.before[0] + wall, self.before[1] + processor
+
+    def save(self) -> None:
+        """Keep the times for a run that goes on from here."""
+        write_text(self.path, json.dumps(self.read()))
 
 
 def main(args: Args) -> None:
@@ -121,27 +165,29 @@ def main(args: Args) -> None:
         if missing:
             print(f"no measured data in {' and '.join(missing)}; say where they are with --data", file=sys.stderr)
             raise SystemExit(2)
+        args = replace(args, pieces=args.pieces / code_digest())
+        args.pieces.mkdir(parents=True, exist_ok=True)
         for part in args.parts:
-            begin = time.perf_counter()
             cases = [tosses(args)] if part == "tosses" else [servo(args, kp) for kp in GAINS]
-            old = read_data(NAME).get(part, {}).get("studies", []) if args.contrast else []
-            if args.contrast:
-                studies = [contrasted(found, case, part) for found, case in zip(old, cases, strict=True)]
-            else:
-                studies = [study(case, part, args) for case in cases]
-            spent = time.perf_counter() - begin
-            write_data(NAME, {**read_data(NAME), part: {"studies": studies, "seconds": spent, "machine": machine()}})
-    write_report(read_data(NAME))
+            studies: list[dict[str, Any]] = []
+            for case in cases:
+                studies.append(study(case, args))
+                write_data(NAME, {**figures(), part: {"studies": studies, "machine": machine()}})
+                write_report(figures())
+    write_report(figures())
 
 
-@dataclass(frozen=True)
-class Case:
-    """A model, what it is diagnosed on, and what judges."""
+def figures() -> dict[str, Any]:
+    """Return the figures of the page, without those of a part that an earlier layout has."""
+    return {part: old for part, old in read_data(NAME).items() if all("sentences" in s for s in old["studies"])}
 
-    title: str
-    model: Model
-    seen: Recording
-    judges: list[Judge]
+
+def code_digest() -> str:
+    """Return a hash of all code that a study depends on."""
+    digest = sha256()
+    for path in (*sorted((ROOT / "concent_warp").rglob("*.py")), Path(__file__), ROOT / "benchmarks/fit/held_out.py"):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def tosses(args: Args) -> Case:
@@ -157,12 +203,15 @@ def tosses(args: Args) -> Case:
     windows = cut_spans(model, unseen, *TOSS_SPAN, moving=MOVING)
     whole = cut_spans(model, unseen, None, TOSS_SPAN[1])
     judges = [
-        Judge("position, windows", "mm", 1e3, POSITION, windows, same, True),
-        Judge("orientation, windows", "deg", 180 / np.pi, ORIENTATION, windows, same, True),
-        Judge("position, whole toss", "mm", 1e3, POSITION, whole, same, True),
+        Judge(f"{name}, {which}", unit, per_unit, channel, spans, same, True)
+        for which, spans in (("windows", windows), ("whole toss", whole))
+        for name, unit, per_unit, channel in (
+            ("position", "mm", 1e3, POSITION),
+            ("orientation", "deg", DEGREES, ORIENTATION),
+        )
     ]
     title = f"{len(seen.demonstrations)} tosses diagnosed, {len(unseen.demonstrations)} others judge"
-    return Case(title, model, seen, judges)
+    return Case(title, "tosses", model, seen, judges)
 
 
 def servo(args: Args, kp: float) -> Case:
@@ -173,13 +222,18 @@ def servo(args: Args, kp: float) -> Case:
     there = Scene(unseen.scene, unseen.source)
 
     def moved(m: Model) -> Model:
-        return replace(m, scene=there)
+        timestep = m.scene.model.opt.timestep
+        return replace(m, scene=there if timestep == there.model.opt.timestep else there.with_timestep(timestep))
 
-    judges = []
-    for name, recording, to in ((f"kp {other:g}, held out", unseen, moved), (f"kp {kp:g}, diagnosed", seen, same)):
-        spans = cut_spans(to(model), recording, *SERVO_SPAN, moving=MOVING)
-        judges.append(Judge(name, "deg", 180 / np.pi, SENSOR, spans, to, False))
-    return Case(f"kp {kp:g} diagnosed, kp {other:g} judges", model, seen, judges)
+    windows = cut_spans(moved(model), unseen, *SERVO_SPAN, moving=MOVING)
+    whole = cut_spans(moved(model), unseen, None, SERVO_SPAN[1])
+    own = cut_spans(model, seen, *SERVO_SPAN, moving=MOVING)
+    judges = [
+        Judge(f"kp {other:g}, windows", "deg", DEGREES, SENSOR, windows, moved, False),
+        Judge(f"kp {other:g}, whole log", "deg", DEGREES, SENSOR, whole, moved, True),
+        Judge(f"kp {kp:g}, diagnosed, windows", "deg", DEGREES, SENSOR, own, same, False, held_out=False),
+    ]
+    return Case(f"kp {kp:g} diagnosed, kp {other:g} judges", "servo", model, seen, judges)
 
 
 def same(model: Model) -> Model:
@@ -187,65 +241,55 @@ def same(model: Model) -> Model:
     return model
 
 
-def study(case: Case, part: Part, args: Args) -> dict[str, Any]:
-    """Diagnose a recording and judge every step, and the decoys on top of the last."""
-    title, model, seen, judges = case.title, case.model, case.seen, case.judges
-    begin = time.perf_counter()
-    cfg = DiagnoseCfg(max_additions=ADDITIONS[part], jobs=args.jobs, explain=False)
-    diagnosis = diagnose(
-        model, seen, cfg, out=args.pieces, progress=lambda share, text: progress(title, begin, share, text)
-    )
-    spent = time.perf_counter() - begin
-    print(f"\n{title}: {diagnosis.verdict}, {[f.name for f in diagnosis.accepted]}, {spent:.0f} s", flush=True)
-    steps = ["as published", *(f"+ {f.name}" for f in diagnosis.accepted)]
-    rows = judged(steps, list(diagnosis.models), judges)
+def study(case: Case, args: Args) -> dict[str, Any]:
+    """Diagnose a recording and judge every model, and what the literature and decoys make of the same data."""
+    name = sha256(json.dumps([case.title, [d.name for d in case.seen.demonstrations]]).encode()).hexdigest()[:12]
+    path, watch = args.pieces / f"{name}.json", Stopwatch(args.pieces / f"{name}.seconds.json")
+    if path.is_file():
+        return json.loads(path.read_text())
+
+    def progress(share: float, text: str) -> None:
+        watch.save()
+        print(f"{case.title}: {100 * share:3.0f} % {text:40s} {watch.read()[0]:5.0f} s", flush=True)
+
+    diagnosis = diagnose(case.model, case.seen, DiagnoseCfg(jobs=args.jobs), out=args.pieces, progress=progress)
+    end_workers()
+    watch.save()
+    wall, processor = watch.read()
+    print(f"{case.title}: {diagnosis.verdict}, {wall:.0f} s, {processor:.0f} s of processors", flush=True)
+    print("\n".join(f"  {sentence}" for sentence in diagnosis.sentences()), flush=True)
+    windows = observe(case.model, case.seen)
     found: dict[str, Any] = {
-        "title": title,
-        "seconds": spent,
-        "judges": [{"name": j.name, "unit": j.unit, "units": len(j.errors(model))} for j in judges],
+        "title": case.title,
+        "part": case.part,
+        "recordings": len(case.seen.demonstrations),
+        "jobs": args.jobs,
+        "seconds": wall,
+        "processor_seconds": processor,
+        "judges": [
+            {"name": j.name, "unit": j.unit, "units": len(j.errors(case.model)), "held_out": j.held_out}
+            for j in case.judges
+        ],
         "diagnosis": diagnosis.to_json(),
-        "steps": rows,
+        "sentences": diagnosis.sentences(),
+        "steps": judged(step_names(case.model, diagnosis.models), diagnosis.models, case.judges),
+        "decoys": decoys(diagnosis.model, windows, case),
+        "ladder": ladder(case.model, windows, case),
     }
-    return contrasted(found, case, part)
-
-
-def contrasted(found: dict[str, Any], case: Case, part: Part) -> dict[str, Any]:
-    """Return a study with decoys added to its final model, and for servos with a ladder of effects, fitted anew."""
-    windows = Procedure(case.model, case.seen, DiagnoseCfg()).baseline().windows
-    final = rebuilt(case.model, found)
-    held = {a.effect.name for a in final.effects}
-    decoys = []
-    for name in DECOYS[part]:
-        if name in held:
-            decoys.append({"name": name, "accepted": True, "changes": [], "values": {}})
-            continue
-        added = fitted(final, [chosen(name)], windows)
-        pairs = [change(j.errors(final), j.errors(added)) for j in case.judges]
-        decoys.append(
-            {"name": name, "accepted": False, "changes": [asdict(c) for c in pairs], "values": values(added, name)}
-        )
-        print(f"  decoy {name}: {[f'{100 * c.fall:.1f} % p {c.p:.2g}' for c in pairs]}", flush=True)
-    found = {**found, "decoys": decoys}
-    if part == "servo":
-        found["ladder"] = ladder(case.model, windows, case.judges)
+    write_text(path, json.dumps(found))
     return found
 
 
-def rebuilt(model: Model, found: dict[str, Any]) -> Model:
-    """Return the last model of a study from its figures."""
-    known: dict[str, float] = found["steps"][-1]["values"]
-    targets = {f["name"].split("(")[0]: f["target"] for f in found["diagnosis"]["effects"] if f["accepted"]}
-    model = replace(model, effects=())
-    for name in dict.fromkeys(key.split(".", 1)[0] for key in known):
-        effect = effect_class(name)(*targets[name]) if name in targets else chosen(name)
-        parts = {key.split(".", 1)[1]: value for key, value in known.items() if key.startswith(f"{name}.")}
-        model = model.add(effect, parts)
-    return model
-
-
-def progress(title: str, begin: float, share: float, text: str) -> None:
-    """Say how far a diagnosis is, on one line."""
-    print(f"\r{title}: {100 * share:3.0f} % {text:40s} {time.perf_counter() - begin:5.0f} s", end="", flush=True)
+def step_names(given: Model, models: Sequence[Model]) -> list[str]:
+    """Return the names of the models of a diagnosis: what each has that the one given has not; the last is saved."""
+    names = ["as given"]
+    for model in models[1:]:
+        added = [a.effect for a in model.effects[len(given.effects) :]]
+        parts = ["nominal values"] if any(e.nominal for e in added) else []
+        if model.scene.model.opt.timestep != given.scene.model.opt.timestep:
+            parts.append("shorter time step")
+        names.append(f"with {', '.join([*(e.name for e in added if not e.nominal), *parts]) or 'nothing'}")
+    return [*names[:-1], f"{names[-1]} (saved)"]
 
 
 def judged(names: Sequence[str], models: Sequence[Model], judges: Sequence[Judge]) -> list[dict[str, Any]]:
@@ -255,21 +299,36 @@ def judged(names: Sequence[str], models: Sequence[Model], judges: Sequence[Judge
     for k, name in enumerate(names):
         first = [asdict(change(a, b)) for a, b in zip(errors[0], errors[k], strict=True)]
         last = [asdict(change(a, b)) for a, b in zip(errors[max(k - 1, 0)], errors[k], strict=True)]
-        rows.append({"name": name, "from_first": first, "from_before": last, "values": values(models[k], "")})
+        rows.append({"name": name, "from_first": first, "from_before": last, "values": values(models[k])})
     return rows
 
 
-def ladder(model: Model, windows: Sequence[Window], judges: Sequence[Judge]) -> list[dict[str, Any]]:
-    """Fit what the literature adds to servos, step by step, without any choice, and judge each step."""
-    models = [fitted(model, [], windows)]
-    names = ["drive strength alone"]
-    for added in LADDER[1:3]:
+def decoys(saved: Model, windows: Sequence[Window], case: Case) -> list[dict[str, Any]]:
+    """Return what effects that were not accepted change on top of the saved model."""
+    held, found = {a.effect.name for a in saved.effects}, []
+    for name in DECOYS[case.part]:
+        if name in held:
+            found.append({"name": name, "accepted": True, "changes": [], "values": {}})
+            continue
+        print(f"{case.title}: decoy {name}", flush=True)
+        added = fitted(saved, [chosen(name)], windows)
+        changes = [asdict(change(j.errors(saved), j.errors(added))) for j in case.judges]
+        found.append({"name": name, "accepted": False, "changes": changes, "values": values(added, name)})
+    return found
+
+
+def ladder(given: Model, windows: Sequence[Window], case: Case) -> list[dict[str, Any]]:
+    """Fit the effects of the literature, step by step, without any choice, and judge each step."""
+    first, ranks, alone = LADDERS[case.part]
+    names, models = [first], [fitted(given, [], windows)]
+    for added in ranks:
+        print(f"{case.title}: literature, {' and '.join(added)}", flush=True)
         models.append(fitted(models[-1], [chosen(name) for name in added], windows))
         names.append("+ " + " and ".join(added))
-    rows = judged(names, models, judges)
-    for added in LADDER[3:]:
+    rows = judged(names, models, case.judges)
+    for added in alone:
         more = fitted(models[-1], [chosen(name) for name in added], windows)
-        rows.append(judged(["", f"+ {added[0]}, on top"], [models[-1], more], judges)[1])
+        rows.append(judged(["", f"+ {added[0]}, on top"], [models[-1], more], case.judges)[1])
     return rows
 
 
@@ -287,7 +346,7 @@ def fitted(model: Model, added: Sequence[Effect], windows: Sequence[Window]) -> 
     return prediction.model(solver.polish(solver.fit()).values)
 
 
-def values(model: Model, only: str) -> dict[str, float]:
+def values(model: Model, only: str = "") -> dict[str, float]:
     """Return the parameters of the effects of a model, of those alone that have a name where one is given."""
     m = replace(model, effects=()).compile()
     return {
@@ -297,6 +356,19 @@ def values(model: Model, only: str) -> dict[str, float]:
         for p, v in zip(a.effect.parameters(m), a.values, strict=True)
         if np.isfinite(v)
     }
+
+
+def processor_seconds() -> float:
+    """Return the processor time of this process and of its ended children [s]."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+def end_workers() -> None:
+    """End the processes that joblib keeps, so that their time is known."""
+    from joblib.externals.loky import get_reusable_executor
+
+    get_reusable_executor().shutdown(wait=True)
 
 
 if __name__ == "__main__":
