@@ -9,7 +9,7 @@ import numpy as np
 
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, nominal_parameters
 from concent_warp.fit.effects.cfg import EffectSolverCfg
-from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, block_sums
+from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
@@ -17,6 +17,9 @@ from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.fit.effects.robust import huber_limit
 from concent_warp.model import Model
 from concent_warp.simulate.select import EngineName
+
+BOUND_DISTANCE = 1e-3
+"""Distance from a bound up to which a parameter is at it, in units of its scale [-]; that of `FittedParameter`."""
 
 
 def fit_baseline(
@@ -77,8 +80,32 @@ def fitted_model(
     settings = cfg.least_squares
     pieces = tuple(without_bounded(model, projected(fit, settings.robust)))
     limit = huber_limit([piece.residual for piece in pieces], settings.robust)
-    errors = HeldOut(block_sums(pieces, blocks, limit), blocks, settings.prior, nominal_parameters(model)).own()
+    errors = held_out_errors(model, block_sums(pieces, blocks, limit), blocks, settings.prior)
     return FittedModel(model, tuple(windows), blocks, fit, pieces, limit, errors, engine, cfg)
+
+
+def held_out_errors(model: Model, sums: Sums, blocks: Blocks, prior: float) -> np.ndarray:
+    """Return the held-out error of each block, shape (B,), for the residuals of a fitted model.
+
+    Parameters at a bound beyond which the error would fall further stay there: a fit without a fold leads beyond it as
+    little as that to all data, and what a linear step there would remove is no gain.
+
+    Args:
+        model: The fitted model.
+        sums: Sums over the blocks of its residuals and sensitivities.
+        blocks: The blocks.
+        prior: See `LeastSquaresCfg.prior`.
+    """
+    plain = replace(model, effects=()).compile()
+    parameters = [p for added in model.effects for p in added.effect.parameters(plain)]
+    values = np.array([value for added in model.effects for value in added.values])
+    low, high, scale = np.array([(p.low, p.high, p.scale) for p in parameters]).reshape(-1, 3).T
+    slope = sums.slope.sum(axis=0)
+    held = (values <= low + BOUND_DISTANCE * scale) & (slope > 0)
+    held |= (values >= high - BOUND_DISTANCE * scale) & (slope < 0)
+    free = np.where(held, 0.0, 1.0)
+    sums = replace(sums, normal=sums.normal * np.outer(free, free), slope=sums.slope * free)
+    return HeldOut(sums, blocks, prior, nominal_parameters(model)).own()
 
 
 def without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:

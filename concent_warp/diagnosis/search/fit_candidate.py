@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.baseline import without_bounded
+from concent_warp.diagnosis.search.baseline import held_out_errors, without_bounded
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.least_squares import Fit, Solver
@@ -23,9 +23,10 @@ def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit
     """Return a fit of a candidate with its residuals and held-out errors."""
     model = solver.p.model(fit.values)
     pieces = tuple(without_bounded(model, base.projected(fit)))
-    held_out = base.held_out(pieces)
+    sums, prior = base.held_out(pieces).sums, base.cfg.least_squares.prior
+    errors = held_out_errors(model, sums, base.blocks, prior)
     ratio = robust_noise_ratio([piece.residual for piece in pieces], base.cfg.least_squares.robust)
-    return FittedCandidate(effect, model, fit, held_out.sums, pieces, held_out.own(), ratio)
+    return FittedCandidate(effect, model, fit, sums, pieces, errors, ratio)
 
 
 def fit_candidate(base: FittedModel, screened: ScreenedCandidate) -> FittedCandidate:

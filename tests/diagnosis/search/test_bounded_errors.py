@@ -1,0 +1,79 @@
+"""Held-out errors of fits with a parameter at a bound, beyond which no fold may lead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.search.baseline import fit_baseline, held_out_errors, refit_without_effect
+from concent_warp.effects.effect import AddedEffect
+from concent_warp.effects.library.joints import JointDamping, JointFriction
+from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, cut_blocks
+from concent_warp.fit.effects.observe import observe
+from concent_warp.model import Model
+from concent_warp.recording.recording import Channel, Demonstration, Recording
+from concent_warp.scene.scene import Scene
+from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.mujoco_engine import MujocoEngine
+
+XML = """
+<mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" type="hinge" axis="0 1 0"
+damping="{damping}"/><geom name="arm" type="sphere" size="0.01" pos="0 0 -0.2" mass="0.2"/></body></worldbody>
+<sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>
+"""
+COUNT = 8
+
+
+def blocks() -> Blocks:
+    """Return blocks of one demonstration, in four folds."""
+    place = np.arange(COUNT, dtype=float)
+    return Blocks((np.arange(COUNT),), np.arange(COUNT) % 4, np.zeros(COUNT, int), place, place + 1)
+
+
+def sums(slope: float, others: int = 0) -> Sums:
+    """Return sums over the blocks for one parameter with this slope of the error, and others."""
+    size, rng = 1 + others, np.random.default_rng(0)
+    slopes = rng.normal(size=(COUNT, size))
+    slopes[:, 0] = slope
+    normal = np.tile(np.eye(size), (COUNT, 1, 1))
+    return Sums(normal, slopes, np.full(COUNT, 9.0))
+
+
+def test_no_fold_leads_beyond_a_bound():
+    bare = Model(Scene(XML.format(damping=0.0)))
+    at_bound = replace(bare, effects=(AddedEffect(JointFriction("hinge"), (0.0,)),))
+    inside = replace(bare, effects=(AddedEffect(JointFriction("hinge"), (0.1,)),))
+    falls_below, falls_above = sums(1.0), sums(-1.0)
+    assert held_out_errors(at_bound, falls_below, blocks(), 10.0) == pytest.approx(falls_below.square)
+    for model, given in ((at_bound, falls_above), (inside, falls_below), (inside, falls_above)):
+        free = HeldOut(given, blocks(), 10.0).own()
+        assert held_out_errors(model, given, blocks(), 10.0) == pytest.approx(free)
+        assert free.sum() < given.square.sum()
+
+
+def test_what_is_at_a_bound_leaves_the_other_parameters_as_they_are():
+    bare = Model(Scene(XML.format(damping=0.0)))
+    added = AddedEffect(JointFriction("hinge"), (0.0,)), AddedEffect(JointDamping("hinge"), (0.1,))
+    given = sums(1.0, others=1)
+    alone = Sums(given.normal[:, 1:, 1:], given.slope[:, 1:], given.square)
+    found = held_out_errors(replace(bare, effects=added), given, blocks(), 10.0)
+    assert found == pytest.approx(HeldOut(alone, blocks(), 10.0).own())
+
+
+def test_an_effect_at_its_null_value_gains_nothing_over_the_model_without_it():
+    """The model has more damping than the arm: friction below zero would help, and is none."""
+    truth, model = Model(Scene(XML.format(damping=0.002))), Model(Scene(XML.format(damping=0.006)))
+    steps = 1000
+    rollout = MujocoEngine(truth).run(Variants(1, qpos=np.array([[1.0]]), qvel=np.zeros((1, 1))), np.zeros((steps, 0)))
+    time, noise = 0.01 * np.arange(200), np.random.default_rng(0).normal(size=200)
+    value = np.interp(time, rollout.numpy().time, rollout.numpy().sensordata[0, :, 0]) + 1e-3 * noise
+    seen = {"angle": Channel(time, value[:, None], noise_std=1e-3)}
+    one = Demonstration("one", "swing", qpos=np.array([1.0]), qvel=np.zeros(1), measured=seen)
+    windows = observe(model, Recording(model.scene.xml, (one,), "made up"))
+    with_friction = fit_baseline(model.add(JointFriction("hinge")), windows, cut_blocks(windows))
+    without = refit_without_effect(with_friction, 0)
+    assert with_friction.model.effects[0].values == (0.0,)
+    assert with_friction.ratio > 3
+    assert with_friction.errors.sum() == pytest.approx(without.errors.sum(), rel=1e-3)
