@@ -14,6 +14,7 @@ from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStat
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, Window, first_time
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
 from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.simulate.replay import initial_state
 from concent_warp.simulate.select import EngineName
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ def with_initial_states(
 ) -> Recording:
     """Return a recording whose demonstrations all state where they start, as a model follows their first readings best.
 
-    Positions and velocities that a demonstration states are kept. Measured states are smoothed first, and then fitted
+    Positions and velocities that a demonstration states are kept, but for what the model's effects on measurements say
+    of them: they are taken to be as the instruments show them. Measured states are smoothed first, and then fitted
     through the model with its effects, those on measurements included.
 
     Args:
@@ -54,6 +56,7 @@ def with_initial_states(
         cfg: Settings.
     """
     cfg, unknown = cfg or FittedStartCfg(), [d.qpos is None or d.qvel is None for d in recording.demonstrations]
+    recording = _with_true_states(model, recording)
     if not any(unknown):
         return recording
     try:
@@ -80,7 +83,7 @@ def with_initial_states(
             whole = source.window(w.number, 0.0, last)
             if whole is not None:
                 (offsets[k],) = _fitted(model, [replace(whole, spread=w.spread)], [offsets[k]], engine, cfg, few)
-    starts = {w.number: _moved(model.scene.model, w, o) for w, o in zip(first, offsets, strict=True)}
+    starts = {w.number: _moved(model, w, o) for w, o in zip(first, offsets, strict=True)}
     demonstrations = []
     for number, d in enumerate(recording.demonstrations):
         qpos, qvel = starts.get(number, (d.qpos, d.qvel))
@@ -104,13 +107,31 @@ def _fitted(
     iterations: int,
 ) -> list[np.ndarray]:
     """Return the errors of the initial states of windows, in units of their spread, each window by itself."""
-    prediction = Prediction(model, (), windows, engine=engine)
+    prediction = Prediction(model, (), windows, engine=engine, at_true_time=True)
     search = InitialStateSearch(prediction, cfg.search)
     return search.refined(prediction.start, offsets, range(len(windows)), iterations)[0]
 
 
-def _moved(m: mujoco.MjModel, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moved(model: Model, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the fitted state at the start of a window, its error in units of its spread taken off."""
-    qpos, step = w.qpos.copy(), offset * w.spread
+    m, prediction = model.scene.model, Prediction(model, (), [w], at_true_time=True)
+    qpos, qvel = prediction.first_state(w, prediction.start)
+    qpos, step = qpos.copy(), offset * w.spread
     mujoco.mj_integratePos(m, qpos, step[: m.nv], 1.0)
-    return qpos, w.qvel + step[m.nv :]
+    return qpos, qvel + step[m.nv :]
+
+
+def _with_true_states(model: Model, recording: Recording) -> Recording:
+    """Return a recording whose stated initial states are corrected for a model's effects on measurements."""
+    if not any(added.effect.misleads_start for added in model.effects):
+        return recording
+    m, demonstrations = model.scene.model, []
+    for number, d in enumerate(recording.demonstrations):
+        if d.qpos is not None and d.qvel is not None:
+            none = np.zeros(0)
+            w = Window(d, number, 0.0, 0.0, *initial_state(m, d), np.zeros(2 * m.nv), (), 0, none)
+            prediction = Prediction(model, (), [w], at_true_time=True)
+            qpos, qvel = prediction.first_state(w, prediction.start)
+            d = replace(d, qpos=qpos, qvel=qvel)
+        demonstrations.append(d)
+    return replace(recording, demonstrations=tuple(demonstrations))

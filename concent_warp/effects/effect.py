@@ -165,6 +165,20 @@ class Effect:
         """Return the reader of the instruments; `read` gives the true values."""
         return read
 
+    def true_time(self, time: float, values: np.ndarray) -> float:  # noqa: ARG002
+        """Return the true time [s] of what the target's sensors stamp with `time` [s]."""
+        return time
+
+    def true_state(
+        self,
+        m: mujoco.MjModel,  # noqa: ARG002
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        values: np.ndarray,  # noqa: ARG002
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the true state of which the instruments show `qpos` (nq,) and `qvel` (nv,), apart from `true_time`."""
+        return qpos, qvel
+
     @property
     def edits(self) -> bool:
         """Whether the values enter the MJCF, so that each set of values is compiled by itself."""
@@ -179,6 +193,12 @@ class Effect:
     def measures(self) -> bool:
         """Whether the effect changes what the instruments read."""
         return type(self).measure is not Effect.measure
+
+    @property
+    def misleads_start(self) -> bool:
+        """Whether a state that the instruments show is not the true one."""
+        kind = type(self)
+        return kind.true_time is not Effect.true_time or kind.true_state is not Effect.true_state
 
     @property
     def commands(self) -> bool:

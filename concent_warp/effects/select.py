@@ -12,6 +12,7 @@ SENSOR = mujoco.mjtSensor
 SINGLE = (int(JOINT.mjJNT_HINGE), int(JOINT.mjJNT_SLIDE))
 POSES = (int(SENSOR.mjSENS_FRAMEPOS), int(SENSOR.mjSENS_FRAMEQUAT))
 JOINTS = (int(SENSOR.mjSENS_JOINTPOS), int(SENSOR.mjSENS_JOINTVEL))
+BODIES = (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY))
 
 
 def element_name(m: mujoco.MjModel, kind: mujoco.mjtObj, i: int) -> str:
@@ -146,3 +147,25 @@ def dof_of(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
 def typical_torque(m: mujoco.MjModel, joints: np.ndarray) -> np.ndarray:
     """Return the torque [N m] or force [N] that moves each joint at 10 rad/s^2 or m/s^2, shape (n,)."""
     return 10.0 * m.dof_M0[dof_of(m, joints)]
+
+
+def shown_dofs(m: mujoco.MjModel, sensors: Iterable[str]) -> np.ndarray:
+    """Return the degrees of freedom whose positions some sensors of joints and of free bodies show, shape (n,) int."""
+    found: list[int] = []
+    for name in sensors:
+        row = m.sensor(name).id
+        kind, i = int(m.sensor_type[row]), int(m.sensor_objid[row])
+        if kind == JOINTS[0]:
+            found.append(int(m.jnt_dofadr[i]))
+        elif kind in POSES and (joint := shown_free_joint(m, row)) is not None:
+            first = int(m.jnt_dofadr[joint]) + 3 * POSES.index(kind)
+            found += range(first, first + 3)
+    return np.unique(np.array(found, dtype=int))
+
+
+def shown_free_joint(m: mujoco.MjModel, sensor: int) -> int | None:
+    """Return the free joint of the body whose position or orientation a sensor shows; None where there is none."""
+    if int(m.sensor_objtype[sensor]) not in BODIES:
+        return None
+    joint = int(m.body_jntadr[m.sensor_objid[sensor]])
+    return joint if joint >= 0 and m.jnt_type[joint] == int(JOINT.mjJNT_FREE) else None

@@ -186,7 +186,9 @@ def _future_window(recorded: RecordedRange, motion: ProposedMotion, duration: fl
     d = Demonstration(motion.name, qpos=motion.qpos, qvel=motion.qvel, action=motion.action, measured=measured)
     spread = start_spread(m, {c: recorded.noise[c] for c in channels}, recorded.observation)
     clocks = np.concatenate(clock)
-    return Window(d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks)
+    return Window(
+        d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks, start_shown=False
+    )
 
 
 def _separations(

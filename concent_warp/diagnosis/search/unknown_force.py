@@ -28,9 +28,6 @@ from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, element_name, free_bodies, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way
 from concent_warp.fit.effects.cross_validation import sign_flip_p
-from concent_warp.simulate.engine import Variants
-from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.simulate.replay import commands
 
 Results = Callable[[Callable[..., ScreenedCandidate], Sequence[tuple[Any, ...]]], Iterable[ScreenedCandidate]]
 """Runs a task for each tuple of arguments and gives the results in their order."""
@@ -219,20 +216,11 @@ def _spread_out(points: np.ndarray, most: int) -> tuple[np.ndarray, float]:
 
 def _visited(base: FittedModel, m: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the states that a fitted model visits, positions (T, nq) and velocities (T, nv)."""
-    engine = MujocoEngine(base.model)
-    qpos, qvel = [np.zeros((0, m.nq))], [np.zeros((0, m.nv))]
-    for w, offset in zip(base.windows, base.fit.offsets, strict=True):
-        steps = max(int(np.ceil((w.end - w.start) / engine.timestep - 1e-9)), 1)
-        ctrl = commands(m, w.demonstration, steps, w.start)
-        for added in base.model.effects:
-            ctrl = added.effect.command(m, ctrl, added.array)
-        start, error = w.qpos.copy(), offset * w.spread
-        mujoco.mj_integratePos(m, start, error[: m.nv], 1.0)
-        variants = Variants(1, qpos=start[None], qvel=(w.qvel + error[m.nv :])[None])
-        rollout = engine.run(variants, ctrl, bodies=[]).numpy()
-        sane = np.isfinite(rollout.qpos[0]).all(axis=1)
-        qpos.append(rollout.qpos[0][sane])
-        qvel.append(rollout.qvel[0][sane])
+    solver = base.solver()
+    courses = solver.p.courses(solver.trials(base.fit.values, base.fit.offsets))
+    sane = [np.isfinite(course.qpos).all(axis=1) for course in courses]
+    qpos = [np.zeros((0, m.nq)), *(c.qpos[rows] for c, rows in zip(courses, sane, strict=True))]
+    qvel = [np.zeros((0, m.nv)), *(c.qvel[rows] for c, rows in zip(courses, sane, strict=True))]
     return np.concatenate(qpos), np.concatenate(qvel)
 
 

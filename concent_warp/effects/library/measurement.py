@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.effects.effect import Effect, Parameter, Reader
-from concent_warp.effects.select import JOINTS, POSES, sensors_by_type
+from concent_warp.effects.select import JOINTS, POSES, sensors_by_type, shown_free_joint
 
 CALIBRATION = "calibration of instruments: reading = gain true + bias, at a clock of its own"
 
@@ -38,6 +40,10 @@ class TimeBase(MeasurementEffect):
         """Return one scale."""
         return (Parameter("scale", "-", 0.0, -0.2, 0.2, 0.01),)
 
+    def true_time(self, time: float, values: np.ndarray) -> float:
+        """See `Effect.true_time`."""
+        return time / (1 + float(values[0]))
+
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Read at the true times."""
         return lambda sensor, time: read(sensor, time / (1 + values[0]) if sensor in self.target else time)
@@ -54,6 +60,10 @@ class Latency(MeasurementEffect):
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one delay."""
         return (Parameter("delay", "s", 0.0, -0.1, 0.3, 0.01),)
+
+    def true_time(self, time: float, values: np.ndarray) -> float:
+        """See `Effect.true_time`."""
+        return time - float(values[0])
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Read earlier."""
@@ -83,6 +93,16 @@ class LengthScale(MeasurementEffect):
         """Return one scale."""
         return (Parameter("scale", "-", 0.0, -0.5, 0.5, 0.01),)
 
+    def true_state(
+        self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Effect.true_state`."""
+        qpos, qvel = qpos.copy(), qvel.copy()
+        for position, velocity in _shown_places(m, self.target):
+            qpos[position] /= 1 + values[0]
+            qvel[velocity] /= 1 + values[0]
+        return qpos, qvel
+
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Scale the positions."""
         return lambda sensor, time: read(sensor, time) * (1 + values[0] if sensor in self.target else 1.0)
@@ -111,6 +131,19 @@ class FrameOffset(MeasurementEffect):
         """Shift, and rotation vector."""
         shift = [Parameter(axis, "m", 0.0, -0.2, 0.2, 0.003) for axis in "xyz"]
         return (*shift, *(Parameter(f"r{axis}", "rad", 0.0, -0.5, 0.5, 0.01) for axis in "xyz"))
+
+    def true_state(
+        self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Effect.true_state`."""
+        qpos, qvel, back = qpos.copy(), qvel.copy(), Rotation.from_rotvec(-np.asarray(values[3:]))
+        for position, velocity in _shown_places(m, self.target):
+            qpos[position] = back.apply(qpos[position] - values[:3])
+            qvel[velocity] = back.apply(qvel[velocity])
+        for place in _shown_orientations(m, self.target):
+            turned = back * Rotation.from_quat(qpos[place], scalar_first=True)
+            qpos[place] = turned.as_quat(scalar_first=True)
+        return qpos, qvel
 
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:
         """Turn and shift the poses."""
@@ -150,6 +183,15 @@ class SensorBias(MeasurementEffect):
         """Return one constant for each sensor."""
         return self.parameter_per_target("bias", "rad or m", 0.0, low=-0.5, high=0.5, scale=0.01)
 
+    def true_state(
+        self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Effect.true_state`."""
+        qpos = qpos.copy()
+        for place, _, bias in _shown_joints(m, self.target, values):
+            qpos[place] -= bias
+        return qpos, qvel
+
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Add it."""
         bias = dict(zip(self.target, values, strict=True))
@@ -174,7 +216,46 @@ class SensorGain(MeasurementEffect):
         """Return one scale for each sensor."""
         return self.parameter_per_target("scale", "-", 0.0, low=-0.9, high=5.0, scale=0.03)
 
+    def true_state(
+        self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Effect.true_state`."""
+        qpos, qvel = qpos.copy(), qvel.copy()
+        for place, dof, scale in _shown_joints(m, self.target, values):
+            qpos[place] /= 1 + scale
+            qvel[dof] /= 1 + scale
+        return qpos, qvel
+
     def measure(self, m: mujoco.MjModel, read: Reader, values: np.ndarray) -> Reader:  # noqa: ARG002
         """Scale it."""
         gain = dict(zip(self.target, values, strict=True))
         return lambda sensor, time: read(sensor, time) * (1 + gain.get(sensor, 0.0))
+
+
+def _shown_places(m: mujoco.MjModel, sensors: Sequence[str]) -> list[tuple[slice, slice]]:
+    """Return where the state has positions and velocities of the free bodies whose positions some sensors show."""
+    joints = _shown_free_joints(m, sensors, POSES[0])
+    places = [(int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j])) for j in joints]
+    return [(slice(p, p + 3), slice(v, v + 3)) for p, v in places]
+
+
+def _shown_orientations(m: mujoco.MjModel, sensors: Sequence[str]) -> list[slice]:
+    """Return where the state has the quaternions of the free bodies whose orientations some sensors show."""
+    places = [int(m.jnt_qposadr[j]) for j in _shown_free_joints(m, sensors, POSES[1])]
+    return [slice(p + 3, p + 7) for p in places]
+
+
+def _shown_free_joints(m: mujoco.MjModel, sensors: Sequence[str], kind: int) -> list[int]:
+    """Return the free joints of the bodies that some sensors of a kind show, each once."""
+    rows = [m.sensor(name).id for name in sensors]
+    found = {shown_free_joint(m, row) for row in rows if int(m.sensor_type[row]) == kind}
+    return sorted(j for j in found if j is not None)
+
+
+def _shown_joints(m: mujoco.MjModel, sensors: Sequence[str], values: np.ndarray) -> Iterator[tuple[int, int, float]]:
+    """Return where the state has position and velocity of each joint whose position a sensor shows, and its value."""
+    for name, value in zip(sensors, values, strict=True):
+        row = m.sensor(name).id
+        if int(m.sensor_type[row]) == JOINTS[0]:
+            joint = int(m.sensor_objid[row])
+            yield int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint]), float(value)

@@ -13,6 +13,7 @@ import numpy as np
 
 from concent_warp.checks import Bounds, Duration, Positive
 from concent_warp.effects.effect import AddedEffect, Effect, Parameter, Reader, variant_fields
+from concent_warp.effects.select import shown_dofs
 from concent_warp.simulate.engine import Engine, Variants
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, commands
@@ -77,8 +78,13 @@ class Prediction:
         engine: EngineName = "mujoco",
         threads: int | None = None,
         cfg: PredictionCfg | None = None,
+        at_true_time: bool = False,
     ) -> None:
         """Prepare to simulate.
+
+        A window starts at the state that the instruments show at its start, corrected for effects on measurements. If
+        one shifts the clock of all channels, the simulation starts at the true time of that state; else what the
+        instruments show too early or too late is moved along its velocity.
 
         Args:
             model: The model, whose effects take part with variable values.
@@ -87,6 +93,7 @@ class Prediction:
             engine: Which engine simulates.
             threads: Simulations at a time, for C MuJoCo; by default one for each CPU.
             cfg: Settings.
+            at_true_time: Whether simulations start when windows do, by the clock of the commands.
         """
         self.cfg = cfg or PredictionCfg()
         self.windows = list(windows)
@@ -116,7 +123,10 @@ class Prediction:
         for e, part in zip(self.effects, self.split, strict=True):
             moves = e.edits or e.commands or type(e).write is not Effect.write
             pure = e.measures and not moves and type(e).force_model is Effect.force_model
-            self.measured_only[part] = pure
+            self.measured_only[part] = pure and not e.misleads_start
+        channels = {r.channel for w in self.windows for r in w.readings}
+        self._clocks = [not at_true_time and channels <= set(e.target) for e in self.effects]
+        """Which effects shift the clock of all channels, if any."""
         self._kept: dict[tuple[int, bytes, bytes], tuple[Reader, int]] = {}
         self.simulated = 0
         """Simulated time so far [s]."""
@@ -203,13 +213,14 @@ class Prediction:
         plain = {}
         for i, trial in enumerate(trials):
             w = self.windows[trial.window]
-            qpos[i], qvel[i] = w.qpos, w.qvel
+            qpos[i], qvel[i] = self.first_state(w, values[i])
             if trial.offset is not None:
                 mujoco.mj_integratePos(m, qpos[i], trial.offset[: m.nv], 1.0)
                 qvel[i] += trial.offset[m.nv :]
-            if trial.window not in plain:
-                plain[trial.window] = self._commands(m, w, steps)
-            ctrl[i] = self._acting(m, plain[trial.window], values[i], steps)
+            begin = self.first_time(w, values[i])
+            if (trial.window, begin) not in plain:
+                plain[trial.window, begin] = self._commands(m, w, steps, begin)
+            ctrl[i] = self._acting(m, plain[trial.window, begin], values[i], steps)
         fields = variant_fields(bare, self.effects, values, self.split)
         force_models = [
             (force_model, values[:, part])
@@ -225,10 +236,44 @@ class Prediction:
             courses.append(Course(SensorReader(m, rollout.time, own, self.cfg.extrapolation), qpos, qvel, own.nbytes))
         return courses
 
-    def _commands(self, m: mujoco.MjModel, w: Window, steps: int) -> np.ndarray:
+    def first_time(self, w: Window, values: np.ndarray) -> float:
+        """Return when the simulation of a window starts [s], by the clock of the commands.
+
+        Args:
+            w: The window.
+            values: Parameters, shape (P,).
+        """
+        time = w.start
+        if w.start_shown:
+            for e, part, all_channels in zip(self.effects[::-1], self.split[::-1], self._clocks[::-1], strict=True):
+                time = e.true_time(time, values[part]) if all_channels else time
+        return time
+
+    def first_state(self, w: Window, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the state in which the simulation of a window starts, without an offset, qpos (nq,) and qvel (nv,).
+
+        Args:
+            w: The window.
+            values: Parameters, shape (P,).
+        """
+        m, qpos, qvel = self._base.scene.model, w.qpos, w.qvel
+        for e, part, all_channels in zip(self.effects[::-1], self.split[::-1], self._clocks[::-1], strict=True):
+            if not w.start_shown or not e.misleads_start:
+                continue
+            qpos, qvel = e.true_state(m, qpos, qvel, values[part])
+            shown, later = (e.true_time(t, values[part]) for t in (w.start, w.start + 1.0))
+            dof = shown_dofs(m, e.target)
+            qpos, qvel, step = qpos.copy(), qvel.copy(), np.zeros(m.nv)
+            qvel[dof] /= later - shown
+            if not all_channels:
+                step[dof] = (w.start - shown) * qvel[dof]
+                mujoco.mj_integratePos(m, qpos, step, 1.0)
+        return qpos, qvel
+
+    def _commands(self, m: mujoco.MjModel, w: Window, steps: int, begin: float) -> np.ndarray:
         """Return the commands of a window and of the time before it that effects reach back to, shape (H + K, nu)."""
         before = self._before(m)
-        return commands(m, w.demonstration, before + steps, w.start - before * m.opt.timestep)
+        return commands(m, w.demonstration, before + steps, begin - before * m.opt.timestep)
 
     def _before(self, m: mujoco.MjModel) -> int:
         """Return how many steps effects reach back."""
@@ -245,7 +290,8 @@ class Prediction:
     def observed(self, window: int, reader: Reader, values: np.ndarray) -> np.ndarray:
         """Return residuals in units of noise, measured less predicted, of a window as instruments read it, (count,)."""
         w, m = self.windows[window], self._base.scene.model
-        read: Reader = lambda sensor, time: reader(sensor, time - w.start)  # noqa: E731
+        begin = self.first_time(w, values)
+        read: Reader = lambda sensor, time: reader(sensor, time - begin)  # noqa: E731
         for e, part in zip(self.effects, self.split, strict=True):
             if e.measures:
                 read = e.measure(m, read, values[part])
