@@ -67,6 +67,8 @@ class CandidateFits:
         self._polish_near(best, expected)
         expected = np.maximum(expected, [c.share(self.base) for c in self.fits])
         self.refit_rivals(expected)
+        if self._restart_left_behind():
+            self.refit_rivals(np.array([c.share(self.base) for c in self.fits]))
         if self._best().ratio > self.cfg.adequate_ratio and self._left() > self.cfg.unknown_force.min_share:
             self._initialise_by_multiple_shooting(short_windows)
         return self.fits
@@ -173,11 +175,31 @@ class CandidateFits:
         for k in lagging:
             expected[k] = max(expected[k], self.fits[k].share(self.base))
 
+    def _restart_left_behind(self) -> bool:
+        """Restart candidates far behind the best from its initial states; returns whether one is near it then.
+
+        Those are its confusions, and others that came some way before it was refined.
+        """
+        best, search = self._best(), self.search
+        if best.ratio >= search.explained_ratio:
+            return False
+        gain = best.share(self.base)
+        behind = [
+            k
+            for k, c in enumerate(self.fits)
+            if c is not best
+            and c.share(self.base) <= search.close_min_gain * gain
+            and (c.share(self.base) > search.explained_min_gain * gain or _are_confused(c.effect, best.effect))
+        ]
+        self._refit(behind, restart_candidate, "fitting rivals again", best.fit, search, True)
+        return any(self.fits[k].share(self.base) > search.polish_min_gain * gain for k in behind)
+
     def _polish_near(self, best: FittedCandidate, expected: np.ndarray) -> None:
         """Refit the initial states of candidates near the best that have not reached the noise.
 
-        Beside a best one that has, those close to it are left to `refit_rivals`, which restarts them from its initial
-        states first.
+        Of those that explain what they promised only the most promising: the others are restarted from the best one's
+        initial states first. Those that explain far less are stuck in a local minimum of their own. Beside a best one
+        that has reached the noise, those close to it are left to `refit_rivals`, which restarts them first, too.
         """
         search, gain = self.search, best.share(self.base)
         restarted = best.ratio < search.noise_level_ratio
@@ -188,8 +210,10 @@ class CandidateFits:
             and c.ratio > search.noise_level_ratio
             and not (restarted and c.share(self.base) > search.close_min_gain * gain)
         ]
-        chosen = sorted(chosen, key=lambda k: -expected[k])[: search.polished_first]
-        self._refit(chosen, polish_candidate, "refining initial states", search)
+        chosen = sorted(chosen, key=lambda k: -expected[k])
+        stuck = [k for k in chosen if self.fits[k].share(self.base) < search.stuck_share * expected[k]]
+        kept = [k for k in chosen if k not in stuck][: search.polished_first]
+        self._refit([*kept, *stuck[: search.polished_stuck]], polish_candidate, "refining initial states", search)
 
     def _initialise_by_multiple_shooting(self, short_windows: Callable[[], Sequence[Window]]) -> None:
         """Refit the candidates that explain most from the values of a fit over shorter windows."""
@@ -205,3 +229,8 @@ class CandidateFits:
             (k for k, c in enumerate(self.fits) if c.share(base) > least), key=lambda k: self.fits[k].fit.cost
         )
         self._refit(near[: search.shooting_fits], multiple_shooting_candidate, "multiple shooting", windows)
+
+
+def _are_confused(one: Effect, other: Effect) -> bool:
+    """Return whether one of two effects says that it is confused with the other."""
+    return other.name in one.confusions or one.name in other.confusions
