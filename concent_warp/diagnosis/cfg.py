@@ -43,6 +43,10 @@ class SearchCfg:
     far_ratio: Positive = 20.0
     """Noise ratio of the model as given beyond which the search begins with shorter windows [-]: over long ones, a
     motion so far off is no longer in proportion to an effect's size, and fits end in local minima. Empirical."""
+    contact_ratio: Positive = 3.0
+    """Residual over its standard deviation [-] to which that one is raised where the model as given is off by more than
+    `far_ratio` and a body moves freely that can be touched. Errors of contact models are rough: in units of a noise far
+    below them, windows would be too short to show friction and finite differences would measure jumps. Empirical."""
     coarse_windows: tuple[PositiveDuration, ...] = (2.0, 0.5)
     """Lengths of these windows [s], the first that reduces the noise ratio below `far_ratio`, else the last.
     Empirical."""
@@ -94,6 +98,11 @@ class SearchCfg:
     """Rivals whose initial states are tried on the baseline. Empirical."""
     polished_first: Count = 1
     """Most fits whose initial states are fitted again before the others start from those of the best. Empirical."""
+    stuck_share: Share = 0.5
+    """Share of what a candidate promised below which its fit counts as stuck in a local minimum [-]: linear
+    extrapolation is taken to be right to a factor of 2."""
+    polished_stuck: Count = 3
+    """Most stuck fits whose initial states are fitted again then. Empirical."""
     reconsidered: Count = 5
     """Most candidates that are tried again in the place of an earlier addition once others are in the model.
     Empirical."""

@@ -60,7 +60,7 @@ from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.fit.effects.observation import Window
-from concent_warp.fit.effects.observe import channel_noises, observe
+from concent_warp.fit.effects.observe import channel_noises, has_touchable_free_body, observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -94,6 +94,8 @@ class Procedure:
         self.gradient = GradientStarts(model, recording) if cfg.gradient else None
         self.widening: dict[int, np.ndarray] = {}
         self.noise: dict[str, float] = {}
+        self.noise_scale = 1.0
+        """See `Window.noise_scale`."""
         self.noise_factors: dict[str, float] = {}
         self.time_step: FinerTimeStep | None = None
         self.nominal_values: tuple[FittedParameter, ...] = ()
@@ -322,19 +324,26 @@ class Procedure:
         self.runner.progress(0.03, "fitting the model as given")
         given = Prediction(self.model, (), windows, engine=self.engine, cfg=fits.prediction)
         check_finite(given, self.model.scene.source)
-        return self._refitted(self.model, windows)
+        found = self._refitted(self.model, windows)
+        search = self.cfg.search
+        if found.noise_ratio <= search.far_ratio or not has_touchable_free_body(self.model.compile()):
+            return found
+        self.runner.progress(0.06, "fitting the model as given, its own error in the place of the noise")
+        self.noise_scale = found.noise_ratio / search.contact_ratio
+        return self._refitted(self.model, self._windows(self.model, self.cfg.window))
 
     def _windows(self, model: Model, length: float | None) -> Sequence[Window]:
         """Return the recording cut into windows of a length [s]; as long as the motion allows where it is None."""
-        return observe(
+        windows = observe(
             model,
             self.recording,
             length=length,
-            noise=self.noise,
+            noise={channel: self.noise_scale * std for channel, std in self.noise.items()},
             engine=self.engine,
             seed=self.cfg.seed,
             cfg=self.cfg.fits.observation,
         )
+        return [replace(w, noise_scale=self.noise_scale) for w in windows]
 
     def find_addition(
         self, base: FittedModel, step: int, *, explained: bool = False

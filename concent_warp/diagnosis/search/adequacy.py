@@ -47,7 +47,7 @@ def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: Diagn
 
 def _scaled(base: FittedModel, noise_factors: Mapping[str, float]) -> list[np.ndarray]:
     """Return the residuals of each channel in units of the largest noise that it may have, each (n,)."""
-    return [r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()]
+    return [base.noise_scale * r / noise_factors.get(c, 1.0) for c, r in channel_residuals(base).items()]
 
 
 def discrepancies(base: FittedModel, first: FittedModel) -> tuple[float, float]:
@@ -64,6 +64,7 @@ def discrepancies(base: FittedModel, first: FittedModel) -> tuple[float, float]:
     after, before = (np.concatenate([piece.residual for piece in one.pieces]) for one in (base, first))
     same = len(after) == len(before)
     outlier = np.abs(after) > base.limit if same else np.abs(before) > first.limit
-    left = float(np.mean(2 * huber(after, base.limit))) - 1.0
+    left = float(np.mean(2 * huber(after, base.limit)))
     limit = base.limit if same else first.limit
-    return left, float(np.mean(np.where(outlier, 2 * huber(before, limit), before**2))) - 1.0
+    lacked = float(np.mean(np.where(outlier, 2 * huber(before, limit), before**2)))
+    return base.noise_scale**2 * left - 1.0, first.noise_scale**2 * lacked - 1.0

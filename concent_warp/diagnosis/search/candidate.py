@@ -46,12 +46,18 @@ class FittedModel:
     @property
     def ratio(self) -> float:
         """Robust RMS residual over the noise [-]: 1 where the model explains all but noise."""
-        return robust_noise_ratio([piece.residual for piece in self.pieces], self.cfg.least_squares.robust)
+        robust = self.cfg.least_squares.robust
+        return self.noise_scale * robust_noise_ratio([piece.residual for piece in self.pieces], robust)
 
     @property
     def noise_ratio(self) -> float:
         """Root mean square residual over the noise [-], "x noise"."""
-        return noise_ratio(np.concatenate([piece.residual for piece in self.pieces]))
+        return self.noise_scale * noise_ratio(np.concatenate([piece.residual for piece in self.pieces]))
+
+    @property
+    def noise_scale(self) -> float:
+        """Standard deviation that residuals are in units of, over that of the noise [-]; see `Window.noise_scale`."""
+        return self.windows[0].noise_scale
 
     @property
     def timestep(self) -> float:

@@ -140,6 +140,11 @@ class Window:
     """Time in the demonstration that each residual belongs to [s], shape (count,)."""
     smooth: bool = False
     """Whether nothing touches anything in the model's motion, which then depends smoothly on the initial state."""
+    noise_scale: float = 1.0
+    """Standard deviation that residuals are in units of over that of the noise [-]: more than 1 where a model is so far
+    off that its own error takes the place of the noise."""
+    start_shown: bool = True
+    """Whether the state at the start is as the instruments show it, and not the true one."""
     defect: TimeStepDefect | None = None
     """Correction of the predictions for a time step that is too long; None for none."""
 

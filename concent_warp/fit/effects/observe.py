@@ -109,7 +109,7 @@ def observe(
     cfg = cfg or ObservationCfg()
     source = ObservedRecording(model, recording, noise or channel_noises(model, recording, cfg), cfg)
     windows: list[Window] = []
-    longest = cfg.max_contact_length if _has_touchable_free_body(model.compile()) else cfg.max_length
+    longest = cfg.max_contact_length if has_touchable_free_body(model.compile()) else cfg.max_length
     for number, d in enumerate(recording.demonstrations):
         channels = [c for c in source.noise if c in d.measured]
         last = max((float(d.measured[c].time[-1]) for c in channels), default=0.0)
@@ -159,7 +159,7 @@ def _can_touch(m: mujoco.MjModel) -> bool:
     return bool(m.npair or (m.geom_contype | m.geom_conaffinity).any())
 
 
-def _has_touchable_free_body(m: mujoco.MjModel) -> bool:
+def has_touchable_free_body(m: mujoco.MjModel) -> bool:
     """Return whether a body moves freely in a scene in which something can touch."""
     return bool((m.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)).any()) and _can_touch(m)
 
