@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from concent_warp.effects.effect import Effect, Parameter, Reader
 from concent_warp.effects.select import JOINTS, POSES, sensors_by_type, shown_free_joint
 
+SCALES = (-0.03, -0.01, 0.01, 0.03)
+"""Errors of scales that are scanned [-]: an impact at another time or place is not in proportion to them."""
 CALIBRATION = "calibration of instruments: reading = gain true + bias, at a clock of its own"
 
 
@@ -38,7 +40,7 @@ class TimeBase(MeasurementEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one scale."""
-        return (Parameter("scale", "-", 0.0, -0.2, 0.2, 0.01),)
+        return (Parameter("scale", "-", 0.0, -0.2, 0.2, 0.01, scan=SCALES),)
 
     def true_time(self, time: float, values: np.ndarray) -> float:
         """See `Effect.true_time`."""
@@ -91,7 +93,7 @@ class LengthScale(MeasurementEffect):
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
         """Return one scale."""
-        return (Parameter("scale", "-", 0.0, -0.5, 0.5, 0.01),)
+        return (Parameter("scale", "-", 0.0, -0.5, 0.5, 0.01, scan=SCALES),)
 
     def true_state(
         self, m: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, values: np.ndarray

@@ -82,9 +82,10 @@ class Prediction:
     ) -> None:
         """Prepare to simulate.
 
-        A window starts at the state that the instruments show at its start, corrected for effects on measurements. If
-        one shifts the clock of all channels, the simulation starts at the true time of that state; else what the
-        instruments show too early or too late is moved along its velocity.
+        A window starts at the state that the instruments show at its start. Where bodies move freely, it is corrected
+        for effects on measurements: if one shifts the clock of all channels, the simulation starts at the true time of
+        that state; else what the instruments show too early or too late is moved along its velocity. Errors of the
+        states of joints alone fade, or are small beside their uncertainty.
 
         Args:
             model: The model, whose effects take part with variable values.
@@ -119,11 +120,13 @@ class Prediction:
         self._threads = threads
         self._engines: dict[tuple[float, ...], tuple[Engine, mujoco.MjModel]] = {}
         self._edits = [i for i, e in enumerate(self.effects) if e.edits]
+        free = self._base.scene.model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+        self._moves_freely = bool(free.any())
         self.measured_only = np.zeros(len(self.parameters), dtype=bool)
         for e, part in zip(self.effects, self.split, strict=True):
             moves = e.edits or e.commands or type(e).write is not Effect.write
             pure = e.measures and not moves and type(e).force_model is Effect.force_model
-            self.measured_only[part] = pure and not e.misleads_start
+            self.measured_only[part] = pure and not (self._moves_freely and e.misleads_start)
         channels = {r.channel for w in self.windows for r in w.readings}
         self._clocks = [not at_true_time and channels <= set(e.target) for e in self.effects]
         """Which effects shift the clock of all channels, if any."""
@@ -244,7 +247,7 @@ class Prediction:
             values: Parameters, shape (P,).
         """
         time = w.start
-        if w.start_shown:
+        if w.start_shown and self._moves_freely:
             for e, part, all_channels in zip(self.effects[::-1], self.split[::-1], self._clocks[::-1], strict=True):
                 time = e.true_time(time, values[part]) if all_channels else time
         return time
@@ -258,7 +261,7 @@ class Prediction:
         """
         m, qpos, qvel = self._base.scene.model, w.qpos, w.qvel
         for e, part, all_channels in zip(self.effects[::-1], self.split[::-1], self._clocks[::-1], strict=True):
-            if not w.start_shown or not e.misleads_start:
+            if not (w.start_shown and self._moves_freely and e.misleads_start):
                 continue
             qpos, qvel = e.true_state(m, qpos, qvel, values[part])
             shown, later = (e.true_time(t, values[part]) for t in (w.start, w.start + 1.0))
