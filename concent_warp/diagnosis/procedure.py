@@ -570,22 +570,25 @@ class Procedure:
         Effects that are not established beside the others are removed one at a time, the rest fitted again.
         """
         while True:
-            found, without = self._fitted_together(fitted)
-            if (fewer := self.remove_unestablished(found, without)) is None:
+            found, without, established = self._fitted_together(fitted)
+            if (fewer := self.remove_unestablished(found, without, established)) is None:
                 return found
             self.with_unestablished = self.with_unestablished or found
             fitted = fewer
 
-    def _fitted_together(self, fitted: list[FittedModel]) -> tuple[list[FittedModel], list[FittedModel | None]]:
+    def _fitted_together(
+        self, fitted: list[FittedModel]
+    ) -> tuple[list[FittedModel], list[FittedModel | None], list[bool]]:
         """Return the fitted models, the last with all that was accepted fitted together, and update the findings to it.
 
         The gain of each effect is then that over the same model without it. These models are returned too, one for each
-        accepted effect, None where there was no time.
+        accepted effect, None where there was no time, and whether an interval of it without the profile likelihood,
+        which a rough cost widens, excludes its null value.
         """
         accepted, reduced = self._accepted(), []
         if not accepted and not nominal_effects(fitted[-1].model):
             self.nominal_values = ()
-            return fitted, reduced
+            return fitted, reduced, []
         self.runner.progress(self.runner.share, "fitting all effects together")
         attempt = self.budget.attempt
         unsettled = "Not refitted: all effects together."
@@ -594,7 +597,8 @@ class Procedure:
         widening = {owned + k: self.widening[f.step] for k, f in enumerate(accepted)}
         unsettled = "Left out of the intervals: errors of nominal values."
         nominal = attempt(lambda: nominal_errors(last, self.cfg), None, unsettled, TOGETHER_SHARE)
-        parameters = joint_parameters(last, widening, nominal)
+        parameters, linear = (joint_parameters(last, by, nominal) for by in (widening, None))
+        established = [any(p.excludes_null for p in linear[owned + k]) for k in range(len(accepted))]
         self.nominal_values = tuple(p for k in nominal_effects(last.model) for p in parameters[k])
         for k, f in enumerate(accepted):
             alone = len(accepted) == 1 and not _is_other(fitted) and not nominal_effects(last.model)
@@ -607,10 +611,10 @@ class Procedure:
                 final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)
             self.findings[self.findings.index(f)] = final
             reduced.append(without)
-        return [*fitted[:-1], with_intervals(last, parameters)], reduced
+        return [*fitted[:-1], with_intervals(last, parameters)], reduced, established
 
     def remove_unestablished(
-        self, fitted: list[FittedModel], without: Sequence[FittedModel | None]
+        self, fitted: list[FittedModel], without: Sequence[FittedModel | None], established: Sequence[bool]
     ) -> list[FittedModel] | None:
         """Return the fitted models without one effect that is not established, None where all are.
 
@@ -622,11 +626,11 @@ class Procedure:
         Args:
             fitted: The fitted models, the last with all that was accepted.
             without: The last one without each accepted effect, in the order of their addition.
+            established: Whether an interval of each excludes its null value.
         """
         accepted, first, last = self._accepted(), fitted[0], fitted[-1]
-        pairs = sorted(zip(accepted, without, strict=True), key=lambda pair: pair[0].gain)
-        for f, refitted in pairs:
-            if refitted is None or any(p.excludes_null for p in f.parameters):
+        for f, refitted, sure in sorted(zip(accepted, without, established, strict=True), key=lambda row: row[0].gain):
+            if refitted is None or sure:
                 continue
             reduced = self._with_nominal_instead(refitted, last)
             if not self._explains(reduced, first, added=len(accepted) > 1):

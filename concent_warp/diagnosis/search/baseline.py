@@ -105,7 +105,7 @@ def held_out_errors(model: Model, sums: Sums, blocks: Blocks, prior: float) -> n
     held |= (values >= high - BOUND_DISTANCE * scale) & (slope < 0)
     free = np.where(held, 0.0, 1.0)
     sums = replace(sums, normal=sums.normal * np.outer(free, free), slope=sums.slope * free)
-    return HeldOut(sums, blocks, prior, nominal_parameters(model)).own()
+    return HeldOut(sums, blocks, prior, nominal_parameters(model)).of_fit()
 
 
 def without_bounded(model: Model, pieces: Sequence[Linear]) -> Sequence[Linear]:

@@ -25,8 +25,6 @@ def fitted_candidate(base: FittedModel, effect: Effect, solver: Solver, fit: Fit
     pieces = tuple(without_bounded(model, base.projected(fit)))
     sums, prior = base.held_out(pieces).sums, base.cfg.least_squares.prior
     errors = held_out_errors(model, sums, base.blocks, prior)
-    if errors.sum() < sums.square.sum():  # a step that the fit could not take promises it: it has not converged
-        errors = sums.square
     ratio = robust_noise_ratio([piece.residual for piece in pieces], base.cfg.least_squares.robust)
     ratio *= base.noise_scale
     return FittedCandidate(effect, model, fit, sums, pieces, errors, ratio)

@@ -159,6 +159,15 @@ class HeldOut:
         """Return the held-out error of each block, shape (B,), for the residuals that the sums are of."""
         return self.errors(self.sums.slope, self.sums.square)
 
+    def of_fit(self) -> np.ndarray:
+        """Return the held-out error of each block, shape (B,), of the fit that the sums are of.
+
+        What a linear step promises that the fit could not take is no gain: where less is left held out than in the fit,
+        the error is that of the fit.
+        """
+        found = self.own()
+        return self.sums.square if found.sum() < self.sums.square.sum() else found
+
 
 def sign_flip_p(gain: np.ndarray, rng: np.random.Generator, samples: int = 20000) -> float:
     """Return the probability of a mean gain at least this large if the sign of each block's gain were random.
