@@ -119,8 +119,8 @@ class Model:
         """
         base = self.compile()
         effect.check(base)
-        same = (a.effect.target for a in self.effects if a.effect.name == effect.name)
-        if any(set(target) & set(effect.target) or target == effect.target for target in same):
+        same = (a.effect.elements for a in self.effects if a.effect.name == effect.name)
+        if any(set(names) & set(effect.elements) or names == effect.elements for names in same):
             raise ModelError(f"the model already has {effect.name} on a target", found=list(effect.target))
         added = AddedEffect(effect, checked_values(effect, base, values))
         return replace(self, effects=(*self.effects, added))
@@ -146,6 +146,9 @@ class Model:
         known: list[str] = []
         for effect in chosen:
             effect.check(base)
+            mine = [set(a.effect.elements) for a in model.effects[len(self.effects) :]]
+            if not target and any(names & set(effect.elements) for names in mine):
+                continue  # another part of the same element
             names = [p.name for p in effect.parameters(base)]
             known += names
             model = model.add(effect, {one: value for one, value in (values or {}).items() if one in names})

@@ -180,6 +180,11 @@ class Effect:
         return qpos, qvel
 
     @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the joints, actuators, bodies, geoms or sensors among the target; all of it, by default."""
+        return self.target
+
+    @property
     def edits(self) -> bool:
         """Whether the values enter the MJCF, so that each set of values is compiled by itself."""
         return type(self).edit is not Effect.edit
@@ -217,16 +222,16 @@ class Effect:
             return
         known = _names(m, self.kind)
         expected = f"{'bodies' if self.kind == 'body' else f'{self.kind}s'} among {known}"
-        if unknown := [name for name in self.target if name not in known]:
+        if unknown := [name for name in self.elements if name not in known]:
             raise ModelError(f"{self.name} has an unknown target", expected=expected, found=unknown)
         if not self.target:
             raise ModelError(f"{self.name} has no target", expected=expected, found="none")
-        if unfit := [n for n, i in zip(self.target, self.ids(m), strict=True) if not self.applies_to(m, int(i))]:
+        if unfit := [n for n, i in zip(self.elements, self.ids(m), strict=True) if not self.applies_to(m, int(i))]:
             raise ModelError(f"{self.name} cannot act on these targets", expected=self.requirement, found=unfit)
 
     def ids(self, m: mujoco.MjModel) -> np.ndarray:
         """Return the ids of the targets, shape (n,) int."""
-        return np.array([mujoco.mj_name2id(m, OBJECTS[self.kind], name) for name in self.target], dtype=int)
+        return np.array([mujoco.mj_name2id(m, OBJECTS[self.kind], name) for name in self.elements], dtype=int)
 
     def parameter_per_target(
         self, name: str, unit: str, null: Sequence[float] | np.ndarray | float, **rest: float

@@ -30,15 +30,15 @@ def candidates(model: Model, channels: Collection[str], names: Sequence[str] = (
                 if not target:
                     continue
             effect = kind(*target)
-            if not _has_effect(model, effect):
+            if not has_effect(model, effect):
                 found.append(effect)
     return found
 
 
-def _has_effect(model: Model, effect: Effect) -> bool:
+def has_effect(model: Model, effect: Effect) -> bool:
     """Return whether a model has an effect already, on some of its target."""
     return any(
-        a.effect.name == effect.name and (not effect.target or set(a.effect.target) & set(effect.target))
+        a.effect.name == effect.name and (not effect.target or set(a.effect.elements) & set(effect.elements))
         for a in model.effects
     )
 
@@ -47,6 +47,6 @@ def label(effect: Effect, among: Sequence[Effect]) -> str:
     """Return the effect's name, with its target where several candidates share the name."""
     if sum(e.name == effect.name for e in among) == 1 or not effect.target:
         return effect.name
-    if len(effect.target) == 1:
-        return f"{effect.name}({effect.target[0]})"
+    if len(effect.elements) == 1:
+        return f"{effect.name}({', '.join(effect.target)})"
     return f"{effect.name}({effect.target[0]}, ...)"

@@ -15,6 +15,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.baseline import fitted_model, refit_without_effect
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.candidates import has_effect
 from concent_warp.diagnosis.search.evidence import assess, indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import fitted_candidate
 from concent_warp.effects.effect import AddedEffect
@@ -68,6 +69,8 @@ def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: Diag
     base = refit_without_effect(last, effect)
     others, pairs = np.delete(last.fit.values, np.r_[last.prediction().split[effect]]), []
     for rival in among:
+        if has_effect(base.model, rival.added.effect):
+            continue
         solver = base.solver(rival.added.effect)
         values = np.concatenate([others, rival.added.array])
         fit = solver.polish(solver.fit(values, last.fit.offsets, last.fit.starts))

@@ -25,8 +25,9 @@ def screen(
 ) -> ScreenedCandidate:
     """Return a candidate with the gain that a fit is expected to have.
 
-    Sensitivities are taken at the baseline's initial states, and at the measured ones where those are far away: initial
-    states that compensate for a missing effect lead to a point where its sensitivities mean little.
+    Sensitivities are taken and values are scanned at the baseline's initial states, and at the measured ones where
+    those are far away: initial states that compensate for a missing effect lead to a point where its sensitivities mean
+    little, and where no value is better than none.
 
     Args:
         base: The fitted baseline.
@@ -50,12 +51,18 @@ def screen(
         zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
         known = (at_measured or linear_at_measured_states(base, cfg)) if taken_over else ()
         linear = solver.linearise(at, zero, known, residual_known=same)
-        measured = base.projected(replace(base.fit, linear=linear, offsets=zero))
-        plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in measured]
+        there = base.projected(replace(base.fit, linear=linear, offsets=zero))
+        plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
         before = base.held_out(plain).own()
-        gain = max(gain, _linear_gain(base, measured, plain, before))
-    scanned_gain, start = _scan(solver, base, values)
-    return ScreenedCandidate(effect, gain, scanned_gain, start, pieces)
+        gain = max(gain, _linear_gain(base, there, plain, before))
+    scanned_gain, start = _scan(solver, base, values, base.fit.offsets)
+    measured = False
+    if _are_far(base, cfg):
+        zero = [np.zeros_like(o) for o in base.fit.offsets]
+        other_gain, other = _scan(solver, base, values, zero)
+        if other_gain > scanned_gain:
+            scanned_gain, start, measured = other_gain, other, True
+    return ScreenedCandidate(effect, gain, scanned_gain, start, pieces, measured)
 
 
 def ranking(base: FittedModel, screened: Sequence[ScreenedCandidate], names: Sequence[str], seed: int = 0) -> str:
@@ -132,10 +139,18 @@ def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Li
     return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
 
 
-def _scan(solver: Solver, base: FittedModel, values: np.ndarray) -> tuple[float, np.ndarray]:
+def _scan(
+    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
+) -> tuple[float, np.ndarray]:
     """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
 
     Threshold effects such as adhesion or backlash have no sensitivity at their null value.
+
+    Args:
+        solver: Solver of the candidate.
+        base: The fitted baseline.
+        values: Parameters at their null values, shape (P,).
+        offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
     """
     trials = []
     for k, parameter in enumerate(solver.p.parameters):
@@ -150,7 +165,7 @@ def _scan(solver: Solver, base: FittedModel, values: np.ndarray) -> tuple[float,
         return best, start
     before = robust_sum(base, [piece.residual for piece in base.pieces])
     for moved in trials:
-        after = robust_sum(base, projected_residuals(solver, base, moved, base.fit.offsets))
+        after = robust_sum(base, projected_residuals(solver, base, moved, offsets))
         gain = (before - after) / max(before, 1e-12)
         if gain > best:
             best, start = gain, moved

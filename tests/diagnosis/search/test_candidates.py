@@ -1,6 +1,6 @@
 import pytest
 
-from concent_warp.diagnosis.search.candidates import _has_effect, candidates, label
+from concent_warp.diagnosis.search.candidates import candidates, has_effect, label
 from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
@@ -33,8 +33,8 @@ def test_instruments_without_readings_have_no_residual():
 def test_what_a_model_has_already_is_left_out():
     damping = effect_class("joint_damping")("hinge")
     model = swing().add(damping)
-    assert _has_effect(model, damping)
-    assert not _has_effect(model, effect_class("joint_friction")("hinge"))
+    assert has_effect(model, damping)
+    assert not has_effect(model, effect_class("joint_friction")("hinge"))
     assert "joint_damping" not in [e.name for e in candidates(model, {"angle"})]
 
 

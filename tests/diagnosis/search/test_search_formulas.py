@@ -14,7 +14,7 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg, UnknownForceCfg
 from concent_warp.diagnosis.search import evidence, screening
 from concent_warp.diagnosis.search import unknown_force as module
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import _has_effect, label
+from concent_warp.diagnosis.search.candidates import has_effect, label
 from concent_warp.diagnosis.search.evidence import (
     _log_errors,
     _plausibility,
@@ -145,6 +145,10 @@ def test_projected_residuals_are_without_what_the_initial_states_take_up():
     assert robust_sum(base, residuals) == pytest.approx(expected)
 
 
+OFFSETS = (np.zeros(2),)
+"""Errors of the initial states."""
+
+
 def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monkeypatch):
     parameters = [
         Parameter("own", "-", 0.0, 0.0, 9.0, 1.0, scan=(5.0,)),
@@ -152,7 +156,7 @@ def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monk
         Parameter("b", "-", np.inf, 0.0, 9.0, 1.0, scan=(3.0,)),
     ]
     solver: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters, owned=1), high=np.array([9.0, 9.0, 8.0]))
-    base, tried = base_of(fit=SimpleNamespace(offsets="offsets")), []
+    base, tried = base_of(), []
     before = robust_sum(base, [p.residual for p in base.pieces])
 
     def left(_solver, _base, values, offsets):
@@ -164,17 +168,17 @@ def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monk
     monkeypatch.setattr(
         screening, "robust_sum", lambda _base, rs: sum(float(r @ r) for r in rs) if len(rs[0]) == 1 else before
     )
-    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]))
+    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
     assert [t[0] for t in tried] == [[0.5, 1.0, np.inf], [0.5, 2.0, np.inf], [0.5, 0.0, 3.0]]
-    assert {t[1] for t in tried} == {"offsets"}
+    assert all(t[1] is OFFSETS for t in tried)
     assert gain == pytest.approx(0.4)
     assert start.tolist() == [0.5, 2.0, np.inf]
     monkeypatch.setattr(screening, "projected_residuals", lambda *_: [np.full(1, np.sqrt(1.1 * before))])
-    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]))
+    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
     assert gain == 0.0
     assert start.tolist() == [0.5, 0.0, 8.0]
     none: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters[:1], owned=1), high=np.array([9.0]))
-    assert _scan(none, base, np.array([0.5]))[0] == 0.0
+    assert _scan(none, base, np.array([0.5]), OFFSETS)[0] == 0.0
 
 
 class OneEffect:
@@ -290,13 +294,13 @@ def test_the_smallest_detectable_size_is_of_the_most_sensitive_parameter():
 
 def test_labels_have_targets_where_names_are_shared():
     def effect(name: str, *target: str) -> Any:
-        return SimpleNamespace(name=name, target=target)
+        return SimpleNamespace(name=name, target=target, elements=target)
 
     one, two, three = effect("a", "x"), effect("a", "x", "y"), effect("b", "x")
     assert [label(e, [one, two, three]) for e in (one, two, three)] == ["a(x)", "a(x, ...)", "b"]
     model: Any = SimpleNamespace(effects=[SimpleNamespace(effect=one)])
     others = (one, two, three, effect("a", "z"), effect("a"))
-    assert [_has_effect(model, e) for e in others] == [True, True, False, False, True]
+    assert [has_effect(model, e) for e in others] == [True, True, False, False, True]
 
 
 def test_folds_of_forces_are_dealt_in_turn():
