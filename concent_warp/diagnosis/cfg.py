@@ -56,6 +56,9 @@ class SearchCfg:
     min_expected_gain: float = 0.5
     """Expected gain over the critical one, above which a screened candidate is fitted [-]: linear extrapolation is
     taken to be right to a factor of 2."""
+    fits_of_each: Count = 3
+    """Most candidates that are fitted of one effect on the same elements, such as parts of one body [-]: those of one
+    effect must not take the places of all others. Empirical."""
     batch_size: Count = 3
     """Candidates fitted before the search decides whether others are worth a fit. The truth is among the first three in
     most scenes. Empirical."""

@@ -56,7 +56,7 @@ class CandidateFits:
         """
         least = self.search.min_expected_gain * critical_gain
         promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
-        fitted = self._fit_in_batches(promising[: self.cfg.max_fits])
+        fitted = self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
         if not self.fits:
             return []
         expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, fitted, strict=True)])
@@ -234,3 +234,20 @@ class CandidateFits:
 def _are_confused(one: Effect, other: Effect) -> bool:
     """Return whether one of two effects says that it is confused with the other."""
     return other.name in one.confusions or one.name in other.confusions
+
+
+def _a_few_of_each(promising: Sequence[ScreenedCandidate], most: int) -> list[ScreenedCandidate]:
+    """Return candidates without those that are further parts of what at most so many before them are of, as one body.
+
+    Args:
+        promising: Candidates, the most promising first.
+        most: Most candidates of one effect on the same elements.
+    """
+    count: dict[tuple[str, ...], int] = {}
+    kept = []
+    for s in promising:
+        key = (s.effect.name, *s.effect.elements)
+        count[key] = count.get(key, 0) + 1
+        if count[key] <= most:
+            kept.append(s)
+    return kept

@@ -55,9 +55,10 @@ def made(*values: Any, **more: Any) -> Any:
     return MadeUp(*values, **more)
 
 
-def screened(name: str, expected: float) -> Any:
-    """Return a screened candidate."""
-    return SimpleNamespace(name=name, expected_gain=expected)
+def screened(name: str, expected: float, of: tuple[str, ...] = ()) -> Any:
+    """Return a screened candidate, by default of an effect by itself; else of one on the elements `of`."""
+    effect = SimpleNamespace(name=name if not of else "part", elements=of)
+    return SimpleNamespace(name=name, expected_gain=expected, effect=effect)
 
 
 def base_of(windows: int = 2, length: float = 1.0, ratio: float = 2.0) -> Any:
@@ -141,6 +142,14 @@ def test_only_promising_candidates_are_fitted_and_at_most_so_many(monkeypatch):
     tasks.done.clear()
     assert fits_of([]).fit(promises, 1.0, ANY) == []
     assert tasks.done == []
+
+
+def test_parts_of_one_body_do_not_take_the_places_of_all_others(monkeypatch):
+    Tasks(monkeypatch, {n: made(n, 0.5, ratio=1.3) for n in "abcdef"})
+    of = {"a": ("body",), "b": ("body",), "c": ("body",), "d": (), "e": ("other",), "f": ("body", "other")}
+    promises = [screened(n, 0.5 - 0.05 * k, of[n]) for k, n in enumerate("abcdef")]
+    found = fits_of([], fits_of_each=2).fit(promises, 0.1, tuple)
+    assert [c.name for c in found] == ["a", "b", "d", "e", "f"]
 
 
 def test_the_search_ends_with_multiple_shooting_where_nothing_explains_the_data(monkeypatch):
