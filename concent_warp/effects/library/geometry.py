@@ -1,4 +1,4 @@
-"""Contact geometry as an effect: offsets of the faces of an object from the nominal model."""
+"""Contact geometry as an effect: faces of an object that lie off or are tilted, and edges that are worn."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.effects.effect import Parameter
+from concent_warp.effects.library.cut_box import ALL_EDGES, EDGE_PARTS, PARTS, CutBox, largest, names
 from concent_warp.effects.library.objects import BodyEffect, keep_inertia
 from concent_warp.effects.select import element_name, free_bodies
 
@@ -25,47 +26,99 @@ MAX_MOVED_SIZE = 0.5
 """Size of a shape over that of the body along each axis below which it is moved and not resized [-]."""
 MIN_SIZE = 0.1
 """Least size of a resized shape over its nominal one [-]."""
+TILT = 1e-3
+"""Typical tilt of a face: how far its ends lie off [m]."""
+CUT = 2e-3
+"""Typical width of the cut of a worn edge [m]."""
+SCANNED = (0.15, 0.4)
+"""Widths of cuts that are scanned, over the largest one [-]: an edge that a motion touches once is lost in contacts."""
+SCANNED_TILT = 0.35
+"""Tilts of faces that are scanned, to both sides, over the largest one [-]."""
+MIN_SPHERES = 8
+"""Fewest spheres that have faces and edges: one a corner."""
 AXIS_TOLERANCE = 1e-6
 """Largest entry, off 0 and 1, of the rotation of a shape whose axes are those of the body."""
 
 
 class ContactGeometryOffset(BodyEffect):
-    """Outward offsets of the faces of a body from the nominal model."""
+    """Contact geometry of a body that is not the model's: its faces lie off or are tilted, or its edges are worn.
+
+    The target is a body, whose faces lie off, or a body and one of `PARTS`. Each part is a candidate by itself: most
+    objects differ from their model in one place, and few parameters leave less room for what another effect explains.
+    """
 
     name = "contact_geometry"
-    requirement = "a body with colliding spheres, boxes, cylinders, capsules or ellipsoids"
+    requirement = (
+        "a body with colliding spheres, boxes, cylinders, capsules or ellipsoids; for tilted faces and worn edges, with"
+        " one box or with spheres alone"
+    )
     summary = (
         "Each face of the box about the body's colliding shapes lies outward of the model's by an offset; spheres and"
-        " shapes at a face move with it, those inside by a share that falls linearly to 0 at the opposite face; mass"
-        " and inertia stay."
+        " shapes at a face move with it, those inside by a share that falls linearly to 0 at the opposite face. Or, by"
+        f" a second target, one of {', '.join(PARTS)}: the two faces across an axis of the box are tilted, each by how"
+        " far it lies further out at the positive end of another axis and further in at the negative; or the four edges"
+        " along an axis, or all edges alike, are cut at 45 degrees by a width on both faces. Mass and inertia stay."
     )
     source = "geometry"
-    signature = "contacts come early or late on some sides of the body, whose resting height is off on others"
+    signature = (
+        "contacts come early or late on some sides of the body, whose resting height is off on others; it rests or is"
+        " pushed at an angle where faces are tilted, and lands turned where edges are worn"
+    )
     confusions = ("size", "frame_offset", "center_of_mass", "length_scale")
+
+    def __init__(self, *target: str) -> None:
+        super().__init__(*target)
+        if self.part:  # any of the parts is as rare as the whole: one by itself is that much rarer
+            self.rarity = 2 * float(np.log(len(PARTS)))  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def part(self) -> str:
+        """The part of the body that is off, one of `PARTS`; empty for the places of its faces."""
+        return self.target[-1] if len(self.target) > 1 and self.target[-1] in PARTS else ""
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The bodies."""
+        return self.target[:-1] if self.part else self.target
 
     @classmethod
     def targets(cls, m: mujoco.MjModel) -> tuple[tuple[str, ...], ...]:
-        """Return each free body with shapes that can be moved."""
-        return tuple(
-            (n,) for b in free_bodies(m) if len(_shapes(m, b)) and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b))
-        )
+        """Return each free body with shapes that can be moved; one box or spheres alone also with each part."""
+        found: list[tuple[str, ...]] = []
+        for b in free_bodies(m):
+            if len(_shapes(m, b)) and (n := element_name(m, mujoco.mjtObj.mjOBJ_BODY, b)):
+                found.append((n,))
+                if _has_parts(m, b):
+                    found += [(n, part) for part in PARTS]
+        return tuple(found)
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:
-        """Return whether a body has shapes that can be moved."""
-        return i > 0 and len(_shapes(m, i)) > 0
+        """Return whether a body has shapes that can be moved, and the part that is off."""
+        return i > 0 and len(_shapes(m, i)) > 0 and (not self.part or _has_parts(m, i))
 
-    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:  # noqa: ARG002
-        """Return an outward offset of each face."""
-        return tuple(Parameter(face, "m", 0.0, -5e-3, 5e-3, 5e-4) for face in FACES)
+    def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
+        """Return an outward offset of each face, the tilts of two faces, or the widths of cuts."""
+        part = self.part
+        if not part:
+            return tuple(Parameter(face, "m", 0.0, -5e-3, 5e-3, 5e-4) for face in FACES)
+        most = min(largest(_box(m, int(b))[1], part) for b in self.ids(m))
+        if part == ALL_EDGES or part in EDGE_PARTS:
+            scan = tuple(share * most for share in SCANNED)
+            return tuple(Parameter(name, "m", 0.0, 0.0, most, CUT, scan) for name in names(part))
+        scan = (-SCANNED_TILT * most, SCANNED_TILT * most)
+        return tuple(Parameter(name, "m", 0.0, -most, most, TILT, scan) for name in names(part))
 
     def edit(self, spec: mujoco.MjSpec, values: np.ndarray) -> None:
         """Move and resize the colliding shapes of the body; what MuJoCo would derive from them is fixed first."""
         compiled = spec.copy().compile()
-        for n in self.target:
+        for n in self.elements:
             body, b = spec.body(n), compiled.body(n).id
             keep_inertia(body, compiled)
-            offsets = Offsets.of(compiled, b, values)
             geoms, first = list(body.geoms), int(compiled.body_geomadr[b])
+            if self.part:
+                _cut(spec, compiled, b, {int(i): geoms[i - first] for i in _shapes(compiled, b)}, self.part, values)
+                continue
+            offsets = Offsets.of(compiled, b, values)
             for i in _shapes(compiled, b):
                 _write(body, geoms[i - first], *offsets.moved(compiled, int(i)))
 
@@ -126,6 +179,60 @@ def _shapes(m: mujoco.MjModel, body: int) -> np.ndarray:
     ids = np.flatnonzero(m.geom_bodyid == body)
     collides = (m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)
     return ids[collides & np.isin(m.geom_type[ids], SHAPES)]
+
+
+def _has_parts(m: mujoco.MjModel, body: int) -> bool:
+    """Return whether a body collides as one box, or as spheres on all sides of its middle."""
+    ids = np.flatnonzero(m.geom_bodyid == body)
+    ids = ids[(m.geom_contype[ids] != 0) | (m.geom_conaffinity[ids] != 0)]
+    if len(ids) == 1:
+        return bool(m.geom_type[ids[0]] == int(GEOM.mjGEOM_BOX))
+    return len(ids) >= MIN_SPHERES and bool((m.geom_type[ids] == SPHERE).all())
+
+
+def _box(m: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return middle and half sizes of the box that a body is, or of that about its spheres [m], shapes (3,)."""
+    ids = _shapes(m, body)
+    if len(ids) == 1:
+        return m.geom_pos[ids[0]], m.geom_size[ids[0]].copy()
+    reach = m.geom_size[ids, :1]
+    low, high = (m.geom_pos[ids] - reach).min(axis=0), (m.geom_pos[ids] + reach).max(axis=0)
+    return (low + high) / 2, (high - low) / 2
+
+
+def _cut(
+    spec: mujoco.MjSpec,
+    m: mujoco.MjModel,
+    body: int,
+    geoms: dict[int, mujoco.MjsGeom],
+    part: str,
+    values: np.ndarray,
+) -> None:
+    """Tilt faces or cut edges of a body: its box becomes a convex mesh, its spheres move.
+
+    Args:
+        spec: The MJCF.
+        m: The same, compiled.
+        body: The body.
+        geoms: Its colliding shapes by their ids.
+        part: One of `PARTS`.
+        values: Values of the parameters, shape (P,); the box stays one where all are 0.
+    """
+    middle, half = _box(m, body)
+    found, ids = CutBox.of(half, part, values), list(geoms)
+    if found.is_plain:
+        return
+    parent = spec.body(m.body(body).name)
+    if len(ids) > 1:
+        places = found.moved(m.geom_pos[ids] - middle, m.geom_size[ids, 0], FACE_DEPTH)
+        for i, place in zip(ids, places, strict=True):
+            _write(parent, geoms[i], middle + place, m.geom_quat[i], m.geom_size[i])
+        return
+    (i,), (geom,) = ids, geoms.values()
+    _write(parent, geom, m.geom_pos[i], m.geom_quat[i], m.geom_size[i])
+    mesh = spec.add_mesh(name=f"{parent.name}_{part}")
+    mesh.uservert = found.corners().ravel()
+    geom.type, geom.meshname = GEOM.mjGEOM_MESH, mesh.name
 
 
 def _rotation(m: mujoco.MjModel, geom: int) -> np.ndarray:
