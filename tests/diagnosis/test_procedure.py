@@ -48,7 +48,7 @@ def node(
     return SimpleNamespace(
         ratio=ratio, noise_ratio=10 * ratio, errors=np.array([errors / 2] * 2), model=model, windows=[window],
         fit=SimpleNamespace(offsets="o", cost=errors), pieces=[piece], cfg=EffectSolverCfg(), timestep=timestep,
-        limit=1e9,
+        limit=1e9, noise_scale=1.0,
         delivered=SimpleNamespace(name=f"delivered {name}", timestep=timestep),
     )  # fmt: skip
 

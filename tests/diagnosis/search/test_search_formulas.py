@@ -70,7 +70,8 @@ def base_of(owned: int = 1, **changes: Any) -> Any:
     """Return a fitted model with random residuals."""
     own = pieces(0, owned)
     bare = cast("Any", SimpleNamespace(effects=()))
-    made = MadeUpModel(bare, (), blocks(), ANY, own, LIMIT, np.zeros(COUNT))
+    windows = (cast("Any", SimpleNamespace(noise_scale=1.0)),)
+    made = MadeUpModel(bare, windows, blocks(), ANY, own, LIMIT, np.zeros(COUNT))
     return replace(made, **{"errors": made.held_out(own).own(), **changes})
 
 
