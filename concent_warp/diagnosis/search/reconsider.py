@@ -18,7 +18,7 @@ from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.search.candidates import has_effect
 from concent_warp.diagnosis.search.evidence import assess, indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import fitted_candidate
-from concent_warp.effects.effect import AddedEffect
+from concent_warp.effects.effect import AddedEffect, Effect
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,8 @@ def near_best(
 def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: DiagnoseCfg) -> Reconsidered | None:
     """Return which of some rivals explains most in the place of an effect; None where none explains as much as it does.
 
+    A rival must have been better than chance when it was compared, and its gain beside the others certain.
+
     Args:
         last: The fitted model.
         effect: Index of the effect among those of the model.
@@ -67,6 +69,7 @@ def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: Diag
         cfg: Settings.
     """
     base = refit_without_effect(last, effect)
+    present = last.model.effects[effect].effect
     others, pairs = np.delete(last.fit.values, np.r_[last.prediction().split[effect]]), []
     for rival in among:
         if has_effect(base.model, rival.added.effect):
@@ -76,8 +79,9 @@ def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: Diag
         fit = solver.polish(solver.fit(values, last.fit.offsets, last.fit.starts))
         c = fitted_candidate(base, rival.added.effect, solver, fit)
         f = assess(base, c, np.zeros(1), rival.finding.step, [rival.added.effect], cfg)
-        if not any(p.at_bound for p in f.parameters) and c.share(base) >= cfg.min_gain:
-            old = rival.finding
+        old = rival.finding
+        certain = _is_same(rival.added.effect, present) or (old.p <= cfg.significance_level and f.low > 0)
+        if certain and not any(p.at_bound for p in f.parameters) and c.share(base) >= cfg.min_gain:
             pairs.append((c, replace(f, name=old.name, p=old.p, smallest_p=old.smallest_p, accepted=True, reason="")))
     if not pairs:
         return None
@@ -94,5 +98,10 @@ def _in_place(last: FittedModel, effect: int, c: FittedCandidate) -> FittedModel
     solver = replace(last, model=model).solver()
     fit = solver.fit(offsets=c.fit.offsets, starts=c.fit.starts)
     found = fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
-    same = added.effect.name == last.model.effects[effect].effect.name
+    same = _is_same(added.effect, last.model.effects[effect].effect)
     return last if same and last.fit.cost <= found.fit.cost else found
+
+
+def _is_same(one: Effect, other: Effect) -> bool:
+    """Return whether two effects are the same, on the same target."""
+    return one.name == other.name and one.target == other.target

@@ -190,6 +190,21 @@ def test_a_rival_that_explains_too_little_or_ends_at_a_bound_is_left_out(right, 
     assert reconsider(right, 0, among, CFG) is None
 
 
+def test_a_rival_that_was_no_better_than_chance_or_is_uncertain_now_does_not_come_in(wrong, right, alone, monkeypatch):
+    for p, name in ((0.05, "joint_damping"), (0.051, None)):
+        found = reconsider(wrong, 0, [rival("joint_damping", alone["joint_damping"], p=p, accepted=False)], CFG)
+        assert (None if found is None else names(found.last)[0]) == name
+    judge = module.assess
+    monkeypatch.setattr(module, "assess", lambda *args: replace(judge(*args), low=0.0))
+    among = [rival(n, alone[n], p=p) for n, p in (("joint_friction", 0.5), ("joint_damping", 0.01))]
+    # The effect that was accepted stays one of those compared.
+    for last, name in ((wrong, "joint_friction"), (right, "joint_damping")):
+        found = reconsider(last, 0, among, CFG)
+        assert found is not None
+        assert [f.name for _, f in found.group] == [name]
+        assert names(found.last) == names(last)
+
+
 def test_nothing_is_reconsidered_without_rivals(right):
     assert reconsider(right, 0, [], CFG) is None
 
