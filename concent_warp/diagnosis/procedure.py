@@ -357,12 +357,11 @@ class Procedure:
                 that the answer would state, see `joint_parameters`, exclude its null values too.
         """
         cfg = self.cfg
-        effects = candidates(base.model, self.channels, cfg.effects)
+        effects, parts = self._candidates(base)
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        null = max_gain_under_null(base, screened, cfg.null_samples, cfg.seed)
-        critical = float(np.quantile(null, 1 - cfg.significance_level))
+        null, critical = self._chance(base, screened)
         needed = max(critical, cfg.min_gain)
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
         if not self._is_lacking(base):
@@ -371,8 +370,15 @@ class Procedure:
         def finding(c: FittedCandidate) -> Finding:
             return assess(base, c, null, step, effects, cfg)
 
+        def short_windows() -> Sequence[Window]:
+            return self._windows(base.model, cfg.search.shooting_window)
+
         fits = CandidateFits(base, cfg, self.runner)
-        fitted = fits.fit(screened, critical, lambda: self._windows(base.model, cfg.search.shooting_window))
+        fitted = fits.fit(screened, critical, short_windows)
+        if parts and self._leaves_more(base, fitted):
+            more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
+            null, critical = self._chance(base, [*screened, *more])
+            fitted = fits.fit(more, critical, short_windows)
         for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
             self.budget.note(sentence, step if decides else None)
         if not fitted and fits.left:
@@ -394,6 +400,33 @@ class Procedure:
         self.rivals[step] = near_best(base, fitted, findings, cfg)
         self._record(base, group, findings)
         return group[0][0], smallest
+
+    def _candidates(self, base: FittedModel) -> tuple[list[Effect], list[Effect]]:
+        """Return the effects that a fitted model may lack, and those considered only where none of these explains it.
+
+        The latter are parts of elements; those of an effect that was asked for by its name are among the former.
+        """
+        found = candidates(base.model, self.channels, self.cfg.effects)
+        later = [e for e in found if e.is_part and e.name not in self.cfg.effects]
+        return [e for e in found if e not in later], later
+
+    def _leaves_more(self, base: FittedModel, fitted: Sequence[FittedCandidate]) -> bool:
+        """Return whether the best of the fitted candidates, without any the model itself, leaves more than noise."""
+        best = max(fitted, key=lambda c: c.share(base), default=base)
+        return best.ratio > self.cfg.search.explained_ratio
+
+    def _chance(self, base: FittedModel, screened: Sequence[ScreenedCandidate]) -> tuple[np.ndarray, float]:
+        """Return the null distribution of the best candidate's gain, and its value at the significance level."""
+        null = max_gain_under_null(base, screened, self.cfg.null_samples, self.cfg.seed)
+        return null, float(np.quantile(null, 1 - self.cfg.significance_level))
+
+    def _screened_parts(self, base: FittedModel, parts: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
+        """Return parts with their expected gains, none where there was no time: the other candidates stay."""
+        try:
+            return self._screened(base, parts, step, share=0.0)
+        except TimeUpError:
+            self.budget.note(f"Not screened: {in_words([label(e, parts) for e in parts])}.", step)
+            return []
 
     def _established(
         self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding]
@@ -419,9 +452,18 @@ class Procedure:
                 found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
         return found
 
-    def _screened(self, base: FittedModel, effects: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
-        """Return all candidates with their expected gains."""
-        span = 0.5 * ADDITIONS_SPAN / self.cfg.max_additions
+    def _screened(
+        self, base: FittedModel, effects: Sequence[Effect], step: int, share: float = 0.5
+    ) -> list[ScreenedCandidate]:
+        """Return candidates with their expected gains.
+
+        Args:
+            base: The fitted model.
+            effects: Candidates.
+            step: Index of the addition.
+            share: Share of the addition that this takes, for the progress.
+        """
+        span = share * ADDITIONS_SPAN / self.cfg.max_additions
         at_measured = linear_at_measured_states(base, self.cfg.search)
         tasks = [(base, e, self.cfg.search, at_measured) for e in effects]
         found = self.runner.run_in_time(screen, tasks, "screening", span)

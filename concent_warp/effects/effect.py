@@ -185,6 +185,14 @@ class Effect:
         return self.target
 
     @property
+    def is_part(self) -> bool:
+        """Whether its target names a part of the elements too.
+
+        A diagnosis considers parts only where no other candidate explains the data: there are many of them.
+        """
+        return len(self.target) > len(self.elements)
+
+    @property
     def edits(self) -> bool:
         """Whether the values enter the MJCF, so that each set of values is compiled by itself."""
         return type(self).edit is not Effect.edit

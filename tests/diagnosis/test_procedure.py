@@ -21,6 +21,7 @@ from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.recording.recording import Channel
+from concent_warp.simulate.time_limit import TimeUpError
 from tests.scenes.swinging import drawing, swung, windows_of
 
 RECORDING = swung(seconds=0.5)
@@ -755,6 +756,11 @@ class MadeUp(SimpleNamespace):
         return self.gain - getattr(base, "less", 0.0)
 
 
+def candidate(name: str, *, is_part: bool = False) -> Any:
+    """Return a candidate, or a part of an element."""
+    return SimpleNamespace(name=name, is_part=is_part, target=(), elements=())
+
+
 def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, **given):
     """Return what a search adds whose candidates have these gains, and notes of what is asked for."""
     notes: dict[str, Any] = {"bases": []}
@@ -762,7 +768,7 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
         MadeUp(name=n, gain=g, model=SimpleNamespace(name=f"model {n}", effects=["own", f"added {n}"]))
         for n, (g, _) in gains.items()
     ]
-    monkeypatch.setattr(module, "candidates", lambda *_: ["effect"])
+    monkeypatch.setattr(module, "candidates", lambda *_: [candidate("effect")])
     monkeypatch.setattr(made, "_screened", lambda *_: ["s1", "s2", "s3"])
     monkeypatch.setattr(module, "max_gain_under_null", lambda *args: notes.setdefault("null", args[2:]) and null)
     monkeypatch.setattr(
@@ -953,3 +959,104 @@ def test_replays_start_where_the_first_window_of_a_demonstration_was_fitted_to()
     assert same.qpos is d.qpos
     assert same.qvel is d.qvel
     assert SearchCfg().max_rounds == 3
+
+
+class Parts:
+    """A search in which one candidate is a part, and notes of what it asks for."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fits: dict[str, tuple[float, float]]) -> None:
+        """Prepare a search whose candidates have a gain and a noise ratio."""
+        self.screened: list[list[str]] = []
+        self.fitted: list[tuple[list[str], float]] = []
+        self.null: list[list[str]] = []
+        self.among: list[list[str]] = []
+        self.time = True
+        notes, found = self, {}
+        for name, (gain, ratio) in fits.items():
+            found[name] = MadeUp(name=name, gain=gain, ratio=ratio, model=SimpleNamespace(effects=[name]))
+        effects = [candidate("whole"), candidate("part", is_part=True), candidate("other")]
+
+        class Fits:
+            left = ()
+
+            def __init__(self, *_):
+                self.fits = []
+
+            def unsettled(self, _name):
+                return []
+
+            def fit(self, screened, critical, _windows):
+                notes.fitted.append((screened, critical))
+                self.fits += [found[s] for s in screened if s in found]
+                return self.fits
+
+        def chance(_base, screened, *_):
+            self.null.append(screened)
+            return np.full(10, 0.01 * len(screened))
+
+        def assess(_base, c, null, step, among, _cfg):
+            self.among.append([e.name for e in among])
+            return replace(finding(c.name, c.gain, step=step), p=float(null[0]))
+
+        monkeypatch.setattr(module, "candidates", lambda *_: effects)
+        monkeypatch.setattr(module, "max_gain_under_null", chance)
+        monkeypatch.setattr(module, "detectable_size", lambda _b, s, needed: f"{s} {needed}")
+        monkeypatch.setattr(module, "CandidateFits", Fits)
+        monkeypatch.setattr(module, "assess", assess)
+        monkeypatch.setattr(module, "profile_widening", lambda _base, c: f"width of {c.name}")
+        monkeypatch.setattr(
+            module, "group_indistinguishable", lambda _b, accepted, *_: [max(accepted, key=lambda pair: pair[1].gain)]
+        )
+
+    def find(self, made: Any, ratio: float = 2.0) -> tuple[str | None, tuple[str, ...]]:
+        """Return the name of what is added to a model of a noise ratio, and the detectable sizes."""
+
+        def screen(_base, effects, _step, **_):
+            if not self.time and effects[0].is_part:
+                raise TimeUpError
+            self.screened.append([e.name for e in effects])
+            return self.screened[-1]
+
+        made._screened = screen
+        best, sizes = made.find_addition(node(ratio), 0)
+        return None if best is None else best.name, sizes
+
+
+@pytest.mark.parametrize(
+    ("whole", "other", "ratio", "needed"),
+    [
+        ((0.7, 1.1), (0.6, 1.5), 2.0, False),
+        ((0.7, 1.11), (0.6, 1.0), 2.0, True),  # the one that gains most counts
+        (None, None, 1.1, False),
+        (None, None, 1.11, True),
+    ],
+)
+def test_parts_are_candidates_where_no_other_one_explains_the_data(monkeypatch, whole, other, ratio, needed):
+    fits = {n: v for n, v in (("whole", whole), ("other", other), ("part", (0.9, 1.0))) if v is not None}
+    made, parts = procedure(), Parts(monkeypatch, fits)
+    added, sizes = parts.find(made, ratio)
+    assert added == ("part" if needed else "whole" if whole else None)
+    assert sizes == ("whole 0.05", "other 0.05")
+    first, rest = ["whole", "other"], [["part"]] if needed else []
+    assert parts.screened == [first, *rest]
+    # Chance has the best of all of them, for those that were fitted before as well.
+    assert parts.null == [first, *([[*first, "part"]] if needed else [])]
+    assert parts.fitted == [(first, 0.02), *((screened, 0.03) for screened in rest)]
+    assert all(among == (["whole", "other", "part"] if needed else first) for among in parts.among)
+    assert {f.p for f in made.findings} == ({0.03} if needed else {0.02} if whole else set())
+    assert len(made.findings) == len(fits) - (not needed)
+
+
+def test_parts_of_an_effect_that_was_asked_for_are_candidates_from_the_start(monkeypatch):
+    for asked, first in ((("part",), ["whole", "part", "other"]), (("whole",), ["whole", "other"])):
+        made, parts = procedure(effects=asked), Parts(monkeypatch, {"whole": (0.7, 1.0)})
+        assert parts.find(made)[0] == "whole"
+        assert parts.screened == [first]
+
+
+def test_without_time_for_parts_the_other_candidates_stay(monkeypatch):
+    made, parts = procedure(), Parts(monkeypatch, {"whole": (0.7, 1.5)})
+    parts.time = False
+    assert parts.find(made)[0] == "whole"
+    assert made.budget.unsettled == ["Not screened: part."]
+    assert made.budget.cut == {0}

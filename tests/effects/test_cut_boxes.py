@@ -8,6 +8,7 @@ from small_worlds import BLOCK, move, world
 from concent_warp.diagnosis.search.candidates import candidates, label
 from concent_warp.effects.library.cut_box import EDGE_PARTS, FACE_PARTS, PAIR_PARTS, PARTS, CutBox, largest, names
 from concent_warp.effects.library.geometry import ContactGeometryOffset
+from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ModelError
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
@@ -176,3 +177,5 @@ def test_candidates_are_told_apart_by_their_parts():
     assert said[0] == "contact_geometry(thing)"
     assert "contact_geometry(thing, edge_x+z-)" in said
     assert len(set(said)) == len(found) == 1 + len(PARTS)
+    assert [e.is_part for e in found] == [False] + [True] * len(PARTS)
+    assert not effect_class("mass")("thing", "other").is_part

@@ -36,6 +36,8 @@ class CandidateFits:
         """Prepare to fit candidates to a baseline."""
         self.base, self.cfg, self.search, self.runner = base, cfg, cfg.search, runner
         self.fits: list[FittedCandidate] = []
+        self.fitted: list[ScreenedCandidate] = []
+        """The same as they were screened."""
         self.left: list[ScreenedCandidate] = []
         """Candidates that there was no time to fit."""
         self.unrefined: list[Effect] = []
@@ -47,19 +49,20 @@ class CandidateFits:
         critical_gain: float,
         short_windows: Callable[[], Sequence[Window]],
     ) -> list[FittedCandidate]:
-        """Return fits of the promising candidates, the most promising first.
+        """Return fits of the promising candidates, the most promising first, after those of earlier calls.
 
         Args:
-            screened: All candidates.
+            screened: All candidates that were not among those of an earlier call.
             critical_gain: Gain that chance reaches at the significance level.
             short_windows: Returns the windows of a multiple-shooting fit.
         """
         least = self.search.min_expected_gain * critical_gain
         promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
-        fitted = self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
+        self.fitted += self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
         if not self.fits:
             return []
-        expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in zip(self.fits, fitted, strict=True)])
+        pairs = zip(self.fits, self.fitted, strict=True)
+        expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in pairs])
         if expected.max() < self.cfg.min_gain:  # none explains enough to be accepted, however well it is fitted
             return self.fits
         best = self._best()
@@ -140,9 +143,10 @@ class CandidateFits:
         """
         base, search, left = self.base, self.search, list(promising)
         fitted: list[ScreenedCandidate] = []
+        span = 0.0 if self.fitted else BATCH_SPAN / search.batch_size
         while left:
             batch, left = left[: search.batch_size], left[search.batch_size :]
-            tasks, span = [(base, s) for s in batch], BATCH_SPAN / search.batch_size
+            tasks = [(base, s) for s in batch]
             for s, c in zip(batch, self.runner.run_in_time(fit_candidate, tasks, "fitting", span), strict=True):
                 if c is None:
                     self.left.append(s)

@@ -181,6 +181,17 @@ def test_expected_gains_are_the_larger_of_promise_and_fit(monkeypatch):
     assert seen == [("a", [0.5, 0.35]), ("a", [0.5, 0.35]), [0.5, 0.35]]
 
 
+def test_candidates_of_a_later_call_are_fitted_and_refined_beside_those_of_earlier_ones(monkeypatch):
+    tasks = Tasks(monkeypatch, {"a": made("a", 0.5, ratio=1.2), "b": made("b", 0.7, ratio=1.2)})
+    search, seen = fits_of([]), []
+    monkeypatch.setattr(search, "refit_rivals", lambda e: seen.append(e.tolist()))
+    assert [c.name for c in search.fit([screened("a", 0.6)], 0.1, list)] == ["a"]
+    assert [c.name for c in search.fit([screened("b", 0.4), screened("c", 0.0)], 0.1, list)] == ["a", "b"]
+    assert [d[1] for d in tasks.done if d[0] == "fit"] == ["a", "b"]
+    assert seen == [[0.6], [0.6, 0.7]]
+    assert [s.name for s in search.fitted] == ["a", "b"]
+
+
 def test_candidates_that_lag_behind_an_explained_fit_are_restarted(monkeypatch):
     best = made("best", 0.8, ratio=1.09)
     lagging = [made(f"x{g}", g) for g in (0.39, 0.41, 0.55, 0.57)]
