@@ -56,13 +56,13 @@ def with_initial_states(
         cfg: Settings.
     """
     cfg, unknown = cfg or FittedStartCfg(), [d.qpos is None or d.qvel is None for d in recording.demonstrations]
-    recording = _with_true_states(model, recording)
+    stated = _with_true_states(model, recording)
     if not any(unknown):
-        return recording
+        return stated
     try:
         noise = channel_noises(model, recording, cfg.observation)
     except RecordingError:  # too few readings to fit anything to
-        return recording
+        return stated
     source = ObservedRecording(model, recording, noise, cfg.observation)
     first: list[Window] = []
     for number, d in enumerate(recording.demonstrations):
@@ -73,7 +73,7 @@ def with_initial_states(
             if (window := source.window(number, 0.0, min(end, max(reach, begin)))) is not None:
                 first.append(window)
     if not first:
-        return recording
+        return stated
     offsets = _fitted(model, first, [np.zeros(len(w.spread)) for w in first], engine, cfg, cfg.search.iterations)
     step, few = model.scene.model.opt.timestep, cfg.few_iterations
     for k, w in enumerate(first):
@@ -85,12 +85,12 @@ def with_initial_states(
                 (offsets[k],) = _fitted(model, [replace(whole, spread=w.spread)], [offsets[k]], engine, cfg, few)
     starts = {w.number: _moved(model, w, o) for w, o in zip(first, offsets, strict=True)}
     demonstrations = []
-    for number, d in enumerate(recording.demonstrations):
+    for number, d in enumerate(stated.demonstrations):
         qpos, qvel = starts.get(number, (d.qpos, d.qvel))
         demonstrations.append(
             replace(d, qpos=qpos if d.qpos is None else d.qpos, qvel=qvel if d.qvel is None else d.qvel)
         )
-    return replace(recording, demonstrations=tuple(demonstrations))
+    return replace(stated, demonstrations=tuple(demonstrations))
 
 
 def _last_time(d: Demonstration, channels: Sequence[str]) -> float:
@@ -127,11 +127,11 @@ def _with_true_states(model: Model, recording: Recording) -> Recording:
         return recording
     m, demonstrations = model.scene.model, []
     for number, d in enumerate(recording.demonstrations):
-        if d.qpos is not None and d.qvel is not None:
+        if d.qpos is not None or d.qvel is not None:
             none = np.zeros(0)
             w = Window(d, number, 0.0, 0.0, *initial_state(m, d), np.zeros(2 * m.nv), (), 0, none)
             prediction = Prediction(model, (), [w], at_true_time=True)
             qpos, qvel = prediction.first_state(w, prediction.start)
-            d = replace(d, qpos=qpos, qvel=qvel)
+            d = replace(d, qpos=None if d.qpos is None else qpos, qvel=None if d.qvel is None else qvel)
         demonstrations.append(d)
     return replace(recording, demonstrations=tuple(demonstrations))
