@@ -120,7 +120,7 @@ def nominal_errors(
     j = np.concatenate([piece.jacobian[:, own] * w for piece, w in zip(last.pieces, weights, strict=True)])
     k = (sensitivities or nominal_sensitivities(last)).of(kinds) * np.concatenate(weights)
     k = np.nan_to_num(k, posinf=0.0, neginf=0.0)
-    excess = max(last.ratio**2 - 1, cfg.min_gain)
+    excess = max(last.ratio**2 - 1, cfg.min_gain) / last.noise_scale**2
     spread[own] = considered_std(j, k, excess, last.cfg.least_squares.prior)
     return spread
 

@@ -118,7 +118,7 @@ def finding(base: FittedModel, finer: FittedModel, seed: int) -> FinerTimeStep:
     return FinerTimeStep(
         given=base.timestep,
         used=finer.timestep,
-        change=noise_ratio(np.concatenate(_projected(base, change))),
+        change=base.noise_scale * noise_ratio(np.concatenate(_projected(base, change))),
         gain=float(gain.sum() / max(base.errors.sum(), 1e-12)),
         low=low,
         high=high,
