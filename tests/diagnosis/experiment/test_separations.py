@@ -83,6 +83,7 @@ def test_a_future_window_has_the_samples_of_each_channel_that_is_measured():
     assert (window.count, window.start, window.end, window.number) == (30 + 18 + 90, 0.0, 0.3, 0)
     np.testing.assert_array_equal(window.qpos, made.qpos)
     np.testing.assert_array_equal(window.qvel, made.qvel)
+    assert not window.start_shown  # it starts as the motion does, whatever the instruments show
     gone = _future_window(known, replace(made, away=("ball",)), 0.3)
     assert gone is not None
     assert [r.channel for r in gone.readings] == ["rail_position"]
