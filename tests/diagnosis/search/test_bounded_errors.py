@@ -45,12 +45,22 @@ def test_no_fold_leads_beyond_a_bound():
     bare = Model(Scene(XML.format(damping=0.0)))
     at_bound = replace(bare, effects=(AddedEffect(JointFriction("hinge"), (0.0,)),))
     inside = replace(bare, effects=(AddedEffect(JointFriction("hinge"), (0.1,)),))
-    falls_below, falls_above = sums(1.0), sums(-1.0)
-    assert held_out_errors(at_bound, falls_below, blocks(), 10.0) == pytest.approx(falls_below.square)
-    for model, given in ((at_bound, falls_above), (inside, falls_below), (inside, falls_above)):
-        free = HeldOut(given, blocks(), 10.0).own()
-        assert held_out_errors(model, given, blocks(), 10.0) == pytest.approx(free)
-        assert free.sum() < given.square.sum()
+    damping = AddedEffect(JointDamping("hinge"), (0.1,))  # what it does scatters: it is worse where it is held out
+    for model, slope, held in ((at_bound, 0.2, True), (at_bound, -0.2, False), (inside, 0.2, False)):
+        given = sums(slope, others=1)
+        stays = replace(given, normal=given.normal * [[0, 0], [0, 1]], slope=given.slope * [0, 1])
+        found = held_out_errors(replace(model, effects=(*model.effects, damping)), given, blocks(), 10.0)
+        free, fixed = (HeldOut(one, blocks(), 10.0).own() for one in (given, stays))
+        assert found == pytest.approx(fixed if held else free)
+        assert given.square.sum() < free.sum() < fixed.sum() - 0.2
+
+
+def test_what_no_step_of_the_fit_could_take_is_no_gain():
+    bare = Model(Scene(XML.format(damping=0.0)))
+    inside = replace(bare, effects=(AddedEffect(JointFriction("hinge"), (0.1,)),))
+    for given in (sums(1.0), sums(-1.0)):
+        assert HeldOut(given, blocks(), 10.0).own().sum() < given.square.sum()
+        assert held_out_errors(inside, given, blocks(), 10.0) == pytest.approx(given.square)
 
 
 def test_what_is_at_a_bound_leaves_the_other_parameters_as_they_are():

@@ -167,6 +167,19 @@ def test_nominal_values_that_remove_less_than_the_least_gain_stay_as_given(sligh
     assert with_nominal_values(slightly_wrong, NominalCfg(), 1.01 * removed) is None
 
 
+def test_what_a_fit_of_nominal_values_could_not_take_does_not_count(slightly_wrong, monkeypatch):
+    fit = Solver.fit
+
+    def stuck(solver, values, offsets, starts):
+        linear, cost = solver.linearise(values, offsets), slightly_wrong.fit.cost
+        return replace(slightly_wrong.fit, values=values, offsets=offsets, starts=starts, linear=linear, cost=cost)
+
+    monkeypatch.setattr(Solver, "fit", stuck)
+    assert with_nominal_values(slightly_wrong, NominalCfg(), 0.05) is None
+    monkeypatch.setattr(Solver, "fit", fit)
+    assert with_nominal_values(slightly_wrong, NominalCfg(), 0.05) is not None
+
+
 def test_nominal_values_that_are_slightly_wrong_are_no_missing_effect():
     model, recording = cw.Model(cw.Scene(SLIGHTLY_WRONG)), pusher(damping=0.05, delay=0.0)
     found = cw.diagnose(model, recording, cw.DiagnoseCfg(jobs=1, explain=False))

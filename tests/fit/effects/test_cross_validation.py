@@ -94,6 +94,15 @@ def test_held_out_errors_fall_for_an_effect_that_is_there_and_not_for_one_that_i
     assert -30 < gains[1] < 10
 
 
+def test_what_a_step_promises_that_the_fit_could_not_take_is_no_gain():
+    rng, blocks = np.random.default_rng(2), even_blocks(600, 12)
+    promising, fitted = line(rng, 600, slope=0.5, size=3), line(rng, 600, size=3)
+    for piece, promises in ((promising, True), (fitted, False)):
+        held_out = HeldOut(block_sums([piece], blocks, WIDE), blocks)
+        assert (held_out.own().sum() < held_out.sums.square.sum()) == promises
+        np.testing.assert_array_equal(held_out.of_fit(), held_out.sums.square if promises else held_out.own())
+
+
 @pytest.mark.parametrize(("gain", "p"), [([1.0, 2.0, 3.0], 1 / 8), ([1.0, -1.0], 3 / 4), ([-1.0, -1.0, -1.0], 1.0)])
 def test_chance_of_the_signs_of_a_few_blocks_is_counted_out(gain, p):
     assert sign_flip_p(np.array(gain), np.random.default_rng(0)) == pytest.approx(p)
