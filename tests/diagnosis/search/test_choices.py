@@ -32,12 +32,13 @@ class MadeUp:
     ratio: float = 1.2
     polished: bool = False
     std: Any = None
+    confusions: tuple[str, ...] = ()
     errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
 
     @property
     def effect(self) -> Any:
         """The effect, by its name."""
-        return SimpleNamespace(name=self.name)
+        return SimpleNamespace(name=self.name, confusions=self.confusions)
 
     @property
     def fit(self) -> Any:
@@ -220,6 +221,54 @@ def test_fits_near_the_best_that_have_not_reached_the_noise_are_polished(monkeyp
         np.array([0.8, 0.7, 0.7, 0.7]),
     )
     assert [d[1] for d in tasks.done] == ["b", "c"]  # those above 0.85 of 0.8 are left to the rivals
+
+
+def test_fits_that_explain_far_less_than_they_promised_are_polished_too(monkeypatch):
+    assert (SearchCfg().stuck_share, SearchCfg().polished_stuck) == (0.5, 3)
+    best = made("best", 0.8)
+    gains = (("near", 0.75, 0.75), ("half", 0.36, 0.72), ("less", 0.35, 0.72), ("low", 0.1, 0.9), ("none", 0.0, 0.5))
+    fits, expected = [best, *(made(n, g) for n, g, _ in gains)], np.array([0.8, *(e for *_, e in gains)])
+    for most, polished in ((3, ["best", "low", "less"]), (1, ["best", "low"])):
+        tasks = Tasks(monkeypatch, {})
+        fits_of(fits, polished_stuck=most)._polish_near(best, expected)
+        assert tasks.done == [("polish", name) for name in polished]  # none that promised far less than the best
+    # Those that have reached the noise are no better afterwards.
+    tasks.done.clear()
+    fits_of([best, made("done", 0.1, ratio=1.02)])._polish_near(best, np.array([0.8, 0.9]))
+    assert [d[1] for d in tasks.done] == ["best"]
+
+
+def test_what_lags_behind_a_refined_best_is_restarted_from_its_initial_states(monkeypatch):
+    # Fits within 0.85 of the best have been its rivals already; others came some way, or are confused with it.
+    gains = (("close", 0.69), ("lagging", 0.67), ("some", 0.25), ("little", 0.23))
+    confused, other = made("confused", 0.0, confusions=("best",)), made("other", 0.0)
+    for confusions, last in (((), []), (("other",), ["other"])):
+        best = made("best", 0.8, ratio=1.09, confusions=confusions)
+        fits = [made(n, g) for n, g in gains]
+        tasks = Tasks(monkeypatch, {"lagging restart": made("lagging", 0.55)})
+        search = fits_of([*fits, best, confused, other])
+        assert not search._restart_left_behind()
+        assert tasks.done == [("restart", n, "best", True) for n in ("lagging", "some", "confused", *last)]
+        assert search.fits[1].gain == 0.55
+    for gain, near in ((0.57, True), (0.55, False)):  # 0.7 of 0.8
+        Tasks(monkeypatch, {"confused restart": replace(confused, gain=gain)})
+        assert fits_of([best, confused])._restart_left_behind() is near
+    tasks.done.clear()
+    assert not fits_of([replace(best, ratio=1.1), confused])._restart_left_behind()  # it does not explain the data
+    assert tasks.done == []
+
+
+def test_a_confusion_that_reaches_the_best_after_its_restart_is_its_rival(monkeypatch):
+    best, lagging = made("best", 0.8, ratio=1.05), made("confused", 0.1, ratio=1.5, confusions=("best",))
+    for gain, rounds in ((0.79, 2), (0.3, 1)):
+        tasks = {"best": best, "confused": lagging, "confused restart": replace(lagging, gain=gain)}
+        Tasks(monkeypatch, tasks)
+        search, seen = fits_of([]), []
+        monkeypatch.setattr(search, "refit_rivals", lambda e, seen=seen: seen.append(e.tolist()))
+        # It promises too little to be restarted before the best is refined.
+        found = search.fit([screened("best", 0.8), screened("confused", 0.3)], 0.1, list)
+        assert [c.gain for c in found] == [0.8, gain]
+        assert seen == [[0.8, 0.3], [0.8, gain]][:rounds]
 
 
 def test_few_fits_are_polished_before_rivals_start_from_the_best_the_most_promising_first(monkeypatch):
