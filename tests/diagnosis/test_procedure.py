@@ -461,26 +461,26 @@ OPEN, CLEAR = interval(-0.1), interval(0.1)
 
 
 def test_an_effect_that_may_be_at_its_null_values_is_removed_where_the_data_are_explained_without_it():
-    for parameters, ratios, removed in (
-        (([OPEN], [OPEN, OPEN], [CLEAR]), (1.2, 1.2, 1.2), "b"),  # the one with the smaller gain
-        (([OPEN], [OPEN, CLEAR], [CLEAR]), (1.2, 1.2, 1.2), "a"),  # one parameter is enough
-        (([OPEN], [OPEN], [CLEAR]), (1.2, 2.4, 1.2), "a"),  # the data need the other one
-        (([OPEN], [OPEN], [CLEAR]), (1.2, 1.9, 1.2), "b"),  # an error in the formulas of the others
-        (([OPEN], [OPEN], [CLEAR]), (2.4, None, 1.2), None),  # there was no time for the model without the other one
-        (([CLEAR], [CLEAR], [CLEAR]), (1.0, 1.0, 1.0), None),
-        (([interval(0.5, np.inf)], [CLEAR], [CLEAR]), (1.0, 1.0, 1.0), None),  # a limit that is finite
+    for established, ratios, removed in (
+        ("c", (1.2, 1.2, 1.2), "b"),  # the one with the smaller gain
+        ("bc", (1.2, 1.2, 1.2), "a"),
+        ("c", (1.2, 2.4, 1.2), "a"),  # the data need the other one
+        ("c", (1.2, 1.9, 1.2), "b"),  # an error in the formulas of the others
+        ("c", (2.4, None, 1.2), None),  # there was no time for the model without the other one
+        ("abc", (1.0, 1.0, 1.0), None),
     ):
-        made = procedure()
+        made, sure = procedure(), [name in established for name in "abc"]
+        # Their own intervals, which a rough cost widens, have no say.
         made.findings = [
-            replace(finding(name, gain, step=step), parameters=tuple(own))
-            for name, gain, step, own in zip("abc", (0.5, 0.3, 0.2), (0, 1, 2), parameters, strict=True)
+            replace(finding(name, gain, step=step), parameters=(OPEN if is_sure else CLEAR,))
+            for name, gain, step, is_sure in zip("abc", (0.5, 0.3, 0.2), (0, 1, 2), sure, strict=True)
         ] + [finding("x", 0.1, accepted=False, reason="no better than chance")]
         made.groups = [("a",), ("b", "y"), ("c",)]
         made.hypotheses = [{"a": 1}, {}, {"b": 2, "y": 3}, {"c": 4}]  # one was superfluous
         made.cfg = replace(made.cfg, nominal=NominalCfg(enabled=False))
         fitted = [node(9), node(5, effects=1), node(3, effects=2), node(1.0, effects=3)]
         without = [r and node(r, 1.0, 2) for r in ratios]
-        after = made.remove_unestablished(fitted, without)
+        after = made.remove_unestablished(fitted, without, sure)
         if removed is None:
             assert after is None
             assert [f.accepted for f in made.findings] == [True] * 3 + [False]
@@ -503,7 +503,7 @@ def test_an_only_effect_that_may_be_at_its_null_value_leaves_the_model_as_given(
         monkeypatch.setattr(module, "with_nominal_values", lambda *_, instead=instead: instead)
         made.findings = [replace(finding("a", 0.1), parameters=(OPEN,))]
         made.groups, made.hypotheses = [("a",)], [{"a": 1}]
-        after = made.remove_unestablished([given, node(1.0, 100.0, effects=1)], [reduced])
+        after = made.remove_unestablished([given, node(1.0, 100.0, effects=1)], [reduced], [False])
         # Beside no other effect, more than noise is no error of form.
         assert after == {"given": [given], "nominal": [instead], None: None}[left]
         assert made.groups == ([] if left else [("a",)])
@@ -517,10 +517,14 @@ def test_effects_are_removed_one_at_a_time_and_the_rest_fitted_together(monkeypa
 
     def together(fitted):
         asked.append(list(fitted))
-        return [*fitted[:-1], f"joint {fitted[-1]}"], ["without"]
+        return [*fitted[:-1], f"joint {fitted[-1]}"], ["without"], ["established"]
+
+    def remove(fitted, without, established):
+        assert (fitted[-1][:5], without, established) == ("joint", ["without"], ["established"])
+        return next(answers)
 
     monkeypatch.setattr(made, "_fitted_together", together)
-    monkeypatch.setattr(made, "remove_unestablished", lambda *_: next(answers))
+    monkeypatch.setattr(made, "remove_unestablished", remove)
     assert made.final_values(["given", "all"]) == ["joint third"]
     assert asked == [["given", "all"], ["first", "second"], ["third"]]
     # What the removed ones explain needs no force of unknown form.
@@ -533,6 +537,34 @@ def test_effects_are_removed_one_at_a_time_and_the_rest_fitted_together(monkeypa
     made.with_unestablished, second = [], list(made.with_unestablished)
     made.conclude(given, [given, last], (), ())
     assert tested == [[given, *second[1:]], [given, last]]
+
+
+def test_effects_are_established_by_intervals_that_the_profile_likelihood_does_not_widen(monkeypatch):
+    narrow = [(CLEAR,), (OPEN,), (OPEN, CLEAR), (interval(0.5, np.inf),), (OPEN, OPEN)]
+    wide, asked = [(CLEAR,), *[(OPEN,)] * 4], []
+
+    def intervals(last, widening, nominal):
+        asked.append((last, widening, nominal))
+        return narrow if widening is None else wide
+
+    made, last = procedure(), node(1.0, effects=5)  # one effect of its own, four added
+    monkeypatch.setattr(made, "_joint", lambda _: last)
+    monkeypatch.setattr(module, "joint_parameters", intervals)
+    monkeypatch.setattr(module, "nominal_errors", lambda *_: "nominal")
+    monkeypatch.setattr(module, "refit_without_effect", lambda _, k: f"without {k}")
+    monkeypatch.setattr(module, "joint_finding", lambda f, parameters, *_: replace(f, parameters=parameters))
+    monkeypatch.setattr(module, "with_intervals", lambda _, parameters: parameters)
+    made.findings = [finding(name, 0.5, step=k) for k, name in enumerate("abcd")]
+    made.widening = {k: f"width of {k}" for k in range(4)}
+    found, without, established = made._fitted_together(["given", "all"])
+    # One parameter is enough; a limit that is infinite by default and finite here excludes it.
+    assert established == [False, True, True, False]
+    assert without == [f"without {k}" for k in range(1, 5)]
+    # What the answer states has the wider intervals.
+    assert found == ["given", wide]
+    assert [f.parameters for f in made.findings] == wide[1:]
+    assert asked == [(last, {k + 1: f"width of {k}" for k in range(4)}, "nominal"), (last, None, "nominal")]
+    assert procedure()._fitted_together([node(1.0)])[1:] == ([], [])
 
 
 def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_candidate(monkeypatch):
@@ -644,6 +676,49 @@ def test_shorter_windows_are_taken_where_the_model_is_far_off(monkeypatch):
         found = made.coarse_baseline(given)
         assert lengths == asked
         assert (None if found is None else found.ratio) == left
+
+
+@pytest.mark.parametrize(
+    ("ratio", "touchable", "scale"), [(60.0, True, 20.0), (20.1, True, 6.7), (20.0, True, 1.0), (60.0, False, 1.0)]
+)
+def test_the_error_of_a_model_far_off_takes_the_place_of_the_noise_where_a_free_body_can_be_touched(
+    monkeypatch, ratio, touchable, scale
+):
+    made, cut = procedure(), []
+
+    def observed(_model, _recording, *, noise, **_):
+        cut.append(noise)
+        return [window]
+
+    def refitted(_model, windows):
+        return SimpleNamespace(noise_ratio=ratio, scales=[w.noise_scale for w in windows])
+
+    (window, *_) = windows_of(RECORDING)
+    monkeypatch.setattr(module, "channel_noises", lambda *_: {"angle": 0.002, "place": 0.01})
+    monkeypatch.setattr(module, "observe", observed)
+    monkeypatch.setattr(module, "has_touchable_free_body", lambda _: touchable)
+    monkeypatch.setattr(made, "_refitted", refitted)
+    assert made.baseline().scales == pytest.approx([scale])
+    assert made.noise_scale == pytest.approx(scale)
+    assert cut[0] == {"angle": 0.002, "place": 0.01}
+    assert len(cut) == (2 if scale > 1 else 1)
+    assert cut[-1] == pytest.approx({"angle": scale * 0.002, "place": scale * 0.01})
+    # Those of later fits are in the same units; the noise itself stays as it was found.
+    (later,) = made._windows(MODEL, 0.5)
+    assert (later.noise_scale, cut[-1]["angle"]) == pytest.approx((scale, scale * 0.002))
+    assert made.noise == {"angle": 0.002, "place": 0.01}
+
+
+def test_the_unit_of_residuals_decides_neither_what_is_left_nor_what_is_lacking():
+    factors, cfg = {"angle": 1.2}, DiagnoseCfg()
+    for ratio in (1.22, 1.24, 1.45, 1.51):
+        plain, first = node(ratio), node(9.0)
+        scaled, first_scaled = node(ratio), node(9.0)
+        for one, scale in ((scaled, 4.0), (first_scaled, 2.0)):
+            one.pieces[0].residual, one.noise_scale = one.pieces[0].residual / scale, scale
+        assert discrepancies(scaled, first_scaled) == pytest.approx(discrepancies(plain, first))
+        assert is_adequate(scaled, factors, cfg) == is_adequate(plain, factors, cfg) == (ratio < 1.5)
+        assert is_lacking(scaled, factors, cfg) == is_lacking(plain, factors, cfg) == (ratio > 1.23)
 
 
 def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monkeypatch):
