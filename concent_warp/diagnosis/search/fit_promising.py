@@ -180,9 +180,9 @@ class CandidateFits:
             expected[k] = max(expected[k], self.fits[k].share(self.base))
 
     def _restart_left_behind(self) -> bool:
-        """Restart candidates far behind the best from its initial states; returns whether one is near it then.
+        """Restart candidates far behind a best one that leaves only noise from its initial states.
 
-        Those are its confusions, and others that came some way before it was refined.
+        Those are its confusions, and others that came some way before it was refined. Returns whether one is near then.
         """
         best, search = self._best(), self.search
         if best.ratio >= search.explained_ratio:
