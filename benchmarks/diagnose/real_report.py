@@ -82,7 +82,7 @@ def summary(studies: list[dict[str, Any]]) -> str:
             for j, c in zip(study["judges"], study["steps"][-1]["from_first"], strict=True)
             if j["held_out"]
         )
-        time = f"{study['seconds']:.0f}, {study['processor_seconds']:.0f} s in {study['jobs']} processes"
+        time = f"{study['seconds']:.0f}, {study['processor_seconds']:.0f} s, {study['jobs']} at a time"
         rows.append([study["title"], f"`{diagnosis['verdict']}`", names, errors, time, bar(study)])
     return table(head, rows)
 
@@ -104,7 +104,7 @@ def section(study: dict[str, Any]) -> str:
 ## {study["title"][0].upper() + study["title"][1:]}
 
 Verdict: `{diagnosis["verdict"]}`, after {study["seconds"]:.0f} s ({study["processor_seconds"]:.0f} s of processor time,
-{study["jobs"]} processes). Residual over noise of the model as given and after each change: {ratios}.
+{study["jobs"]} at a time). Residual over noise of the model as given and after each change: {ratios}.
 {100 * diagnosis["unexplained"]:.0f} % of the discrepancy remain unexplained.
 
 An expert would say: {EXPERTS[study["part"]]}.
