@@ -311,7 +311,7 @@ def decoys(saved: Model, windows: Sequence[Window], case: Case) -> list[dict[str
             found.append({"name": name, "accepted": True, "changes": [], "values": {}})
             continue
         print(f"{case.title}: decoy {name}", flush=True)
-        added = fitted(saved, [chosen(name)], windows)
+        added = fitted(saved, [chosen(name, saved)], windows)
         changes = [asdict(change(j.errors(saved), j.errors(added))) for j in case.judges]
         found.append({"name": name, "accepted": False, "changes": changes, "values": values(added, name)})
     return found
@@ -323,18 +323,20 @@ def ladder(given: Model, windows: Sequence[Window], case: Case) -> list[dict[str
     names, models = [first], [fitted(given, [], windows)]
     for added in ranks:
         print(f"{case.title}: literature, {' and '.join(added)}", flush=True)
-        models.append(fitted(models[-1], [chosen(name) for name in added], windows))
+        models.append(fitted(models[-1], [chosen(name, case.model) for name in added], windows))
         names.append("+ " + " and ".join(added))
     rows = judged(names, models, case.judges)
     for added in alone:
-        more = fitted(models[-1], [chosen(name) for name in added], windows)
+        more = fitted(models[-1], [chosen(name, case.model) for name in added], windows)
         rows.append(judged(["", f"+ {added[0]}, on top"], [models[-1], more], case.judges)[1])
     return rows
 
 
-def chosen(name: str) -> Effect:
+def chosen(name: str, model: Model) -> Effect:
     """Return an effect on what it concerns in these scenes."""
     kind = effect_class(name)
+    if kind.kind == "sensor":
+        return kind(*kind.targets(model.compile())[0])
     target = {"joint": (JOINT,), "actuator": (DRIVE,), "body": ("cube",), "none": ()}
     return kind(*target[kind.kind])
 
