@@ -127,6 +127,8 @@ The diagnosis says:
     for k, judge in enumerate(study["judges"]):
         text += f"\n{judge['name']} [{judge['unit']}], {judge['units']} units:\n\n"
         text += steps(study["steps"], k)
+    if not study["decoys"]:
+        text += "\nDecoys and effects in the order of the literature were left out of this run.\n"
     text += "\nDecoys, fitted to the diagnosed data on top of the saved model:\n\n"
     text += table(
         ["decoy", *(j["name"] for j in study["judges"]), "fitted"], [decoy(d, study) for d in study["decoys"]]
