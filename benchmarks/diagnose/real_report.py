@@ -127,17 +127,20 @@ The diagnosis says:
     for k, judge in enumerate(study["judges"]):
         text += f"\n{judge['name']} [{judge['unit']}], {judge['units']} units:\n\n"
         text += steps(study["steps"], k)
-    if not study["decoys"]:
-        text += "\nDecoys and effects in the order of the literature were left out of this run.\n"
-    text += "\nDecoys, fitted to the diagnosed data on top of the saved model:\n\n"
-    text += table(
-        ["decoy", *(j["name"] for j in study["judges"]), "fitted"], [decoy(d, study) for d in study["decoys"]]
-    )
-    text += "\nEffects in the order of the literature, without a selection, fitted to the same data:\n"
-    for k, judge in enumerate(study["judges"]):
-        text += f"\n{judge['name']} [{judge['unit']}]:\n\n" + steps(study["ladder"], k)
-    fitted = "; ".join(f"{name} {value:.3g}" for name, value in study["ladder"][-1]["values"].items())
-    text += f"\nValues of the last: {fitted}.\n"
+    if study["decoys"]:
+        text += "\nDecoys, fitted to the diagnosed data on top of the saved model:\n\n"
+        head = ["decoy", *(j["name"] for j in study["judges"]), "fitted"]
+        text += table(head, [decoy(d, study) for d in study["decoys"]])
+    else:
+        text += "\nDecoys were left out of this run.\n"
+    if len(study["ladder"]) > 1:
+        text += "\nEffects in the order of the literature, without a selection, fitted to the same data:\n"
+        for k, judge in enumerate(study["judges"]):
+            text += f"\n{judge['name']} [{judge['unit']}]:\n\n" + steps(study["ladder"], k)
+        fitted = "; ".join(f"{name} {value:.3g}" for name, value in study["ladder"][-1]["values"].items())
+        text += f"\nValues of the last: {fitted}.\n"
+    else:
+        text += "\nEffects in the order of the literature were left out of this run.\n"
     rejected = [f for f in diagnosis["effects"] if not f["accepted"]]
     if rejected:
         text += "\nFitted and not accepted: "
@@ -222,7 +225,7 @@ def draw(studies: list[dict[str, Any]]) -> None:
         return
     figure, axes = plt.subplots(1, len(studies), figsize=(5.2 * len(studies), 4.2), squeeze=False)
     for axis, study in zip(axes[0], studies, strict=True):
-        names = [row["name"] for row in study["steps"]]
+        names = ["as given", *map(str, range(1, len(study["steps"]) - 1)), "saved"][: len(study["steps"])]
         for k, judge in enumerate(study["judges"]):
             changes = [row["from_first"][k] for row in study["steps"]]
             first = changes[0]["before"]
@@ -231,12 +234,13 @@ def draw(studies: list[dict[str, Any]]) -> None:
             label = f"{judge['name']} ({first:.3g} {judge['unit']} at first)"
             axis.plot(range(len(names)), value, "o-", color=COLOURS[k], label=label)
             axis.fill_between(range(len(names)), low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
-        axis.set_xticks(range(len(names)), names, rotation=25, ha="right")
+        axis.set_xticks(range(len(names)), names)
+        axis.set_xlabel("model after each change, as in the tables")
         axis.set_ylim(0, max(1.1, axis.get_ylim()[1]))
         axis.set_title(study["title"], fontsize=10)
         axis.grid(axis="y", alpha=0.3)
-        axis.legend(fontsize=8, loc="lower left")
-    axes[0, 0].set_ylabel("error, as a share of the first model's")
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    axes[0, 0].set_ylabel("error over that as given")
     figure.tight_layout()
     figure.savefig(FOLDER / "diagnose_real.png", dpi=110)
     plt.close(figure)

@@ -47,8 +47,8 @@ def screen(
     linear = solver.linearise(at, base.fit.offsets, known, residual_known=same)
     pieces = with_residuals(base.projected(replace(base.fit, linear=linear)), base.pieces)
     gain = _linear_gain(base, pieces, base.pieces, base.errors)
-    if _are_far(base, cfg):
-        zero = tuple(np.zeros_like(o) for o in base.fit.offsets)
+    far, zero = _are_far(base, cfg), tuple(np.zeros_like(o) for o in base.fit.offsets)
+    if far:
         known = (at_measured or linear_at_measured_states(base, cfg)) if taken_over else ()
         linear = solver.linearise(at, zero, known, residual_known=same)
         there = base.projected(replace(base.fit, linear=linear, offsets=zero))
@@ -57,8 +57,7 @@ def screen(
         gain = max(gain, _linear_gain(base, there, plain, before))
     scanned_gain, start = _scan(solver, base, values, base.fit.offsets)
     measured = False
-    if _are_far(base, cfg):
-        zero = [np.zeros_like(o) for o in base.fit.offsets]
+    if far:
         other_gain, other = _scan(solver, base, values, zero)
         if other_gain > scanned_gain:
             scanned_gain, start, measured = other_gain, other, True
