@@ -182,7 +182,9 @@ function setTime(t) {
 let before = 0;
 function play(now) {
   if (!state.playing) return;
-  const next = state.time + Math.min((now - before) / 1000, 0.1) * Number($("speed").value);
+  // The time of a frame that had begun before the button was pressed lies before that of the press.
+  const passed = Math.min(Math.max((now - before) / 1000, 0), 0.1);
+  const next = state.time + passed * Number($("speed").value);
   before = now;
   if (next >= state.demonstration.duration) { setTime(state.demonstration.duration); setPlaying(false); return; }
   setTime(next); requestAnimationFrame(play);
