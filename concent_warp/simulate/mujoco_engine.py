@@ -30,6 +30,7 @@ from concent_warp.simulate.mujoco_steps import (
     OVERFLOW,
     VariantResult,
     records_states_only,
+    restored,
     simulate_in_one_call,
     simulate_steps,
     simulate_with_force_models,
@@ -167,13 +168,13 @@ class MujocoEngine:
         count = min(self.threads, len(rows))
         if run.variants.force_models and self._processes.suits(count, len(rows) * run.steps):
             time_check()
-            return in_processes(self._in_turn, run, rows, self.threads)
+            return in_processes(self._all_in_turn, run, rows, self.threads)
         if run.variants.force_models:  # Python code, which runs in one thread at a time: more would only slow it down
-            count = 1
-        elif records_states_only(self._compiled, run) and not self._varies_spheres(run.variants):
+            return self._in_turn(run, rows)
+        if records_states_only(self._compiled, run) and not self._varies_spheres(run.variants):
             parts = self._batches.parts(rows, run.steps, count)
             return [r for part in _in_threads(lambda part: self._batch(run, part), parts, count) for r in part]
-        return _in_threads(lambda n: self._simulate(run, n), rows, count)
+        return self._in_turn(run, rows) if count == 1 else _in_threads(lambda n: self._simulate(run, n), rows, count)
 
     def _batch(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
         """Simulate some variants in one call, and those that raise a warning by themselves."""
@@ -188,18 +189,56 @@ class MujocoEngine:
         self._data.put(d)
         return [self._simulate(run, n) if result is None else result for n, result in zip(rows, found, strict=True)]
 
-    def _in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
+    def _all_in_turn(self, run: SimulationRun) -> list[VariantResult | None]:
         """Simulate all variants one after the other, in another process."""
         with quiet_warnings():
-            return [self._simulate(run, n) for n in range(run.variants.count)]
+            return self._in_turn(run, range(run.variants.count))
 
-    def _simulate(self, run: SimulationRun, n: int) -> VariantResult | None:
-        """Simulate variant n; None if its contacts or constraints did not fit the arena."""
-        m = self._variant_model(run.variants, n)
+    def _in_turn(self, run: SimulationRun, rows: Sequence[int]) -> list[VariantResult | None]:
+        """Simulate some variants one after the other; those with equal fields share a model and its data.
+
+        A fit varies initial states far more often than fields, and making a model takes as long as some hundred steps.
+        """
+        check = time_check()
+        groups: dict[int, list[int]] = {}
+        for n, like in zip(rows, self._alike(run.variants, rows), strict=True):
+            groups.setdefault(like, []).append(n)
+        found: dict[int, VariantResult | None] = {}
+        for like, members in groups.items():
+            m = self._variant_model(run.variants, like)
+            m = copy.copy(m) if m is self._compiled else m
+            d = mujoco.MjData(m)
+            for n in members:
+                check()
+                found[n] = self._simulate(run, n, m, d)
+        return [found[n] for n in rows]
+
+    def _alike(self, variants: Variants, rows: Sequence[int]) -> list[int]:
+        """Return for each of some variants the first of them that has the same model."""
+        if self._varies_spheres(variants):
+            return list(rows)
+        return distinct(rows, list((variants.fields or {}).values()))
+
+    def _simulate(
+        self, run: SimulationRun, n: int, m: mujoco.MjModel | None = None, d: mujoco.MjData | None = None
+    ) -> VariantResult | None:
+        """Simulate variant n; None if its contacts or constraints did not fit the arena.
+
+        Args:
+            run: What is asked for.
+            n: Index of the variant.
+            m: Its model, which force models may edit; fields that they edit are as before when this returns.
+            d: Data of the model, overwritten.
+        """
         force_models = [(force_model, values[n]) for force_model, values in run.variants.force_models or ()]
-        if any(force_model.edits for force_model, _ in force_models):
-            m = copy.copy(m)
-        d = mujoco.MjData(m)
+        if m is None:
+            m = self._variant_model(run.variants, n)
+            if any(force_model.edits for force_model, _ in force_models):
+                m = copy.copy(m)
+        if d is None:
+            d = mujoco.MjData(m)
+        else:
+            mujoco.mj_resetData(m, d)
         if run.variants.qpos is not None:
             d.qpos[:] = run.variants.qpos[n]
         if run.variants.qvel is not None:
@@ -209,7 +248,8 @@ class MujocoEngine:
         if records_states_only(m, run):
             step = simulate_with_force_models if force_models else simulate_in_one_call
         try:
-            result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, force_models)
+            with restored(m, [name for force_model, _ in force_models for name in force_model.edits]):
+                result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, force_models)
         except mujoco.FatalError as error:
             if "stack" in str(error) or "arena" in str(error):
                 return None

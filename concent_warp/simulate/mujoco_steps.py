@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,17 @@ class VariantResult:
         """Record a state, and what `d` holds computed from it."""
         self.qpos[row], self.qvel[row], self.sensordata[row] = qpos, qvel, d.sensordata
         self.body_position[row], self.body_quaternion[row] = d.xpos[body_ids], d.xquat[body_ids]
+
+
+@contextmanager
+def restored(m: mujoco.MjModel, names: Sequence[str]) -> Iterator[None]:
+    """Give fields of a model the values back that they had."""
+    before = {name: getattr(m, name).copy() for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            getattr(m, name)[:] = value
 
 
 def simulate_steps(

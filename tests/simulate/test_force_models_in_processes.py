@@ -44,7 +44,7 @@ def test_processes_find_what_one_thread_finds_to_the_last_bit(monkeypatch):
 
 
 def test_few_steps_stay_where_they_are(monkeypatch):
-    monkeypatch.setattr(MujocoEngine, "_in_turn", None)
+    monkeypatch.setattr(MujocoEngine, "_all_in_turn", None)
     assert not run(3).diverged.any()
 
 
@@ -56,3 +56,25 @@ def test_an_error_in_another_process_is_reported_as_here(monkeypatch):
     monkeypatch.setattr(MujocoEngine, "_simulate", None)  # in this process alone
     with pytest.raises(ValueError):  # a force model without its parameters
         engine.run(Variants(3, force_models=((force_model, np.zeros((3, 0))),)), np.zeros((1, STEPS, 1)), bodies=[])
+
+
+def test_variants_that_share_a_model_find_what_each_finds_alone():
+    model = Model(Scene(PENDULUM))
+    effect = effect_class("load_friction")("hinge")
+    engine = MujocoEngine(model.add(effect), threads=1)
+    force_model = effect.force_model(engine.compiled)
+    assert force_model is not None
+    mass = engine.compiled.body_mass * np.array([1.0, 2.0, 1.0, 2.0])[:, None]
+    values = np.array([0.3, 0.1, 0.0, 0.3])[:, None]
+    start, ctrl = np.array([0.5, 0.5, 0.2, 0.1])[:, None], np.full((1, STEPS, 1), 0.1)
+
+    def simulated(rows):
+        chosen = ((force_model, values[rows]),)
+        return engine.run(
+            Variants(len(rows), qpos=start[rows], fields={"body_mass": mass[rows]}, force_models=chosen), ctrl
+        )
+
+    together = simulated([0, 1, 2, 3])
+    for n in range(4):
+        np.testing.assert_array_equal(together.qpos[n], simulated([n]).qpos[0])
+    assert len({tuple(row) for row in together.qpos[:, -1]}) == 4
