@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Numbers, Row, StepState
+
 if TYPE_CHECKING:
     import mujoco_warp as mjw
     import warp as wp
@@ -27,6 +29,13 @@ class ForceModel:
     edits: ClassVar[tuple[str, ...]] = ()
     """Fields of the compiled model that it overwrites."""
 
+    acts: ClassVar[Callable[[bool, Numbers, Numbers, StepState], None] | None] = None
+    """A function of `compiled_forces.FORCES`, which acts on one element by a row of numbers.
+
+    Its arguments: whether this is not the first step, indices, numbers, and MuJoCo's arrays. None for force models that
+    are Python alone.
+    """
+
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and self._acts_on() == other._acts_on()  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -39,18 +48,32 @@ class ForceModel:
         return tuple((name, value.tobytes() if isinstance(value, np.ndarray) else value) for name, value in rows)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """Apply it in C MuJoCo.
+        """Apply it in C MuJoCo to the coming step.
 
         Args:
             m: Model of this variant alone; `edits` may be overwritten.
             d: Its data; to be added to: `qfrc_applied` (nv,) [N m or N], `xfrc_applied` (nbody, 6) [N, N m].
             values: Parameters, shape (P,).
         """
+        self.bound(m, d, values)()
+
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """Return indices and numbers of each element that `acts` acts on, in their order; arguments as of `apply`."""
         raise NotImplementedError
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """Return `apply` for the steps of one simulation; override it to look up constants once."""
-        return lambda: self.apply(m, d, values)
+        """Return `apply` for the steps of one simulation, in Python: constants are looked up once."""
+        act = type(self).acts
+        if act is None:
+            raise NotImplementedError
+        state, rows = StepState.of(m, d), self.rows(m, values)
+
+        def step() -> None:
+            begun = d.time > 0
+            for whole, real in rows:
+                act(begun, whole, real, state)
+
+        return step
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """Launch the same in MuJoCo-Warp, for all worlds.

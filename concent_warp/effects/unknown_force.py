@@ -13,6 +13,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Row, push_by_bump
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.effects.force_model import ForceModel
 
@@ -25,6 +26,8 @@ class UnknownJointForce(ForceModel):
 
     Parameters are the sizes of the basis functions over their scale, joint by joint, shape (n K,).
     """
+
+    acts = staticmethod(push_by_bump)
 
     def __init__(self, of: np.ndarray, dof: np.ndarray, centre: np.ndarray, scale: np.ndarray, *, moving: bool) -> None:
         """Set the basis functions.
@@ -43,27 +46,18 @@ class UnknownJointForce(ForceModel):
         """Number of parameters."""
         return self.centre.size
 
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
         del m
-        of, applied = d.qvel if self.moving else d.qpos, d.qfrc_applied
         width = self.centre[:, 1] - self.centre[:, 0]
         sizes = values.reshape(self.centre.shape) * self.scale[:, None]
-        rows = [
-            (int(self.of[i]), int(self.dof[i]), float(self.centre[i, k]), 1.0 / float(width[i]), float(sizes[i, k]))
+        return [
+            (
+                [int(self.dof[i]), int(self.of[i]), int(self.moving)],
+                [float(self.centre[i, k]), 1.0 / float(width[i]), float(sizes[i, k])],
+            )
             for i, k in np.argwhere(np.abs(sizes) > NEGLIGIBLE_SIZE)
         ]
-
-        def act() -> None:
-            for at, dof, centre, narrow, size in rows:
-                x = (of[at] - centre) * narrow
-                applied[dof] += size * math.exp(-0.5 * x * x)
-
-        return act
-
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
 
 
 Way = Literal["field", "brake", "drag", "turning"]
@@ -132,10 +126,6 @@ class UnknownBodyForce(ForceModel):
                 (torque if way == "turning" else force)[:] -= bump * size[0] / math.hypot(speed, fade_speed) * moved
 
         return act
-
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
 
 
 class UnknownForce(Effect):

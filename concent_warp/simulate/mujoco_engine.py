@@ -7,6 +7,7 @@ import queue
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import mujoco
@@ -14,6 +15,7 @@ import numpy as np
 
 from concent_warp.checks import check_at_least
 from concent_warp.errors import EngineError
+from concent_warp.simulate.compiled_steps import can_step, cannot_fill_arena
 from concent_warp.simulate.contact_log import collect
 from concent_warp.simulate.engine import Contacts, Rollout, Variants
 from concent_warp.simulate.fields import apply_fields
@@ -39,6 +41,7 @@ from concent_warp.simulate.parallel import ProcessPoolCfg, in_processes, simulat
 from concent_warp.simulate.time_limit import time_check
 
 if TYPE_CHECKING:
+    from concent_warp.effects.force_model import ForceModel
     from concent_warp.model import Model
 
 S = TypeVar("S")
@@ -86,6 +89,7 @@ class MujocoEngine:
         self._compiled, self._sphere_geom = compile_model(model, self._collidable)
         self._compilers: queue.SimpleQueue[VariantCompiler] = queue.SimpleQueue()
         self._data: queue.SimpleQueue[mujoco.MjData] = queue.SimpleQueue()
+        self._roomy: bool | None = None
         if memory is not None:
             self._resize(memory)
         self.repeats = 0
@@ -246,7 +250,8 @@ class MujocoEngine:
         result = VariantResult.empty(m, run)
         step = simulate_steps
         if records_states_only(m, run):
-            step = simulate_with_force_models if force_models else simulate_in_one_call
+            step = partial(simulate_with_force_models, compiled=self._may_compile(force_models))
+            step = step if force_models else simulate_in_one_call
         try:
             with restored(m, [name for force_model, _ in force_models for name in force_model.edits]):
                 result.diverged = not step(m, d, run, run.ctrl[n % len(run.ctrl)], result, force_models)
@@ -255,6 +260,14 @@ class MujocoEngine:
                 return None
             raise EngineError("MuJoCo stopped", where=f"variant {n}", found=error) from None
         return None if d.warning.number[OVERFLOW].any() else result
+
+    def _may_compile(self, force_models: Sequence[tuple[ForceModel, np.ndarray]]) -> bool:
+        """Return whether steps with some force models may be compiled."""
+        if not force_models or not can_step(force_models):
+            return False
+        if self._roomy is None:
+            self._roomy = cannot_fill_arena(self._compiled)
+        return self._roomy
 
     def _varies_spheres(self, variants: Variants) -> bool:
         """Return whether spheres of the contact geometry vary."""
@@ -297,6 +310,7 @@ class MujocoEngine:
         spec = self.model.spec(self._collidable)
         spec.memory = size
         self._compiled = self.model.finish(spec.compile())
+        self._roomy = None
 
 
 def _in_threads(work: Callable[[S], T], arguments: Sequence[S], count: int) -> list[T]:

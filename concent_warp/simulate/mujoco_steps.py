@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.simulate.compiled_steps import step_compiled
+
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
     from concent_warp.simulate.inputs import SimulationRun
@@ -169,20 +171,48 @@ def simulate_with_force_models(
     ctrl: np.ndarray,
     result: VariantResult,
     force_models: Sequence[tuple[ForceModel, np.ndarray]],
+    *,
+    compiled: bool = False,
 ) -> bool:
-    """Simulate as `simulate_steps` where only force models interrupt the steps; on a warning, fall back to that."""
+    """Simulate as `simulate_steps` where only force models interrupt the steps; on a warning, fall back to that.
+
+    The steps may be `compiled` where `concent_warp.simulate.compiled_steps` allows it.
+    """
     number = d.warning.number
     start = d.qpos.copy(), d.qvel.copy(), d.userdata.copy()
     base = [
         (getattr(m, name), getattr(m, name).copy()) for force_model, _ in force_models for name in force_model.edits
     ]
-    acting = [force_model.bound(m, d, values) for force_model, values in force_models]
     row_of = np.full(run.steps + 1, -1)
     row_of[run.record] = np.arange(len(run.record))
+    if compiled:
+        step_compiled(m, d, ctrl, row_of, force_models, result.qpos, result.qvel, result.sensordata)
+    else:
+        _step_in_python(m, d, ctrl, row_of, force_models, base, result)
+    if number[OVERFLOW].any() or number[DIVERGED].any():
+        mujoco.mj_resetData(m, d)
+        for field, value in base:
+            field[:] = value
+        d.qpos[:], d.qvel[:], d.userdata[:] = start
+        return simulate_steps(m, d, run, ctrl, result, force_models)
+    return True
+
+
+def _step_in_python(
+    m: mujoco.MjModel,
+    d: mujoco.MjData,
+    ctrl: np.ndarray,
+    row_of: np.ndarray,
+    force_models: Sequence[tuple[ForceModel, np.ndarray]],
+    base: Sequence[tuple[np.ndarray, np.ndarray]],
+    result: VariantResult,
+) -> None:
+    """Do what `step_compiled` does; `base` holds fields that force models edit, and their values."""
+    acting = [force_model.bound(m, d, values) for force_model, values in force_models]
     rows, command = row_of.tolist(), d.ctrl
     qpos, qvel, sensordata, joint_force, wrench = d.qpos, d.qvel, d.sensordata, d.qfrc_applied, d.xfrc_applied
     for k, row in enumerate(rows):
-        if m.nu and k < run.steps:
+        if m.nu and k < len(ctrl):
             command[:] = ctrl[k]
         joint_force.fill(0.0)
         wrench.fill(0.0)
@@ -196,13 +226,6 @@ def simulate_with_force_models(
         result.qpos[row], result.qvel[row] = qpos, qvel
         mujoco.mj_step(m, d)
         result.sensordata[row] = sensordata
-    if number[OVERFLOW].any() or number[DIVERGED].any():
-        mujoco.mj_resetData(m, d)
-        for field, value in base:
-            field[:] = value
-        d.qpos[:], d.qvel[:], d.userdata[:] = start
-        return simulate_steps(m, d, run, ctrl, result, force_models)
-    return True
 
 
 def _apply_force_models(

@@ -162,8 +162,11 @@ class Needy(Effect):
 
 
 class NoKernel(ForceModel):
-    def apply(self, m, d, values):  # noqa: ARG002
-        d.qfrc_applied[0] += values[0]
+    def bound(self, m, d, values):  # noqa: ARG002
+        def act():
+            d.qfrc_applied[0] += values[0]
+
+        return act
 
 
 class Half(Needy):

@@ -36,10 +36,6 @@ class AnisotropicForce(ForceModel):
         self.still[static_geoms(m)] = True
         self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
-
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""
         extra = float(values[0]) - 1.0
@@ -112,10 +108,6 @@ class AdhesionForce(ForceModel):
         flat = np.isin(m.geom_type, [GEOM.mjGEOM_PLANE, GEOM.mjGEOM_BOX]) & colliding
         self.still = np.intersect1d(static_geoms(m), np.flatnonzero(flat)).astype(np.int32)
         self._device: tuple[wp.array[Any], wp.array[Any], wp.array[Any], wp.array[Any]] | None = None
-
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
 
     def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
         """See `ForceModel.bound`."""

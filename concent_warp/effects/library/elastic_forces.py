@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Row, drive_by_spring
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.select import driven_joints
 
@@ -22,8 +22,6 @@ DAMPING_RATIO = 0.05
 LEAST_DAMPING = 0.25
 """Least relaxation time of the spring, damping over stiffness, in time steps [-]: it damps what a step cannot resolve,
 as a rotor without inertia, and takes the velocity at the end of the step."""
-FREE = 1e9
-"""Limit of an actuator's force that is none [N m or N]."""
 SLOTS = 4
 """User data of an actuator."""
 IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -58,6 +56,7 @@ class ElasticGearForce(ForceModel):
     """
 
     edits = ("dof_armature", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "site_pos")
+    acts = staticmethod(drive_by_spring)
 
     def __init__(self, actuators: np.ndarray, sites: np.ndarray, first: int) -> None:
         """Act on position-controlled actuators of single joints.
@@ -72,36 +71,11 @@ class ElasticGearForce(ForceModel):
         self.first = first
         self._device: tuple[wp.array[Any], wp.array[Any]] | None = None
 
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
-
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
         every, side = zip(self.actuators, self.sites, values[:-1], strict=True), float(values[-1])
         gears = [ElasticGear.of(m, int(a), int(site), 1 / float(c), side) for a, site, c in every if c > 0]
-        if not gears:
-            return lambda: None
-        ctrl, qpos, qvel, kept, applied = d.ctrl, d.qpos, d.qvel, d.userdata, d.qfrc_applied
-        site_pos, first = m.site_pos, self.first
-        armature, ranges = m.dof_armature, m.actuator_forcerange
-        gains, biases = m.actuator_gainprm, m.actuator_biasprm
-        weak = [(g.share * gains[g.actuator], g.share * biases[g.actuator]) for g in gears]
-
-        def act() -> None:
-            begun = d.time > 0
-            for gear, (gain, bias) in zip(gears, weak, strict=True):
-                slot, a = first + SLOTS * gear.actuator, gear.actuator
-                last = kept[slot : slot + SLOTS].tolist() if begun else None
-                turn = gear.turned(ctrl[a], qpos[gear.place], qvel[gear.dof], last)
-                kept[slot : slot + SLOTS] = turn.kept
-                site_pos[gear.site] = turn.kept[0], turn.kept[1], turn.servo
-                applied[gear.dof] += turn.force
-                armature[gear.dof] = turn.share * gear.inertia
-                gains[a], biases[a] = (0.0, 0.0) if turn.limited else (gain, bias)
-                ranges[a] = -FREE, FREE
-
-        return act
+        return [([g.actuator, g.site, g.place, g.dof, self.first + SLOTS * g.actuator], g.numbers()) for g in gears]
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""
@@ -112,21 +86,6 @@ class ElasticGearForce(ForceModel):
         if self._device is None:
             self._device = wp.array(self.actuators, dtype=int), wp.array(self.sites, dtype=int)
         force_models.apply_elastic_gear(m, d, *self._device, self.first, values, DAMPING_RATIO, LEAST_DAMPING)
-
-
-class Turn(NamedTuple):
-    """What an elastic gear does in a step."""
-
-    kept: tuple[float, float, float, float]
-    """User data: twist, its rate, and the next rate without the link's velocity, and per velocity."""
-    force: float
-    """To apply on the joint [N m or N]."""
-    servo: float
-    """The servo's force on the rotor, as the actuator sees it [N m or N]."""
-    share: float
-    """S: of the armature, and of the servo unless it is limited."""
-    limited: bool
-    """Whether the servo's force is at a limit: it is then a part of the applied one."""
 
 
 @dataclass(frozen=True)
@@ -205,37 +164,12 @@ class ElasticGear:
         """S, while no limit of the servo's force is reached."""
         return self.spring / (self.inertia + self.spring + self.servo)
 
-    def turned(self, command: float, position: float, velocity: float, last: list[float] | None) -> Turn:
-        """Return what a step does.
-
-        Args:
-            command: Of the servo.
-            position: Of the joint.
-            velocity: Of the joint.
-            last: The user data of the step before; None for the first step, where the twist is at rest.
-        """
-        command = min(max(command, self.lowest), self.highest)
-        constant, by_length, by_rate = self.bias
-        free = self.gain * command + constant + by_length * self.gear * position + by_rate * self.gear * velocity
-        if last is None:
-            carried = self.stiffness * free / (self.kp + self.stiffness)
-            twist, rate = self.gear * min(max(carried, self.weakest), self.strongest) / self.stiffness, 0.0
-        else:
-            rate = last[1] + last[2] - last[3] * velocity
-            twist = last[0] + self.timestep * rate
-        torque = self.stiffness * twist + self.damping * rate
-        back = self.kp * twist + self.kv * rate
-        total = self.inertia + self.spring + self.servo
-        push = self.gear * free - back - torque
-        force = free - (back + self.servo * push / total) / self.gear  # its mean over the step
-        servo = min(max(force, self.weakest), self.strongest)
-        limited = servo != force
-        if limited:
-            total, push = self.inertia + self.spring, self.gear * servo - torque
-        share = self.spring / total
-        follow = (self.inertia + (0.0 if limited else self.implicit)) / total
-        kept = (twist, rate, push * self.timestep / total + follow * velocity, follow)
-        return Turn(kept, torque + share * (push - (0.0 if limited else self.gear * free)), servo, share, limited)
+    def numbers(self) -> list[float]:
+        """Return what a step needs, for `drive_by_spring`."""
+        weak = [self.share * number for number in (self.gain, *self.bias)]
+        command = [self.gear, self.lowest, self.highest, self.weakest, self.strongest, self.gain, *self.bias]
+        inertias = [self.inertia, self.implicit, self.spring, self.servo]
+        return [*command, self.kp, self.kv, self.stiffness, self.damping, *inertias, self.timestep, *weak]
 
 
 def limits_of(limited: bool, bounds: np.ndarray) -> tuple[float, float]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Row, add_load, add_stribeck
 from concent_warp.effects.force_model import ForceModel
 
 if TYPE_CHECKING:
@@ -40,23 +39,13 @@ class StribeckFriction(DofForce):
     """
 
     edits = ("dof_frictionloss",)
+    acts = staticmethod(add_stribeck)
 
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
-
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
-        loss, qvel, qacc, half = m.dof_frictionloss, d.qvel, d.qacc, 0.5 * m.opt.timestep
-        speed = max(float(values[-1]), 1e-6)
-        rows = [(int(i), max(float(extra), 0.0)) for i, extra in zip(self.dof, values[:-1], strict=True)]
-
-        def act() -> None:
-            for i, extra in rows:
-                ratio = (qvel[i] + half * qacc[i]) / speed
-                loss[i] += extra * math.exp(-ratio * ratio)
-
-        return act
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
+        half, speed = 0.5 * float(m.opt.timestep), max(float(values[-1]), 1e-6)
+        every = zip(self.dof, values[:-1], strict=True)
+        return [([int(i)], [max(float(extra), 0.0), half, speed]) for i, extra in every]
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""
@@ -73,21 +62,12 @@ class LoadFriction(DofForce):
     """
 
     edits = ("dof_frictionloss",)
+    acts = staticmethod(add_load)
 
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
-
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
-        loss, motor, weight = m.dof_frictionloss, d.qfrc_actuator, d.qfrc_bias
-        rows = [(int(i), 0.5 * max(float(c), 0.0)) for i, c in zip(self.dof, values, strict=True)]
-
-        def act() -> None:
-            for i, share in rows:
-                loss[i] += share * abs(motor[i] + weight[i])
-
-        return act
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
+        del m
+        return [([int(i)], [0.5 * max(float(c), 0.0)]) for i, c in zip(self.dof, values, strict=True)]
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
+from concent_warp.effects.compiled_forces import Row, pass_play, through_play
 from concent_warp.effects.force_model import ForceModel
 from concent_warp.effects.select import driven_joints
 
@@ -28,36 +28,19 @@ class BacklashForce(ForceModel):
     joint, shape (1,); x is kept in the user data.
     """
 
+    acts = staticmethod(pass_play)
+
     def __init__(self, actuators: np.ndarray, first: int) -> None:
         """Act on position-controlled actuators of single joints, ids of shape (n,); user data begin at `first`."""
         self.actuators = np.asarray(actuators, dtype=np.int32)
         self.first = first
         self._device: wp.array[Any] | None = None
 
-    def apply(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> None:
-        """See `ForceModel.apply`."""
-        self.bound(m, d, values)()
-
-    def bound(self, m: mujoco.MjModel, d: mujoco.MjData, values: np.ndarray) -> Callable[[], None]:
-        """See `ForceModel.bound`."""
+    def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
+        """See `ForceModel.rows`."""
         play = float(values[0])
-        if play <= 0:
-            return lambda: None
-        gears = [Gear.of(m, int(a), play) for a in self.actuators]
-        ctrl, qpos, qvel, kept, applied = d.ctrl, d.qpos, d.qvel, d.userdata, d.qfrc_applied
-        first = self.first
-
-        def act() -> None:
-            begun = d.time > 0
-            for gear in gears:
-                error = min(max(ctrl[gear.actuator], gear.lowest), gear.highest) + gear.offset
-                error += gear.slope * qpos[gear.place]
-                speed = gear.gear * qvel[gear.dof]
-                slot = first + gear.actuator
-                through, kept[slot] = gear.through(error, speed, kept[slot] if begun else None)
-                applied[gear.dof] += through
-
-        return act
+        gears = [Gear.of(m, int(a), play) for a in self.actuators] if play > 0 else []
+        return [([g.actuator, g.place, g.dof, self.first + g.actuator], g.numbers()) for g in gears]
 
     def launch(self, m: mjw.Model, d: mjw.Data, values: wp.array[Any]) -> None:
         """See `ForceModel.launch`."""
@@ -124,23 +107,14 @@ class Gear:
             dt,
         )
 
-    def through(self, error: float, speed: float, ahead: float | None) -> tuple[float, float]:
-        """Return what the play changes of the force on the joint [N m or N], and the rotor's lead after the step.
+    def numbers(self) -> list[float]:
+        """Return what a step needs, for `through_play`."""
+        servo = [self.gear, self.kp, self.kv, self.lowest, self.highest, self.weakest, self.strongest]
+        return [*servo, self.offset, self.slope, self.half, self.fading, self.timestep]
 
-        Args:
-            error: Of the link, as a position.
-            speed: Of the link.
-            ahead: The rotor's lead; None before the first step.
-        """
-        force, half = self.kp * error - self.kv * speed, self.half
-        if ahead is None:
-            ahead = min(max(force / self.kp, -half), half)
-        alone = error + (ahead - error) * self.fading - speed * self.timestep
-        after = min(max(alone, -half), half)
-        share = 0.0 if alone == after else (alone - after) / (alone - ahead)
-        pressed = share * (self.kp * (error - after) - self.kv * speed)
-        change = min(max(pressed, self.weakest), self.strongest) - min(max(force, self.weakest), self.strongest)
-        return self.gear * change, after
+    def through(self, error: float, speed: float, ahead: float | None) -> tuple[float, float]:
+        """Return what `through_play` does; the rotor's lead is None before the first step."""
+        return through_play(self.numbers(), error, speed, ahead is not None, ahead or 0.0)
 
 
 def _limits_of(limited: bool, bounds: np.ndarray) -> tuple[float, float]:
