@@ -191,6 +191,8 @@ def simulate_with_force_models(
         _step_in_python(m, d, ctrl, row_of, force_models, base, result)
     if number[OVERFLOW].any() or number[DIVERGED].any():
         mujoco.mj_resetData(m, d)
+        for records in (result.qpos, result.qvel, result.sensordata):
+            records.fill(np.nan)
         for field, value in base:
             field[:] = value
         d.qpos[:], d.qvel[:], d.userdata[:] = start
