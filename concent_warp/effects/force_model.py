@@ -55,6 +55,8 @@ class ForceModel:
             d: Its data; to be added to: `qfrc_applied` (nv,) [N m or N], `xfrc_applied` (nbody, 6) [N, N m].
             values: Parameters, shape (P,).
         """
+        if self.acts is None and type(self).bound is ForceModel.bound:
+            raise NotImplementedError
         self.bound(m, d, values)()
 
     def rows(self, m: mujoco.MjModel, values: np.ndarray) -> list[Row]:
@@ -65,7 +67,7 @@ class ForceModel:
         """Return `apply` for the steps of one simulation, in Python: constants are looked up once."""
         act = type(self).acts
         if act is None:
-            raise NotImplementedError
+            return lambda: self.apply(m, d, values)
         state, rows = StepState.of(m, d), self.rows(m, values)
 
         def step() -> None:

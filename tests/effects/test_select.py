@@ -338,9 +338,9 @@ def test_force_models_are_equal_where_they_are_of_one_class_and_act_on_the_same(
 
 def test_a_force_model_without_a_kernel_says_so():
     class Wind(ForceModel):
-        def bound(self, m, d, values):
+        def apply(self, m, d, values):
             del m
-            return lambda: d.qfrc_applied.__setitem__(0, values[0])
+            d.qfrc_applied[:] = values
 
     with pytest.raises(EngineError, match=r"Wind cannot run on MuJoCo-Warp.*use the mujoco engine"):
         Wind().launch(*cast("tuple[Any, Any, Any]", (None, None, None)))

@@ -162,11 +162,8 @@ class Needy(Effect):
 
 
 class NoKernel(ForceModel):
-    def bound(self, m, d, values):  # noqa: ARG002
-        def act():
-            d.qfrc_applied[0] += values[0]
-
-        return act
+    def apply(self, m, d, values):  # noqa: ARG002
+        d.qfrc_applied[0] += values[0]
 
 
 class Half(Needy):
