@@ -95,6 +95,9 @@ class SearchCfg:
     data [-]. Empirical."""
     shooting_fits: int = 3
     """Most candidates initialised that way. Empirical."""
+    window_growth: Annotated[float, Bounds(1, above_low=True)] = 1.5
+    """Factor by which windows that cannot be cut grow from one fit to the next, from `shooting_window` on [-]: one more
+    impact at a time. Empirical."""
     doubtful_gain: float = 0.4
     """Best gain below which the baseline is refitted from its rivals' initial states, so that the gain is not owed to
     those alone [-]. Empirical."""
