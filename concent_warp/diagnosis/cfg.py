@@ -108,6 +108,11 @@ class SearchCfg:
     stuck_share: Share = 0.5
     """Share of what a candidate promised below which its fit counts as stuck in a local minimum [-]: linear
     extrapolation is taken to be right to a factor of 2."""
+    scan_step: PositiveShare = 0.25
+    """Step from a scanned value from which no step of a fit lowered the cost, over its distance from the null value
+    [-]. Empirical."""
+    max_scan_steps: Count = 3
+    """Most such steps in one direction, as long as the cost falls. Empirical."""
     polished_stuck: Count = 3
     """Most stuck fits whose initial states are fitted again then. Empirical."""
     reconsidered: Count = 5

@@ -18,6 +18,7 @@ from concent_warp.diagnosis.search.fit_candidate import (
     multiple_shooting_candidate,
     polish_candidate,
     restart_candidate,
+    search_candidate_value,
 )
 from concent_warp.diagnosis.search.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
 from concent_warp.diagnosis.tasks import TaskRunner
@@ -68,6 +69,7 @@ class CandidateFits:
             return self.fits
         added = self._continue_from_first_parts(screened, short_windows)
         expected = np.maximum(np.pad(expected, (0, added)), [c.share(self.base) for c in self.fits])
+        self._search_values()
         best = self._best()
         self._restart_lagging(best, expected)
         self._polish_near(best, expected)
@@ -166,6 +168,17 @@ class CandidateFits:
                 left = [s for s in left if s.expected_gain > needed * best]
                 self.left = [s for s in self.left if s.expected_gain > needed * best]
         return fitted
+
+    def _search_values(self) -> None:
+        """Search the values of candidates near the best whose fits ended at the scanned value where they started."""
+        base, search = self.base, self.search
+        if all(w.smooth for w in base.windows):
+            return
+        least = search.polish_min_gain * self._best().share(base)
+        for k, (c, s) in enumerate(zip(self.fits, self.fitted, strict=True)):
+            near = c.share(base) > least and c.ratio > search.noise_level_ratio
+            if near and s.scanned_gain > 0 and np.array_equal(c.fit.values, s.start):
+                self._refit([k], search_candidate_value, "searching values", s.start, search)
 
     def _restart_lagging(self, best: FittedCandidate, expected: np.ndarray) -> None:
         """Restart candidates that lag behind one that explains the data from its initial states.

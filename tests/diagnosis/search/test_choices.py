@@ -34,6 +34,7 @@ class MadeUp:
     std: Any = None
     confusions: tuple[str, ...] = ()
     errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
+    value: float = 0.0
     source: Any = None
     """The effect, where it must be one object."""
 
@@ -45,7 +46,7 @@ class MadeUp:
     @property
     def fit(self) -> Any:
         """The cost as that of a fit."""
-        return SimpleNamespace(cost=self.cost, of=self.name)
+        return SimpleNamespace(cost=self.cost, of=self.name, values=np.array([self.value]))
 
     def share(self, base: Any) -> float:
         """Return the gain."""
@@ -61,7 +62,7 @@ def made(*values: Any, **more: Any) -> Any:
 def screened(name: str, expected: float, of: tuple[str, ...] = ()) -> Any:
     """Return a screened candidate, by default of an effect by itself; else of one on the elements `of`."""
     effect = SimpleNamespace(name=name if not of else "part", elements=of)
-    return SimpleNamespace(name=name, expected_gain=expected, effect=effect)
+    return SimpleNamespace(name=name, expected_gain=expected, effect=effect, scanned_gain=0.0)
 
 
 def base_of(windows: int = 2, length: float = 1.0, ratio: float = 2.0) -> Any:
@@ -75,7 +76,8 @@ class Tasks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, fits: dict[str, Any]) -> None:
         self.fits, self.done = fits, []
-        for name in ("fit_candidate", "restart_candidate", "polish_candidate", "multiple_shooting_candidate"):
+        kinds = ("fit_candidate", "restart_candidate", "polish_candidate", "multiple_shooting_candidate")
+        for name in (*kinds, "search_candidate_value"):
             monkeypatch.setattr(fit_promising, name, self._task(name.split("_candidate")[0]))
 
     def _task(self, kind: str):
@@ -193,6 +195,26 @@ def test_candidates_of_a_later_call_are_fitted_and_refined_beside_those_of_earli
     assert [d[1] for d in tasks.done if d[0] == "fit"] == ["a", "b"]
     assert seen == [[0.6], [0.6, 0.7]]
     assert [s.name for s in search.fitted] == ["a", "b"]
+
+
+def test_fits_near_the_best_that_ended_at_their_scanned_value_are_searched_from_it(monkeypatch):
+    tasks = Tasks(monkeypatch, {})
+    names = ("best", "near", "moved", "noise", "null", "far")
+    gains = dict(zip(names, (0.8, 0.57, 0.7, 0.7, 0.7, 0.55), strict=True))  # near: more than 0.7 of 0.8
+    fits = [
+        made(n, g, ratio=1.03 if n == "noise" else 1.04, value=2.0 if n == "moved" else 1.0) for n, g in gains.items()
+    ]
+    search = fits_of(fits)
+    search.fitted = [screened(n, 0.5) for n in names]
+    for s in search.fitted:
+        s.start, s.scanned_gain = np.array([1.0]), 0.0 if s.name == "null" else 0.1
+    search._search_values()
+    assert [d[:2] for d in tasks.done] == [("search", "best"), ("search", "near")]
+    tasks.done.clear()
+    for w in search.base.windows:
+        w.smooth = True
+    search._search_values()
+    assert tasks.done == []
 
 
 def test_candidates_that_lag_behind_an_explained_fit_are_restarted(monkeypatch):
