@@ -95,6 +95,9 @@ class SearchCfg:
     data [-]. Empirical."""
     shooting_fits: int = 3
     """Most candidates initialised that way. Empirical."""
+    window_growth: Annotated[float, Bounds(1, above_low=True)] = 1.5
+    """Factor by which windows that cannot be cut grow from one fit to the next, from `shooting_window` on [-]: one more
+    impact at a time. Empirical."""
     doubtful_gain: float = 0.4
     """Best gain below which the baseline is refitted from its rivals' initial states, so that the gain is not owed to
     those alone [-]. Empirical."""
@@ -105,6 +108,11 @@ class SearchCfg:
     stuck_share: Share = 0.5
     """Share of what a candidate promised below which its fit counts as stuck in a local minimum [-]: linear
     extrapolation is taken to be right to a factor of 2."""
+    scan_step: PositiveShare = 0.25
+    """Step from a scanned value from which no step of a fit lowered the cost, over its distance from the null value
+    [-]. Empirical."""
+    max_scan_steps: Count = 3
+    """Most such steps in one direction, as long as the cost falls. Empirical."""
     polished_stuck: Count = 3
     """Most stuck fits whose initial states are fitted again then. Empirical."""
     reconsidered: Count = 5

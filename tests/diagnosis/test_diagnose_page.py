@@ -81,6 +81,13 @@ def test_figures_of_the_procedure_are_those_of_the_settings():
     assert f"that can be touched last {cfg.fits.observation.max_contact_length:g} s at most" in PAGE
     assert f"changes the residuals by more than {cfg.fits.least_squares.max_change:g} x noise is taken again" in PAGE
     assert f"multiple shooting over windows of {cfg.search.shooting_window:g} s" in PAGE
+    assert f"shortened to their first {cfg.search.shooting_window:g} s" in PAGE
+    assert f"the first fits leave more than {cfg.search.explained_ratio:g} x noise, all" in PAGE
+    assert (cfg.search.shooting_fits, cfg.search.shooting_min_gain) == (3, 0.5)
+    assert f"continued as the windows grow by factors of {cfg.search.window_growth:g}" in PAGE
+    assert (cfg.search.scan_step, cfg.search.polish_min_gain) == (0.25, 0.7)
+    assert "moves by quarters of its distance from the null value" in PAGE
+    assert "seven tenths of the best gain" in PAGE
     assert BOUND == 2.0
     assert "bounds of two tolerances" in PAGE
     assert f"at most {cfg.adequate_ratio:g} x noise altogether, and of {cfg.adequate_channel_ratio:g} x" in PAGE

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from concent_warp.diagnosis.cfg import SearchCfg
 from concent_warp.diagnosis.search.baseline import held_out_errors, without_bounded
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
@@ -56,6 +58,43 @@ def polish_candidate(
     if found.fit.polished != fit.polished:
         found = replace(found, fit=replace(found.fit, polished=fit.polished))
     return replace(found, polished=fit.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost)
+
+
+def search_candidate_value(
+    base: FittedModel, candidate: FittedCandidate, start: np.ndarray, cfg: SearchCfg | None = None
+) -> FittedCandidate:
+    """Return the better of a fit that ended where it started, at a scanned value, and a fit from values beyond it.
+
+    Contacts make the cost rough: derivatives lead to the next local minimum of the initial states. The scanned value is
+    therefore moved by larger steps, initial states fitted anew after each, for as long as the cost falls.
+
+    Args:
+        base: The fitted baseline.
+        candidate: The fit.
+        start: Parameters from which it started, shape (P,).
+        cfg: Settings.
+    """
+    cfg, solver = cfg or SearchCfg(), candidate_solver(base, candidate.effect)
+    away = np.where(np.isfinite(start) & np.isfinite(solver.p.start), start - solver.p.start, 0.0)
+    away[: solver.p.owned] = 0.0
+    if not away.any():
+        return candidate
+    best, measured = candidate.fit, [np.zeros_like(o) for o in candidate.fit.offsets]
+    move, _ = solver.solve(best.linear, best.starts, best.offsets, best.values, base.cfg.least_squares.damping)
+    forth = 1.0 if move @ (away / solver.scale) >= 0 else -1.0
+    for direction in (forth, -forth):
+        for _ in range(cfg.max_scan_steps):
+            values = solver.inside(best.values + direction * cfg.scan_step * away)
+            there = solver.improve_initial_states(replace(best, values=values), [measured], noise=0.0, fresh=False)
+            if there.cost >= best.cost:
+                break
+            best = there
+        if best is not candidate.fit:
+            break
+    if best.cost > (1 - cfg.min_cost_fall) * candidate.fit.cost:
+        return candidate
+    fit = solver.fit(best.values, best.offsets, best.starts)
+    return _better(candidate, fitted_candidate(base, candidate.effect, solver, fit))
 
 
 def restart_candidate(

@@ -18,7 +18,9 @@ from concent_warp.diagnosis.search.fit_candidate import (
     multiple_shooting_candidate,
     polish_candidate,
     restart_candidate,
+    search_candidate_value,
 )
+from concent_warp.diagnosis.search.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import in_words
 from concent_warp.effects.effect import Effect
@@ -65,6 +67,9 @@ class CandidateFits:
         expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in pairs])
         if expected.max() < self.cfg.min_gain:  # none explains enough to be accepted, however well it is fitted
             return self.fits
+        added = self._continue_from_first_parts(screened, short_windows)
+        expected = np.maximum(np.pad(expected, (0, added)), [c.share(self.base) for c in self.fits])
+        self._search_values()
         best = self._best()
         self._restart_lagging(best, expected)
         self._polish_near(best, expected)
@@ -164,6 +169,17 @@ class CandidateFits:
                 self.left = [s for s in self.left if s.expected_gain > needed * best]
         return fitted
 
+    def _search_values(self) -> None:
+        """Search the values of candidates near the best whose fits ended at the scanned value where they started."""
+        base, search = self.base, self.search
+        if all(w.smooth for w in base.windows):
+            return
+        least = search.polish_min_gain * self._best().share(base)
+        for k, (c, s) in enumerate(zip(self.fits, self.fitted, strict=True)):
+            near = c.share(base) > least and c.ratio > search.noise_level_ratio
+            if near and s.scanned_gain > 0 and np.array_equal(c.fit.values, s.start):
+                self._refit([k], search_candidate_value, "searching values", s.start, search)
+
     def _restart_lagging(self, best: FittedCandidate, expected: np.ndarray) -> None:
         """Restart candidates that lag behind one that explains the data from its initial states.
 
@@ -219,6 +235,53 @@ class CandidateFits:
         kept = [k for k in chosen if k not in stuck][: search.polished_first]
         self._refit([*kept, *stuck[: search.polished_stuck]], polish_candidate, "refining initial states", search)
 
+    def _continue_from_first_parts(
+        self, screened: Sequence[ScreenedCandidate], short_windows: Callable[[], Sequence[Window]]
+    ) -> int:
+        """Fit candidates over the first part of each window, and continue the best of these fits as windows grow.
+
+        That is for long windows with contacts that cannot be cut into short ones, where no fit explains the data.
+        Returns how many candidates it adds to those that were fitted already.
+        """
+        base, search, length = self.base, self.search, self.search.shooting_window
+        if self._best().ratio < search.explained_ratio or not self._cannot_be_cut(short_windows):
+            return 0
+        tasks = [(base, length)]
+        near = next(iter(self.runner.run_in_time(baseline_of_first_parts, tasks, "fitting the first parts of windows")))
+        if near is None or near.ratio**2 < 1 + self.cfg.min_gain:
+            return 0
+        tasks = [(near, s.effect, search, self.cfg.min_gain) for s in screened]
+        found = self.runner.run_in_time(fit_first_parts, tasks, "fitting the first parts of windows")
+        ranked = sorted(
+            ((c.share(near), s, c) for s, c in zip(screened, found, strict=True) if c is not None),
+            key=lambda row: -row[0],
+        )
+        least = max(self.cfg.min_gain, search.shooting_min_gain * ranked[0][0]) if ranked else 0.0
+        chosen = [(s, c) for share, s, c in ranked if share > least][: search.shooting_fits]
+        tasks = [(base, c, search) for _, c in chosen]
+        added, effects = 0, [c.effect for c in self.fits]
+        for (s, _), c in zip(chosen, self.runner.run_in_time(continue_fit, tasks, "growing windows"), strict=True):
+            if c is None:
+                continue
+            if s.effect in effects:
+                k = effects.index(s.effect)
+                self.fits[k] = min(self.fits[k], c, key=lambda one: one.fit.cost)
+            else:
+                self.fits.append(c)
+                self.fitted.append(s)
+                added += 1
+        return added
+
+    def _cannot_be_cut(self, short_windows: Callable[[], Sequence[Window]]) -> bool:
+        """Return whether there are long windows with contacts, and no short ones since states were not measured."""
+        shortest = 2 * self.search.shooting_window
+        if not any(w.end - w.start >= shortest and not w.smooth for w in self.base.windows):
+            return False
+        try:
+            return any(w.end - w.start >= shortest for w in short_windows())
+        except TimeUpError:
+            return False
+
     def _initialise_by_multiple_shooting(self, short_windows: Callable[[], Sequence[Window]]) -> None:
         """Refit the candidates that explain most from the values of a fit over shorter windows."""
         base, search = self.base, self.search
@@ -227,6 +290,8 @@ class CandidateFits:
         try:
             windows = short_windows()
         except TimeUpError:
+            return
+        if any(w.end - w.start >= 2 * search.shooting_window for w in windows):  # these cannot be cut
             return
         least = search.shooting_min_gain * max(c.share(base) for c in self.fits)
         near = sorted(

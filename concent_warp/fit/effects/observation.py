@@ -149,6 +149,36 @@ class Window:
     """Correction of the predictions for a time step that is too long; None for none."""
 
 
+def first_part(w: Window, length: float) -> Window:
+    """Return the first part of a window, of a length [s]; the window itself where it is no longer.
+
+    A window that begins where the state was not measured cannot be cut into several.
+
+    Raises:
+        RecordingError: Nothing was measured in that part.
+    """
+    if w.end - w.start <= length:
+        return w
+    readings, rows, count = [], [], 0
+    for r in w.readings:
+        inside = r.time <= length + 1e-9
+        if not inside.any():
+            continue
+        here = np.arange(r.rows.start, r.rows.stop)
+        each = len(here) // len(r.time) if r.known is None else r.known.sum(axis=1)
+        here = here[np.repeat(inside, each)]
+        known = None if r.known is None else r.known[inside]
+        kept = slice(count, count + len(here))
+        readings.append(replace(r, rows=kept, time=r.time[inside], value=r.value[inside], known=known))
+        rows.append(here)
+        count += len(here)
+    if not rows:
+        raise RecordingError("nothing was measured at the beginning of a window", expected=f"samples within {length} s")
+    chosen = np.concatenate(rows)
+    defect = None if w.defect is None else replace(w.defect, residual=w.defect.residual[chosen])
+    return replace(w, end=w.start + length, readings=tuple(readings), count=count, clock=w.clock[chosen], defect=defect)
+
+
 def start_spread(
     m: mujoco.MjModel,
     noise: Mapping[str, float],

@@ -34,16 +34,19 @@ class MadeUp:
     std: Any = None
     confusions: tuple[str, ...] = ()
     errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
+    value: float = 0.0
+    source: Any = None
+    """The effect, where it must be one object."""
 
     @property
     def effect(self) -> Any:
         """The effect, by its name."""
-        return SimpleNamespace(name=self.name, confusions=self.confusions)
+        return self.source or SimpleNamespace(name=self.name, confusions=self.confusions)
 
     @property
     def fit(self) -> Any:
         """The cost as that of a fit."""
-        return SimpleNamespace(cost=self.cost, of=self.name)
+        return SimpleNamespace(cost=self.cost, of=self.name, values=np.array([self.value]))
 
     def share(self, base: Any) -> float:
         """Return the gain."""
@@ -59,12 +62,12 @@ def made(*values: Any, **more: Any) -> Any:
 def screened(name: str, expected: float, of: tuple[str, ...] = ()) -> Any:
     """Return a screened candidate, by default of an effect by itself; else of one on the elements `of`."""
     effect = SimpleNamespace(name=name if not of else "part", elements=of)
-    return SimpleNamespace(name=name, expected_gain=expected, effect=effect)
+    return SimpleNamespace(name=name, expected_gain=expected, effect=effect, scanned_gain=0.0)
 
 
 def base_of(windows: int = 2, length: float = 1.0, ratio: float = 2.0) -> Any:
     """Return a baseline with windows of a length [s] and a noise ratio."""
-    cut = [SimpleNamespace(start=0.5, end=0.5 + length)] * windows
+    cut = [SimpleNamespace(start=0.5, end=0.5 + length, smooth=False)] * windows
     return SimpleNamespace(windows=cut, cfg=EffectSolverCfg(), ratio=ratio)
 
 
@@ -73,7 +76,8 @@ class Tasks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, fits: dict[str, Any]) -> None:
         self.fits, self.done = fits, []
-        for name in ("fit_candidate", "restart_candidate", "polish_candidate", "multiple_shooting_candidate"):
+        kinds = ("fit_candidate", "restart_candidate", "polish_candidate", "multiple_shooting_candidate")
+        for name in (*kinds, "search_candidate_value"):
             monkeypatch.setattr(fit_promising, name, self._task(name.split("_candidate")[0]))
 
     def _task(self, kind: str):
@@ -166,8 +170,8 @@ def test_the_search_ends_with_multiple_shooting_where_nothing_explains_the_data(
         Tasks(monkeypatch, {"a": made("a", 0.5, ratio=ratio)})
         search = fits_of([], base_of(ratio=base))
         monkeypatch.setattr(search, "_initialise_by_multiple_shooting", called.append)
-        search.fit([screened("a", 0.9)], 0.1, "windows")
-        assert called == (["windows"] if wanted else [])
+        search.fit([screened("a", 0.9)], 0.1, list)
+        assert called == ([list] if wanted else [])
         called.clear()
 
 
@@ -178,7 +182,7 @@ def test_expected_gains_are_the_larger_of_promise_and_fit(monkeypatch):
     monkeypatch.setattr(search, "_restart_lagging", lambda best, e: seen.append((best.name, e.tolist())))
     monkeypatch.setattr(search, "_polish_near", lambda best, e: seen.append((best.name, e.tolist())))
     monkeypatch.setattr(search, "refit_rivals", lambda e: seen.append(e.tolist()))
-    search.fit([screened("a", 0.4), screened("b", 0.35)], 0.1, ANY)
+    search.fit([screened("a", 0.4), screened("b", 0.35)], 0.1, list)
     assert seen == [("a", [0.5, 0.35]), ("a", [0.5, 0.35]), [0.5, 0.35]]
 
 
@@ -191,6 +195,26 @@ def test_candidates_of_a_later_call_are_fitted_and_refined_beside_those_of_earli
     assert [d[1] for d in tasks.done if d[0] == "fit"] == ["a", "b"]
     assert seen == [[0.6], [0.6, 0.7]]
     assert [s.name for s in search.fitted] == ["a", "b"]
+
+
+def test_fits_near_the_best_that_ended_at_their_scanned_value_are_searched_from_it(monkeypatch):
+    tasks = Tasks(monkeypatch, {})
+    names = ("best", "near", "moved", "noise", "null", "far")
+    gains = dict(zip(names, (0.8, 0.57, 0.7, 0.7, 0.7, 0.55), strict=True))  # near: more than 0.7 of 0.8
+    fits = [
+        made(n, g, ratio=1.03 if n == "noise" else 1.04, value=2.0 if n == "moved" else 1.0) for n, g in gains.items()
+    ]
+    search = fits_of(fits)
+    search.fitted = [screened(n, 0.5) for n in names]
+    for s in search.fitted:
+        s.start, s.scanned_gain = np.array([1.0]), 0.0 if s.name == "null" else 0.1
+    search._search_values()
+    assert [d[:2] for d in tasks.done] == [("search", "best"), ("search", "near")]
+    tasks.done.clear()
+    for w in search.base.windows:
+        w.smooth = True
+    search._search_values()
+    assert tasks.done == []
 
 
 def test_candidates_that_lag_behind_an_explained_fit_are_restarted(monkeypatch):
@@ -340,11 +364,81 @@ def test_fits_that_explain_most_are_initialised_by_multiple_shooting(monkeypatch
     tasks = Tasks(monkeypatch, {})
     fits = [made(n, g, c) for n, g, c in (
         ("a", 0.8, 9.0), ("b", 0.41, 5.0), ("c", 0.4, 1.0), ("d", 0.5, 7.0), ("e", 0.6, 6.0))]  # fmt: skip
-    fits_of(fits, base_of(length=0.8))._initialise_by_multiple_shooting(lambda: ANY)
+    fits_of(fits, base_of(length=0.8))._initialise_by_multiple_shooting(lambda: base_of(length=0.79).windows)
     assert [d[:2] for d in tasks.done] == [("multiple_shooting", n) for n in "bed"]
     tasks.done.clear()
-    fits_of(fits, base_of(length=0.79))._initialise_by_multiple_shooting(lambda: ANY)
+    fits_of(fits, base_of(length=0.79))._initialise_by_multiple_shooting(lambda: base_of(length=0.4).windows)
+    # Windows that cannot be cut would only be fitted again.
+    fits_of(fits, base_of(length=0.8))._initialise_by_multiple_shooting(lambda: base_of(length=0.8).windows)
     assert tasks.done == []
+
+
+def growing(monkeypatch, near: float, gains: dict[str, float]) -> tuple[list[str], Any]:
+    """Stand in for fits over first parts of windows, of which the model leaves some noise ratio.
+
+    Args:
+        monkeypatch: The fixture.
+        near: Noise ratio of the model over these parts.
+        gains: Gain of each candidate there; those that promise too little have none.
+
+    Returns:
+        The names of those whose fits were continued, and which function returns windows that cannot be cut.
+    """
+    continued: list[str] = []
+    parts = base_of(ratio=near)
+
+    def continue_fit(_base: Any, found: Any, _cfg: Any) -> Any:
+        continued.append(found.name)
+        return replace(found, gain=found.gain + 0.1, cost=10.0)
+
+    def fit_first_parts(_near: Any, effect: Any, _cfg: Any, least: float) -> Any:
+        assert least == DiagnoseCfg().min_gain
+        return replace(made(effect.name, gains[effect.name]), source=effect) if effect.name in gains else None
+
+    monkeypatch.setattr(fit_promising, "baseline_of_first_parts", lambda _base, length: (length, parts)[1])
+    monkeypatch.setattr(fit_promising, "fit_first_parts", fit_first_parts)
+    monkeypatch.setattr(fit_promising, "continue_fit", continue_fit)
+    return continued, lambda: base_of(length=0.8).windows
+
+
+def test_the_best_fits_over_first_parts_are_continued_where_windows_cannot_be_cut(monkeypatch):
+    gains = {"a": 0.6, "b": 0.7, "c": 0.3, "d": 0.9, "e": 0.5}  # c has less than half of the best
+    all_of_them = [screened(n, 0.1) for n in "abcdef"]
+    for near, ratio, length, wanted in (
+        (2.0, 1.2, 0.8, "dba"),
+        (1.02, 1.2, 0.8, ""),  # noise alone is left over the first parts
+        (2.0, 1.09, 0.8, ""),  # the data are explained
+        (2.0, 1.2, 0.79, ""),  # no window is long
+    ):
+        continued, windows = growing(monkeypatch, near, gains)
+        search = fits_of(
+            [replace(made("a", 0.3, 20.0, ratio=ratio), source=all_of_them[0].effect)], base_of(length=length)
+        )
+        search.fitted = [all_of_them[0]]
+        added = search._continue_from_first_parts(all_of_them, windows)
+        assert continued == list(wanted)
+        if wanted:
+            assert added == 2
+            assert [(c.name, c.cost) for c in search.fits] == [("a", 10.0), ("d", 10.0), ("b", 10.0)]
+            assert [s.name for s in search.fitted] == ["a", "d", "b"]
+        else:
+            assert added == 0
+    continued, _ = growing(monkeypatch, 2.0, gains)
+    assert not fits_of([made("a", 0.3)])._continue_from_first_parts(all_of_them, lambda: base_of(length=0.5).windows)
+    smooth = base_of()
+    for w in smooth.windows:
+        w.smooth = True
+    assert not fits_of([made("a", 0.3)], smooth)._continue_from_first_parts(all_of_them, ANY)
+    assert continued == []
+
+
+def test_a_fit_that_was_continued_from_first_parts_stays_out_where_the_present_one_is_better(monkeypatch):
+    a = screened("a", 0.1)
+    for cost, kept in ((9.0, 9.0), (11.0, 10.0)):
+        _, windows = growing(monkeypatch, 2.0, {"a": 0.6})
+        search = fits_of([replace(made("a", 0.3, cost), source=a.effect)])
+        assert search._continue_from_first_parts([a], windows) == 0
+        assert [c.fit.cost for c in search.fits] == [kept]
 
 
 def test_the_better_of_two_fits_has_the_lower_cost():

@@ -9,7 +9,13 @@ from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.evidence import indistinguishable
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate, restart_candidate
+from concent_warp.diagnosis.search.fit_candidate import (
+    fit_candidate,
+    fitted_candidate,
+    polish_candidate,
+    restart_candidate,
+    search_candidate_value,
+)
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
 from concent_warp.diagnosis.search.grouping import group_indistinguishable
 from concent_warp.diagnosis.search.joint_fit import refit_jointly
@@ -106,6 +112,43 @@ def test_a_fit_with_wrong_initial_states_recovers_from_those_of_the_best_fit(lac
     assert cost > 1.1 * right.fit.cost
     stuck = replace(right, fit=replace(right.fit, offsets=astray, cost=cost, linear=linear))
     assert restart_candidate(lacking, stuck, right.fit).fit.cost < 1.01 * right.fit.cost
+
+
+def at_value(base, name, value):
+    """Return a fit of an effect at a value, at the baseline's initial states."""
+    solver = base.solver(effect(name))
+    values = np.array([value])
+    linear = solver.linearise(values, base.fit.offsets)
+    cost = solver.cost([piece.residual for piece in linear], base.fit.offsets, values)
+    fit = replace(base.fit, values=values, linear=linear, cost=cost)
+    return fitted_candidate(base, effect(name), solver, fit)
+
+
+@pytest.mark.parametrize(("start", "reached"), [(0.8, 1.0), (0.6, 1.05), (1.2, 0.9), (2.0, 1.0)])
+def test_a_fit_that_no_step_improves_is_searched_from_its_scanned_value_on(lacking, monkeypatch, start, reached):
+    stuck = at_value(lacking, "joint_damping", start * DAMPING)
+    begun = []
+
+    def stays(self, values, offsets, starts):  # as where the cost is rough
+        begun.append(values / DAMPING)
+        linear = self.linearise(values, offsets)
+        cost = self.cost([piece.residual for piece in linear], offsets, values)
+        return replace(stuck.fit, values=values, offsets=tuple(offsets), starts=starts, linear=linear, cost=cost)
+
+    monkeypatch.setattr(Solver, "fit", stays)
+    found = search_candidate_value(lacking, stuck, stuck.fit.values)
+    assert found.fit.cost < 0.99 * stuck.fit.cost
+    assert begun == [pytest.approx([reached])]
+    assert found.fit.values == pytest.approx([reached * DAMPING])
+    monkeypatch.undo()
+    assert search_candidate_value(lacking, stuck, stuck.fit.values).fit.values[0] == pytest.approx(DAMPING, rel=0.03)
+
+
+def test_a_fit_at_the_best_value_or_at_the_null_value_is_not_searched(lacking):
+    right = fit_candidate(lacking, screen(lacking, effect("joint_damping")))
+    assert search_candidate_value(lacking, right, right.fit.values) is right
+    null = at_value(lacking, "joint_damping", 0.0)
+    assert search_candidate_value(lacking, null, null.fit.values) is null
 
 
 def test_an_effect_that_is_not_missing_gains_no_more_than_the_null_distribution(complete):
