@@ -142,11 +142,11 @@ def fit_effects(
     report = progress or _silent
     robust, noise = cfg.least_squares.robust, channel_noises(model, recording, cfg.observation)
     report(0.0, "cutting windows")
-    begun = _begin(model, recording, noise, cfg, engine, report)
+    begun = _begin(model, recording, noise, cfg, engine)
     scale = cfg.raised_noise.scale(noise_ratio(np.concatenate(begun.residuals)), model.compile())
     if scale > 1:
         report(0.1, "cutting windows, the model's own error in the place of the noise")
-        begun = _begin(model, recording, {channel: scale * std for channel, std in noise.items()}, cfg, engine, report)
+        begun = _begin(model, recording, {channel: scale * std for channel, std in noise.items()}, cfg, engine)
     windows, solver, given = begun.windows, begun.solver, begun.residuals
     start, offsets, starts = solver.p.start, begun.offsets, begun.starts
     report(0.3, "trial values")
@@ -190,12 +190,7 @@ class _Begun(NamedTuple):
 
 
 def _begin(
-    model: Model,
-    recording: Recording,
-    noise: Mapping[str, float],
-    cfg: FitEffectsCfg,
-    engine: EngineName,
-    report: Callable[[float, str], None],
+    model: Model, recording: Recording, noise: Mapping[str, float], cfg: FitEffectsCfg, engine: EngineName
 ) -> _Begun:
     """Cut windows for a noise of each channel, and fit their initial states."""
     windows = observe(
@@ -203,7 +198,6 @@ def _begin(
     )
     solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
     check_finite(solver.p, model.scene.source)
-    report(0.1, "initial states")
     offsets, starts = solver.fit_initial_states(solver.p.start, [np.zeros(len(w.spread)) for w in windows])
     return _Begun(windows, solver, offsets, starts, _residuals_at(solver, solver.p.start, offsets, starts))
 
