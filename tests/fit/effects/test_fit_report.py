@@ -285,12 +285,11 @@ def test_channels_are_listed_by_their_residual_before_the_fit():
     ]
     before = [np.array([1.0, -1.0, 2.0, 2.0, 2.0]), np.array([4.0, 9.0, 9.0])]
     after = [np.array([0.5, -0.5, 1.0, 1.0, 1.0]), np.array([1.0, 3.0, -3.0])]
-    assert _by_channel(windows, before, after, 1.0) == (
+    assert _by_channel(windows, before, after) == (
         ChannelError("c", 9.0, 3.0),
         ChannelError("b", np.sqrt(28 / 4), 1.0),
         ChannelError("a", 1.0, 0.5),
     )
-    assert [c.before for c in _by_channel(windows, before, after, 4.0)] == [36.0, 4 * np.sqrt(28 / 4), 4.0]
 
 
 def test_the_fall_is_the_share_of_the_squared_residual():
