@@ -43,6 +43,11 @@ class SearchCfg:
     far_ratio: Positive = 20.0
     """Noise ratio of the model as given beyond which the search begins with shorter windows [-]: over long ones, a
     motion so far off is no longer in proportion to an effect's size, and fits end in local minima. Empirical."""
+    contact_ratio: Positive = 3.0
+    """What the model as given leaves, in units of the standard deviation of fits [-], where it is off by more than
+    `far_ratio` x noise and a body moves freely that can be touched: the noise is raised for the fits until no more is
+    left. Errors of contact models are rough: in units of a noise far below them, windows would be too short to show
+    friction, and finite differences would measure jumps. Empirical."""
     coarse_windows: tuple[PositiveDuration, ...] = (2.0, 0.5)
     """Lengths of these windows [s], the first that reduces the noise ratio below `far_ratio`, else the last.
     Empirical."""

@@ -60,7 +60,7 @@ from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.fit import check_finite
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.fit.effects.observation import Window
-from concent_warp.fit.effects.observe import channel_noises, observe
+from concent_warp.fit.effects.observe import channel_noises, has_touchable_free_body, observe
 from concent_warp.fit.effects.prediction import Prediction
 from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
@@ -325,11 +325,11 @@ class Procedure:
         given = Prediction(self.model, (), windows, engine=self.engine, cfg=fits.prediction)
         check_finite(given, self.model.scene.source)
         found = self._refitted(self.model, windows)
-        scale = fits.raised_noise.scale(found.noise_ratio, self.model.compile())
-        if scale <= 1:
+        search = self.cfg.search
+        if found.noise_ratio <= search.far_ratio or not has_touchable_free_body(self.model.compile()):
             return found
         self.runner.progress(0.06, "fitting the model as given, its own error in the place of the noise")
-        self.noise_scale = scale
+        self.noise_scale = found.noise_ratio / search.contact_ratio
         return self._refitted(self.model, self._windows(self.model, self.cfg.window))
 
     def _windows(self, model: Model, length: float | None) -> Sequence[Window]:

@@ -18,7 +18,6 @@ from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.diagnosis.tasks import TaskRunner
-from concent_warp.fit.effects import cfg as solver_settings
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.recording.recording import Channel
@@ -697,7 +696,7 @@ def test_the_error_of_a_model_far_off_takes_the_place_of_the_noise_where_a_free_
     (window, *_) = windows_of(RECORDING)
     monkeypatch.setattr(module, "channel_noises", lambda *_: {"angle": 0.002, "place": 0.01})
     monkeypatch.setattr(module, "observe", observed)
-    monkeypatch.setattr(solver_settings, "has_touchable_free_body", lambda _: touchable)
+    monkeypatch.setattr(module, "has_touchable_free_body", lambda _: touchable)
     monkeypatch.setattr(made, "_refitted", refitted)
     assert made.baseline().scales == pytest.approx([scale])
     assert made.noise_scale == pytest.approx(scale)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from concent_warp.fit.effects.intervals import (
 )
 from concent_warp.fit.effects.least_squares import Fit, Linear, Solver, projected
 from concent_warp.fit.effects.observation import Window
-from concent_warp.fit.effects.observe import channel_noises, observe
+from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.fit.effects.robust import huber_limit, robust_noise_ratio
 from concent_warp.model import Model
@@ -140,15 +139,15 @@ def fit_effects(
     if not model.effects:
         raise ModelError("the model has no effects to fit", where=model.scene.source, fix="add one")
     report = progress or _silent
-    robust, noise = cfg.least_squares.robust, channel_noises(model, recording, cfg.observation)
     report(0.0, "cutting windows")
-    begun = _begin(model, recording, noise, cfg, engine)
-    scale = cfg.raised_noise.scale(noise_ratio(np.concatenate(begun.residuals)), model.compile())
-    if scale > 1:
-        report(0.1, "cutting windows, the model's own error in the place of the noise")
-        begun = _begin(model, recording, {channel: scale * std for channel, std in noise.items()}, cfg, engine)
-    windows, solver, given = begun.windows, begun.solver, begun.residuals
-    start, offsets, starts = solver.p.start, begun.offsets, begun.starts
+    windows = observe(model, recording, length=cfg.window, engine=engine, seed=cfg.seed, cfg=cfg.observation)
+    robust = cfg.least_squares.robust
+    solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
+    check_finite(solver.p, model.scene.source)
+    report(0.1, "initial states")
+    start = solver.p.start
+    offsets, starts = solver.fit_initial_states(start, [np.zeros(len(w.spread)) for w in windows])
+    given = _residuals_at(solver, start, offsets, starts)
     report(0.3, "trial values")
     chosen = _best_start(solver, start, offsets, starts, cfg)
     fit = solver.fit(chosen, offsets, starts, lambda share: report(0.3 + 0.5 * share, "fitting"))
@@ -159,47 +158,21 @@ def fit_effects(
     report(1.0, "done")
     parameters, correlation = _fitted_parameters(solver, fit, linear, windows, cfg)
     remarks = _remarks(solver, fit, parameters, correlation, cfg)
-    before, after = scale * noise_ratio(np.concatenate(given)), scale * noise_ratio(np.concatenate(found))
-    if scale * robust_noise_ratio(found, robust) > max(scale * robust_noise_ratio(given, robust), cfg.noise_ratio):
+    before, after = noise_ratio(np.concatenate(given)), noise_ratio(np.concatenate(found))
+    if robust_noise_ratio(found, robust) > max(robust_noise_ratio(given, robust), cfg.noise_ratio):
         remarks.insert(0, f"The fit ended no better than it began ({after:.3g} x noise, {before:.3g} before).")
     fitted = FittedEffects(
         solver.p.model(fit.values, [(q.low, q.high) for q in parameters]),
         tuple(tuple(parameters[part]) for part in solver.p.split),
         before,
         after,
-        _by_channel(windows, given, found, scale),
+        _by_channel(windows, given, found),
         fit.converged,
         tuple(remarks),
     )
     if out is not None:
         fitted.model.save(out)
     return fitted
-
-
-class _Begun(NamedTuple):
-    """A fit before its first step."""
-
-    windows: Sequence[Window]
-    solver: Solver
-    offsets: Sequence[np.ndarray]
-    """Of the initial states."""
-    starts: tuple[np.ndarray, ...]
-    """Sensitivities to these."""
-    residuals: list[np.ndarray]
-    """With the values that the model came with."""
-
-
-def _begin(
-    model: Model, recording: Recording, noise: Mapping[str, float], cfg: FitEffectsCfg, engine: EngineName
-) -> _Begun:
-    """Cut windows for a noise of each channel, and fit their initial states."""
-    windows = observe(
-        model, recording, length=cfg.window, noise=noise, engine=engine, seed=cfg.seed, cfg=cfg.observation
-    )
-    solver = Solver(Prediction(model, (), windows, engine=engine, cfg=cfg.prediction), cfg.least_squares)
-    check_finite(solver.p, model.scene.source)
-    offsets, starts = solver.fit_initial_states(solver.p.start, [np.zeros(len(w.spread)) for w in windows])
-    return _Begun(windows, solver, offsets, starts, _residuals_at(solver, solver.p.start, offsets, starts))
 
 
 def _silent(share: float, text: str) -> None:
@@ -320,15 +293,13 @@ def _remarks(
 
 
 def _by_channel(
-    windows: Sequence[Window], before: Sequence[np.ndarray], after: Sequence[np.ndarray], scale: float
+    windows: Sequence[Window], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
 ) -> tuple[ChannelError, ...]:
-    """Return the residual over noise of each channel, largest first; residuals are in units of `scale` x noise."""
+    """Return the residual over noise of each channel, largest first."""
     names = dict.fromkeys(r.channel for w in windows for r in w.readings)
     found = []
     for name in names:
         rows = [(k, r.rows) for k, w in enumerate(windows) for r in w.readings if r.channel == name]
-        first, last = (
-            scale * noise_ratio(np.concatenate([residuals[k][s] for k, s in rows])) for residuals in (before, after)
-        )
+        first, last = (noise_ratio(np.concatenate([residuals[k][s] for k, s in rows])) for residuals in (before, after))
         found.append(ChannelError(name, first, last))
     return tuple(sorted(found, key=lambda c: -c.before))
