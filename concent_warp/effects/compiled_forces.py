@@ -1,7 +1,7 @@
 """Force models as machine code: functions that act on MuJoCo's arrays, each on one element by a row of numbers.
 
 C MuJoCo calls nothing of ours between the parts of a step, so a force model has to act between steps. In Python that
-costs up to ten times what the step of a small robot takes. Numba compiles the same lines in some seconds, once for an
+costs more than the step of a small robot. Numba compiles the same lines in some seconds, once for an
 installation; where it is not installed, they run as they stand.
 """
 

@@ -74,22 +74,19 @@ def test_compiled_steps_find_what_python_finds_to_the_last_bit(names, monkeypatc
     assert np.ptp(compiled.qpos[:, -1, 0]) > 1e-4
 
 
-def test_a_smooth_force_on_a_joint_acts_compiled_as_in_python():
+def test_a_smooth_force_on_a_joint_acts_compiled_as_in_python(monkeypatch):
     force_model = UnknownJointForce(
         np.array([0]), np.array([1]), np.array([[-1.0, 0.0, 1.0]]), np.array([0.5]), moving=True
     )
-    values = np.array([0.3, 0.0, -0.4])
-    assert can_step([(force_model, values)])
-    m = mujoco.MjModel.from_xml_string(ROBOT)
-    d = mujoco.MjData(m)
-    d.qvel[0] = 0.6
-    force_model.apply(m, d, values)
-    table = [(compiled_forces.FORCES.index(force_model.acts), *row) for row in force_model.rows(m, values)]
-    found = d.qfrc_applied.copy()
-    expected = 0.5 * (0.3 * np.exp(-0.5 * 1.6**2) - 0.4 * np.exp(-0.5 * 0.4**2))
-    assert found.tolist() == [0.0, pytest.approx(expected)]
-    assert {kind for kind, _, _ in table} == {4}
-    assert len(table) == 2
+    values = np.array([[0.3, 0.0, -0.4], [0.0, 0.0, 0.0]])
+    assert can_step([(force_model, values[0])])
+    engine = MujocoEngine(Model(Scene(ROBOT)), threads=1)
+    variants = Variants(2, qpos=np.array([[0.3, -0.2]] * 2), force_models=((force_model, values),))
+    compiled = engine.run(variants, np.zeros((1, STEPS, 2)), bodies=[])
+    monkeypatch.setattr(mujoco_engine, "can_step", lambda _: False)
+    python = engine.run(variants, np.zeros((1, STEPS, 2)), bodies=[])
+    np.testing.assert_array_equal(compiled.qpos, python.qpos)
+    assert np.abs(compiled.qpos[0, -1] - compiled.qpos[1, -1]).max() > 1e-3
 
 
 def test_a_diverging_simulation_is_reported_as_without_compiling():
