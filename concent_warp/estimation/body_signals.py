@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.local_polynomial import LocalPolynomialCfg
-from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame_channel, measured_pose, observed_poses
+from concent_warp.estimation.object_tracks import BodyTarget, body_target, frame_channel, observed_poses
 from concent_warp.estimation.signals import MeasuredBody, OrientationSignal, Signal
 from concent_warp.estimation.smoothing_spline import SmoothingSplineCfg
 from concent_warp.recording.recording import Channel
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from concent_warp.scene.scene import Scene
 
 SENSOR = mujoco.mjtSensor
+POSE_SENSORS = (SENSOR.mjSENS_FRAMEPOS, SENSOR.mjSENS_FRAMEQUAT)
+"""Sensors of a body's position and orientation, each with readings at times of its own."""
 
 
 def polynomial_bodies(
@@ -57,20 +59,15 @@ def _polynomial_signals(
     scene: Scene, demonstration: Demonstration, body: str, cfg: LocalPolynomialCfg, qpos: np.ndarray
 ) -> tuple[Signal, OrientationSignal] | None:
     """Return position and orientation of a body; None if it was not measured."""
-    pose = measured_pose(scene.model, demonstration, body)
-    if pose is not None and body not in demonstration.points:
-        time, position, rotation = pose
-        valid = np.flatnonzero(np.isfinite(position).all(axis=1))
-        time, position = time[valid], position[valid]
-        quaternion = rotation.as_quat(scalar_first=True)[valid]
-    else:
+    place, turned = (frame_channel(scene.model, demonstration, body, kind) for kind in POSE_SENSORS)
+    if place is None or turned is None or body in demonstration.points:
         target = body_target(scene, demonstration, body, qpos)
         if target is None:
             return None
         time, position, quaternion = _tracked_pose(target)
+        place, turned = Channel(time, position), Channel(time, quaternion)
     linear, angular = _velocity_channels(scene.model, demonstration, body)
-    signal = cfg.signal(Channel(time, position), linear)
-    orientation = cfg.orientation(Channel(time, quaternion), angular)
+    signal, orientation = cfg.signal(place, linear), cfg.orientation(turned, angular)
     return None if signal is None or orientation is None else (signal, orientation)
 
 

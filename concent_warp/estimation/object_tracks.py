@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.checks import Count
 from concent_warp.errors import RecordingError
@@ -128,16 +128,20 @@ def _resting_mean(points: np.ndarray, rest_displacement: float) -> np.ndarray:
 def measured_pose(
     model: mujoco.MjModel, demonstration: Demonstration, body: str
 ) -> tuple[np.ndarray, np.ndarray, Rotation] | None:
-    """Return times [s], positions [m] (T, 3) and rotations of a body's frame, from its pose sensors; None without."""
+    """Return times [s], positions [m] (T, 3) and rotations of a body's frame, from its pose sensors; None without.
+
+    Times are those of the positions. Orientations that were read at other times are interpolated, along the shorter
+    way; before the first and after the last one they stay.
+    """
     position = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEPOS)
     orientation = frame_channel(model, demonstration, body, mujoco.mjtSensor.mjSENS_FRAMEQUAT)
     if position is None or orientation is None:
         return None
     valid = np.isfinite(orientation.value).all(axis=1)
-    turn = Rotation.from_quat(orientation.value[valid], scalar_first=True)
-    time, value = position.time, position.value
-    nearest = np.abs(time[:, None] - orientation.time[valid][None, :]).argmin(axis=1)
-    return time, value, turn[nearest]
+    turn, clock = Rotation.from_quat(orientation.value[valid], scalar_first=True), orientation.time[valid]
+    time = position.time
+    rotation = Slerp(clock, turn)(np.clip(time, clock[0], clock[-1])) if len(clock) > 1 else turn[[0] * len(time)]
+    return time, position.value, rotation
 
 
 def frame_channel(
