@@ -36,7 +36,7 @@ CORES = 2
 """Processes of a diagnosis."""
 SECONDS = 300.0
 """Duration of a diagnosis from which on it counts as wrong [s]: 5 minutes on two cores."""
-LEFT_OUT = ("where", "detectable", "next_experiment", "versions", "effects")
+LEFT_OUT = ("where", "detectable", "next_experiment", "versions")
 """Entries of a diagnosis that no score needs."""
 
 
@@ -106,7 +106,7 @@ def study(case: DataSet, limit: float = SECONDS, cores: int = CORES) -> dict[str
     result["processor_seconds"] = processor_seconds() - spent
     result["megabytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     if found is not None:
-        result |= _slim(found, {t.effect for t in data.truth})
+        result |= _slim(found)
         result["held_out"] = held_out_errors(found, data)
     return result
 
@@ -134,12 +134,9 @@ def limited(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _slim(found: Diagnosis, hidden: set[str]) -> dict[str, Any]:
-    """Return a diagnosis in plain types, of the effects only those accepted or hidden."""
-    whole = found.to_json()
-    kept = {key: value for key, value in whole.items() if key not in LEFT_OUT}
-    kept["effects"] = [e for e in whole["effects"] if e["accepted"] or e["name"].split("(")[0] in hidden]
-    return kept
+def _slim(found: Diagnosis) -> dict[str, Any]:
+    """Return a diagnosis in plain types, without what no score needs."""
+    return {key: value for key, value in found.to_json().items() if key not in LEFT_OUT}
 
 
 def held_out_errors(found: Diagnosis, data: Data) -> dict[str, Any]:
