@@ -103,6 +103,9 @@ class Effect:
     formula_error: ClassVar[float] = 0.0
     """Standard deviation of the effect's size between repeated measurements, relative to it [-]: by how much what the
     formula leaves out (wear, temperature, place) changes its parameters. Part of their intervals."""
+    null_error: ClassVar[float] = 0.0
+    """Standard deviation of the null values relative to them [-]: by how much the model's own values of the quantity
+    are uncertain, where it is no constant of the bodies. Part of the intervals."""
     part_of: ClassVar[str] = ""
     """Name of the effect that is the same quantity without a tolerance, for a nominal value."""
     engines: ClassVar[tuple[str, ...]] = ("mujoco", "warp")

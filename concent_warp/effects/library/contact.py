@@ -169,6 +169,7 @@ class ContactCompliance(SurfaceEffect):
     source = f"MuJoCo's solref ({MUJOCO})"
     signature = "height of rebounds; sinking in at rest and at impacts"
     confusions = ("size", "adhesion", "air_drag")
+    null_error = 0.025  # rebounds of one ball from one floor scatter by 2 to 3 %
     requirement = "bodies that collide, where their contacts and those of all that stands still have a time constant"
 
     def applies_to(self, m: mujoco.MjModel, i: int) -> bool:

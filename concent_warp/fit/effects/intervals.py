@@ -92,11 +92,12 @@ def formula_errors(
     """Return standard deviations of an effect's values due to its formula, in the units of these, shape (P,).
 
     Those of `discretisation_errors`, together with `Effect.formula_error` times each parameter's difference from its
-    null value.
+    null value, and `Effect.null_error` times that.
     """
     null = np.array([p.null if np.isfinite(p.null) else 0.0 for p in parameters])
     own = np.where(np.isfinite(values), np.abs(values - null), 0.0)
-    return np.hypot(discretisation_errors(parameters, values, discretisation_error), effect.formula_error * own)
+    form = np.hypot(effect.formula_error * own, effect.null_error * null)
+    return np.hypot(discretisation_errors(parameters, values, discretisation_error), form)
 
 
 def discretisation_errors(parameters: Sequence[Parameter], values: np.ndarray, relative_error: float) -> np.ndarray:

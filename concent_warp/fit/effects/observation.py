@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated
 
 import mujoco
 import numpy as np
 
-from concent_warp.checks import Count, Positive, PositiveDuration
+from concent_warp.checks import Bounds, Count, Positive, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState, partial_state
 from concent_warp.estimation.state_estimator import StateEstimator
@@ -57,8 +58,12 @@ class ObservationCfg:
     """Pairs of simulations from opposite errors of the initial state, from which the length of windows is chosen [-].
     Empirical."""
     max_curvature: Positive = 3.0
-    """Deviation of the mean of such a pair from the simulation without an error, over the noise, at which a window ends
-    [-]: beyond it, the effect of an error is no longer in proportion to it. Empirical."""
+    """Deviation of the mean of such a pair from the simulation without an error, over the noise and the numerical
+    scatter, at which a window ends [-]: beyond it, the effect of an error is no longer in proportion to it.
+    Empirical."""
+    max_scatter_noise: Positive = 5.0
+    """Largest numerical scatter that is taken into account there, over the noise [-]: chaotic motion scatters without
+    limit. Empirical."""
     max_scatter: float = 2.0
     """Scatter of the samples about a smooth motion over its median below which a window may start [-]: it is larger at
     impacts, where velocities are unknown. Empirical."""
@@ -66,10 +71,19 @@ class ObservationCfg:
     """Shortest window [s]. Empirical."""
     max_length: PositiveDuration = 20.0
     """Longest window [s], for the simulations' memory."""
-    max_contact_length: PositiveDuration = 0.5
+    max_contact_length: PositiveDuration = 2.0
     """Longest window of a body that moves freely and can be touched [s]: contacts that are made and broken give a long
     window's cost many local minima, in which errors of its initial state stand in for a wrong friction or mass
     (multiple shooting: Bock 1983). Long enough for a fall of a metre."""
+    scatter_samples: Annotated[int, Bounds(0, 10_000, excluded=1)] = 16
+    """Simulations from which the numerical scatter of a window's predictions is estimated [-], see `NumericalScatter`;
+    0 for none."""
+    scatter_offset: Positive = 0.02
+    """Standard deviation of the differences of their initial states, in units of the states' spread [-]: small beside
+    what is fitted, large enough to shift the instant of each later impact within a time step."""
+    min_scatter: Positive = 0.1
+    """Standard deviation along a direction of the residuals below which scatter is neglected [-]: a hundredth of the
+    noise's variance."""
     default_position_noise: Positive = 1e-3
     """Noise of positions for which it is neither stated nor estimable [m or rad]: of a typical motion capture."""
     default_noise: Positive = 1e-2
@@ -118,6 +132,41 @@ class TimeStepDefect:
 
 
 @dataclass(frozen=True)
+class NumericalScatter:
+    """Scatter of a window's predictions over the phase of the time grid, in units of noise.
+
+    A simulated contact begins at a step of the time grid, up to one step after bodies meet; the impulse, and what
+    follows, depends on where between two steps they meet. No measurement can tell: what it changes is an error of the
+    simulation that counts as noise, correlated over the rest of the window.
+    """
+
+    deviations: np.ndarray = field(repr=False)
+    """Deviations of the residuals, shape (count, K); their covariance is `deviations @ deviations.T`."""
+
+    def whitened(self, residual: np.ndarray) -> np.ndarray:
+        """Return residuals (count,) in units of noise and scatter: (I + D D')^(-1/2) r."""
+        return self._scaled(residual, -0.5)
+
+    def in_noise(self, whitened: np.ndarray) -> np.ndarray:
+        """Return whitened residuals (count,) in units of noise alone: (I + D D')^(1/2) r."""
+        return self._scaled(whitened, 0.5)
+
+    def rows(self, chosen: np.ndarray) -> NumericalScatter:
+        """Return the scatter of some of the residuals, by their indices."""
+        return NumericalScatter(self.deviations[chosen])
+
+    @cached_property
+    def _directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal directions (count, K) of the deviations, and the variances along them (K,)."""
+        directions, size, _ = np.linalg.svd(self.deviations, full_matrices=False)
+        return directions, size**2
+
+    def _scaled(self, residual: np.ndarray, power: float) -> np.ndarray:
+        directions, variance = self._directions
+        return residual + directions @ (((1 + variance) ** power - 1) * (directions.T @ residual))
+
+
+@dataclass(frozen=True)
 class Window:
     """A span of a demonstration that is simulated in one go."""
 
@@ -147,6 +196,8 @@ class Window:
     """Whether the state at the start is as the instruments show it, and not the true one."""
     defect: TimeStepDefect | None = None
     """Correction of the predictions for a time step that is too long; None for none."""
+    scatter: NumericalScatter | None = None
+    """Numerical scatter of the predictions; None for none."""
 
 
 def first_part(w: Window, length: float) -> Window:
@@ -173,7 +224,16 @@ def first_part(w: Window, length: float) -> Window:
         return w
     chosen = np.concatenate(rows)
     defect = None if w.defect is None else replace(w.defect, residual=w.defect.residual[chosen])
-    return replace(w, end=w.start + length, readings=tuple(readings), count=count, clock=w.clock[chosen], defect=defect)
+    scatter = None if w.scatter is None else w.scatter.rows(chosen)
+    return replace(
+        w,
+        end=w.start + length,
+        readings=tuple(readings),
+        count=count,
+        clock=w.clock[chosen],
+        defect=defect,
+        scatter=scatter,
+    )
 
 
 def start_spread(

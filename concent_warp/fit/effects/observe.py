@@ -20,6 +20,8 @@ from concent_warp.fit.effects.observation import (
     first_time,
     start_spread,
 )
+from concent_warp.fit.effects.prediction import turn
+from concent_warp.fit.effects.scatter import with_scatter
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
@@ -127,7 +129,9 @@ def observe(
             start = end
     if not windows:
         raise RecordingError("nothing was measured that a model could be compared with", where=recording.source)
-    return [replace(w, smooth=True) for w in windows] if moves_untouched(model, windows, engine) else windows
+    if moves_untouched(model, windows, engine):
+        return [replace(w, smooth=True) for w in windows]
+    return with_scatter(model, windows, engine, cfg)
 
 
 def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName) -> bool:
@@ -172,37 +176,49 @@ def keeps_close(
     span = min(last - start, cfg.max_length)
     steps = max(int(np.ceil(span / m.opt.timestep)), 1)
     state = source.state(d, start)
-    qpos, qvel = state.qpos, state.qvel
     noise = {c: source.noise[c] for c in source.noise if c in d.measured}
     spread = start_spread(m, noise, cfg) / cfg.state_noise
     rng = np.random.default_rng(seed)
-    n = 2 * cfg.probe_pairs + 1
-    positions, velocities = np.tile(qpos, (n, 1)), np.tile(qvel, (n, 1))
-    for i in range(1, n, 2):
+    offsets = [np.zeros(2 * m.nv)]
+    for _ in range(cfg.probe_pairs):
         offset = rng.normal(size=2 * m.nv) * spread
-        for row, sign in ((i, 1.0), (i + 1, -1.0)):
-            mujoco.mj_integratePos(m, positions[row], sign * offset[: m.nv], 1.0)
-            velocities[row] += sign * offset[m.nv :]
+        offsets += [offset, -offset]
+    near = len(offsets)
+    offsets += list(cfg.scatter_offset * cfg.state_noise * spread * rng.normal(size=(cfg.probe_pairs, 2 * m.nv)))
+    positions, velocities = np.tile(state.qpos, (len(offsets), 1)), np.tile(state.qvel, (len(offsets), 1))
+    for row, offset in enumerate(offsets):
+        mujoco.mj_integratePos(m, positions[row], offset[: m.nv], 1.0)
+        velocities[row] += offset[m.nv :]
     every = max(int(0.01 / m.opt.timestep), 1)
     record = np.arange(0, steps + 1, every)
     simulator = make_engine(engine, source.model)
-    ctrl = commands(m, d, steps, start)
-    rollout = simulator.run(Variants(n, qpos=positions, qvel=velocities), ctrl, record=record, bodies=[]).numpy()
+    variants = Variants(len(offsets), qpos=positions, qvel=velocities)
+    rollout = simulator.run(variants, commands(m, d, steps, start), record=record, bodies=[]).numpy()
     curved = np.zeros(len(record))
     for name, std in noise.items():
         row = m.sensor(name).id
         address, dim = m.sensor_adr[row], m.sensor_dim[row]
         value = rollout.sensordata[:, :, address : address + dim]
-        if dim == 4:
-            value = np.where((value * value[:1]).sum(axis=2, keepdims=True) < 0, -value, value)
-        second = np.linalg.norm(value[1::2] + value[2::2] - 2 * value[:1], axis=2) / 2
-        size = (2.0 if dim == 4 else 1.0) / (std * np.sqrt(dim))
-        with np.errstate(invalid="ignore"):  # inf - inf between two samples that diverge
-            bend = np.quantile(size * second, 0.8, axis=0)
-        curved = np.maximum(curved, np.nan_to_num(bend, nan=np.inf))
+        away = np.stack([_away(value[0], one, turns=dim == 4) for one in value]) / std
+        # inf - inf between two samples that diverge
+        with np.errstate(invalid="ignore"):
+            bend = np.quantile(_rms(away[1:near:2] + away[2:near:2]) / 2, 0.8, axis=0)
+            scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0))
+        scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
+        curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
     wild = np.flatnonzero(curved > cfg.max_curvature)
     reach = span if not len(wild) else float(record[wild[0]] * m.opt.timestep)
     return float(np.clip(reach, cfg.min_length, span))
+
+
+def _away(start: np.ndarray, end: np.ndarray, *, turns: bool) -> np.ndarray:
+    """Return differences of readings (T, dim), rotation vectors (T, 3) where these are orientations."""
+    return turn(start, end) if turns else end - start
+
+
+def _rms(value: np.ndarray) -> np.ndarray:
+    """Return the root mean square over the last axis."""
+    return np.sqrt((value**2).mean(axis=-1))
 
 
 def _calmest(measured: StateEstimator, start: float, reach: float, cfg: ObservationCfg) -> float:

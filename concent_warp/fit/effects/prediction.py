@@ -47,6 +47,8 @@ class SimulationRequest:
     """Shape (P,)."""
     offset: np.ndarray | None = None
     """Difference of the initial state, positions then velocities, shape (2 nv,); None for none."""
+    early: float = 0.0
+    """Time by which the simulation begins before the window [s]."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ class Prediction:
         channels = {r.channel for w in self.windows for r in w.readings}
         self._clocks = [not at_true_time and channels <= set(e.target) for e in self.effects]
         """Which effects shift the clock of all channels, if any."""
-        self._kept: dict[tuple[int, bytes, bytes], tuple[Reader, int]] = {}
+        self._kept: dict[tuple[int, bytes, bytes, float], tuple[Reader, int]] = {}
         self.simulated = 0
         """Simulated time so far [s]."""
 
@@ -181,10 +183,10 @@ class Prediction:
             size -= self._kept.pop(next(iter(self._kept)))[1]
         return found
 
-    def _key(self, trial: SimulationRequest) -> tuple[int, bytes, bytes]:
+    def _key(self, trial: SimulationRequest) -> tuple[int, bytes, bytes, float]:
         """Return what a simulation depends on."""
         offset = b"" if trial.offset is None else trial.offset.tobytes()
-        return trial.window, trial.values[~self.measured_only].tobytes(), offset
+        return trial.window, trial.values[~self.measured_only].tobytes(), offset, trial.early
 
     def courses(self, trials: Sequence[SimulationRequest], time: float | None = None) -> list[Course]:
         """Simulate trials, each to the end of its window or for some time [s] only."""
@@ -220,7 +222,7 @@ class Prediction:
             if trial.offset is not None:
                 mujoco.mj_integratePos(m, qpos[i], trial.offset[: m.nv], 1.0)
                 qvel[i] += trial.offset[m.nv :]
-            begin = self.first_time(w, values[i])
+            begin = self.first_time(w, values[i]) - trial.early
             if (trial.window, begin) not in plain:
                 plain[trial.window, begin] = self._commands(m, w, steps, begin)
             ctrl[i] = self._acting(m, plain[trial.window, begin], values[i], steps)
@@ -234,9 +236,9 @@ class Prediction:
         rollout = engine.run(variants, ctrl, bodies=[]).numpy()
         self.simulated += n * steps * m.opt.timestep
         courses = []
-        for qpos, qvel, read in zip(rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
-            own = read.copy()  # not a part of the array of all, which would live as long
-            courses.append(Course(SensorReader(m, rollout.time, own, self.cfg.extrapolation), qpos, qvel, own.nbytes))
+        for trial, qpos, qvel, read in zip(trials, rollout.qpos, rollout.qvel, rollout.sensordata, strict=True):
+            own, time = read.copy(), rollout.time - trial.early  # no part of the array of all, which would live as long
+            courses.append(Course(SensorReader(m, time, own, self.cfg.extrapolation), qpos, qvel, own.nbytes))
         return courses
 
     def first_time(self, w: Window, values: np.ndarray) -> float:
@@ -291,7 +293,10 @@ class Prediction:
         return ctrl[len(ctrl) - steps :]
 
     def observed(self, window: int, reader: Reader, values: np.ndarray) -> np.ndarray:
-        """Return residuals in units of noise, measured less predicted, of a window as instruments read it, (count,)."""
+        """Return residuals, measured less predicted, of a window as instruments read it, shape (count,).
+
+        They are in units of noise, or of noise and numerical scatter (`Window.scatter`) together.
+        """
         w, m = self.windows[window], self._base.scene.model
         begin = self.first_time(w, values)
         read: Reader = lambda sensor, time: reader(sensor, time - begin)  # noqa: E731
@@ -303,6 +308,8 @@ class Prediction:
             predicted = read(r.channel, r.time + w.start)
             value = turn(predicted, r.value) if r.orientation else r.value - predicted
             residual[r.rows] = r.residuals(np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most))
+        if w.scatter is not None:
+            residual = w.scatter.whitened(np.clip(residual, -most, most))
         return np.clip(residual if w.defect is None else residual + w.defect.residual, -most, most)
 
     def residuals(self, trials: Sequence[SimulationRequest]) -> list[np.ndarray]:
