@@ -119,7 +119,8 @@ class SearchCfg:
     """Most candidates that are tried again in the place of an earlier addition once others are in the model.
     Empirical."""
     min_fold_share: Share = 0.8
-    """Share of the folds in which an accepted effect must gain [-]: 4 of 5."""
+    """Share of the folds' gains and losses that an accepted effect must gain [-]: 4 of 5. A fold whose motions hardly
+    show the effect loses or gains little."""
     equal_error: float = 0.02
     """Relative difference of held-out errors below which candidates count as equal [-]. Empirical."""
     equal_standard_errors: float = 2.0
@@ -259,6 +260,9 @@ class DiagnoseCfg:
 
     significance_level: OpenShare = 0.05
     """Probability of naming an effect where nothing is missing [-]."""
+    quiet_significance_level: OpenShare = 0.005
+    """The same where the model leaves no more than noise in size [-]: such data are the most frequent, and errors of
+    nominal values and formulas have a structure, too."""
     min_gain: float = 0.05
     """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""

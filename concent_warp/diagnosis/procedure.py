@@ -157,8 +157,7 @@ class Procedure:
         cfg, runner, fitted, first = self.cfg, self.runner, list(fitted), fitted[0]
         while True:
             step = len(fitted) - 1
-            explained = step or nominal_effects(fitted[-1].model)
-            if explained and not is_lacking(fitted[-1], self.noise_factors, cfg):
+            if step and not is_lacking(fitted[-1], self.noise_factors, cfg):
                 break
             if step and self._is_form_error(fitted[-1], first):
                 if self.provisional is None:
@@ -228,7 +227,7 @@ class Procedure:
 
     def _finer(self, one: FittedModel) -> FittedModel | None:
         """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
-        if self.time_step is not None or not self._is_lacking(one):
+        if self.time_step is not None:
             return None
         self.runner.progress(self.runner.share, "halving the time step")
         unsettled = "Open: whether the model's time step is too long."
@@ -242,7 +241,7 @@ class Procedure:
             one: The fitted model.
             enough: Whether a model with values at their bounds leaves little enough.
         """
-        if not self.cfg.nominal.enabled or nominal_effects(one.model) or not self._is_lacking(one):
+        if not self.cfg.nominal.enabled or nominal_effects(one.model):
             return None
         self.runner.progress(self.runner.share, "fitting nominal values within their tolerance")
         unsettled = "Open: whether nominal values are off within their tolerance."
@@ -361,14 +360,14 @@ class Procedure:
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        null, critical = self._chance(base, screened)
+        # What shows in the size of the residual no more than noise does must show the clearer in its structure.
+        level = cfg.significance_level if self._is_lacking(base) else cfg.quiet_significance_level
+        null, critical = self._chance(base, screened, level)
         needed = max(critical, cfg.min_gain)
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
-        if not self._is_lacking(base):
-            return None, smallest
 
         def finding(c: FittedCandidate) -> Finding:
-            return assess(base, c, null, step, effects, cfg)
+            return assess(base, c, null, step, effects, replace(cfg, significance_level=level))
 
         def short_windows() -> Sequence[Window]:
             return self._windows(base.model, cfg.search.shooting_window)
@@ -377,7 +376,7 @@ class Procedure:
         fitted = fits.fit(screened, critical, short_windows)
         if parts and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
-            null, critical = self._chance(base, [*screened, *more])
+            null, critical = self._chance(base, [*screened, *more], level)
             fitted = fits.fit(more, critical, short_windows)
         for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
             self.budget.note(sentence, step if decides else None)
@@ -415,10 +414,12 @@ class Procedure:
         best = max(fitted, key=lambda c: c.share(base), default=base)
         return best.ratio > self.cfg.search.explained_ratio
 
-    def _chance(self, base: FittedModel, screened: Sequence[ScreenedCandidate]) -> tuple[np.ndarray, float]:
-        """Return the null distribution of the best candidate's gain, and its value at the significance level."""
+    def _chance(
+        self, base: FittedModel, screened: Sequence[ScreenedCandidate], level: float
+    ) -> tuple[np.ndarray, float]:
+        """Return the null distribution of the best candidate's gain, and its value at a significance level."""
         null = max_gain_under_null(base, screened, self.cfg.null_samples, self.cfg.seed)
-        return null, float(np.quantile(null, 1 - self.cfg.significance_level))
+        return null, float(np.quantile(null, 1 - level))
 
     def _screened_parts(self, base: FittedModel, parts: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return parts with their expected gains, none where there was no time: the other candidates stay."""

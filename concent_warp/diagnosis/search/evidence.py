@@ -33,7 +33,7 @@ def assess(
     share, gain = c.share(base), c.gain(base)
     low, high = bootstrap_interval(gain, base.errors, base.blocks.demonstration, rng)
     p, parameters = null_p_value(null, share), fitted_parameters(base, c)
-    folds = [gain[base.blocks.fold == f].sum() > 0 for f in np.unique(base.blocks.fold)]
+    folds = np.array([gain[base.blocks.fold == f].sum() for f in np.unique(base.blocks.fold)])
     reason = ""
     if p > cfg.significance_level:
         reason = "no better than chance"
@@ -41,7 +41,7 @@ def assess(
         reason = f"removes less than {100 * cfg.min_gain:.0f} % of the error"
     elif low <= 0:
         reason = "the interval of its gain includes zero"
-    elif np.mean(folds) < cfg.search.min_fold_share:
+    elif folds[folds > 0].sum() < cfg.search.min_fold_share * np.abs(folds).sum():
         reason = "folds disagree"
     elif not any(q.excludes_null for q in parameters):
         reason = "its parameters may be at their null values"
