@@ -13,7 +13,8 @@ from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.initial_states import InitialStateCfg, InitialStateSearch
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, Window, first_time
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
-from concent_warp.fit.effects.prediction import Prediction
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
+from concent_warp.fit.effects.robust import huber, huber_limit
 from concent_warp.simulate.replay import initial_state
 from concent_warp.simulate.select import EngineName
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FittedStartCfg:
-    """How initial states that a recording does not state are fitted."""
+    """How initial states that a recording does not state are fitted, and stated ones are judged by first readings."""
 
     length: float = 1.0
     """Readings up to this time after the first one count [s]; less where small differences grow faster. Longer than it
@@ -46,8 +47,10 @@ def with_initial_states(
     """Return a recording whose demonstrations all state where they start, as a model follows their first readings best.
 
     Positions and velocities that a demonstration states are kept, but for what the model's effects on measurements say
-    of them: they are taken to be as the instruments show them. Measured states are smoothed first, and then fitted
-    through the model with its effects, those on measurements included.
+    of them: they are taken to be as the instruments show them, and corrected. Some recordings state the true ones,
+    as of a robot that threw the body, and do not say so: where a demonstration states both positions and velocities,
+    they are kept as they are if the model follows its first readings better from there (Huber's loss). Measured states
+    are smoothed first, and then fitted through the model with its effects, those on measurements included.
 
     Args:
         model: The model.
@@ -55,29 +58,26 @@ def with_initial_states(
         engine: Which engine simulates.
         cfg: Settings.
     """
-    cfg, unknown = cfg or FittedStartCfg(), [d.qpos is None or d.qvel is None for d in recording.demonstrations]
-    stated = _with_true_states(model, recording)
-    if not any(unknown):
-        return stated
+    cfg = cfg or FittedStartCfg()
+    unknown = [number for number, d in enumerate(recording.demonstrations) if not _states_all(d)]
+    misled = any(added.effect.misleads_start for added in model.effects)
+    if not (unknown or misled):
+        return recording
     try:
         noise = channel_noises(model, recording, cfg.observation)
-    except RecordingError:  # too few readings to fit anything to
+        source = ObservedRecording(model, recording, noise, cfg.observation)
+    except RecordingError:  # too few readings to fit or to decide anything
+        source = None
+    stated = _with_true_states(model, recording, source, engine, cfg.length) if misled else recording
+    if source is None:
         return stated
-    source = ObservedRecording(model, recording, noise, cfg.observation)
-    first: list[Window] = []
-    for number, d in enumerate(recording.demonstrations):
-        begin, last = first_time(d, list(noise)), _last_time(d, list(noise))
-        end = min(last, begin + cfg.length)
-        if unknown[number] and end > begin:
-            reach = end if source.measured(d) is None else keeps_close(source, d, 0.0, end, engine, 0)
-            if (window := source.window(number, 0.0, min(end, max(reach, begin)))) is not None:
-                first.append(window)
+    first = [w for number in unknown if (w := _first_window(source, number, engine, cfg.length)) is not None]
     if not first:
         return stated
     offsets = _fitted(model, first, [np.zeros(len(w.spread)) for w in first], engine, cfg, cfg.search.iterations)
     step, few = model.scene.model.opt.timestep, cfg.few_iterations
     for k, w in enumerate(first):
-        last = _last_time(w.demonstration, list(noise))
+        last = _last_time(w.demonstration, list(source.noise))
         trials = len(w.spread) + len(cfg.search.dampings)
         if last > w.end and few * trials * last / step <= cfg.max_steps:
             whole = source.window(w.number, 0.0, last)
@@ -91,6 +91,23 @@ def with_initial_states(
             replace(d, qpos=qpos if d.qpos is None else d.qpos, qvel=qvel if d.qvel is None else d.qvel)
         )
     return replace(stated, demonstrations=tuple(demonstrations))
+
+
+def _states_all(d: Demonstration) -> bool:
+    """Return whether a demonstration states both positions and velocities at its start."""
+    return d.qpos is not None and d.qvel is not None
+
+
+def _first_window(source: ObservedRecording, number: int, engine: EngineName, length: float) -> Window | None:
+    """Return the window of the first readings of a demonstration, at most of a length [s]; None for too few."""
+    d, channels = source.recording.demonstrations[number], list(source.noise)
+    begin = first_time(d, channels)
+    end = min(_last_time(d, channels), begin + length)
+    if end <= begin:
+        return None
+    known = _states_all(d) or source.measured(d) is not None
+    reach = keeps_close(source, d, 0.0, end, engine, 0) if known else end
+    return source.window(number, 0.0, min(end, max(reach, begin)))
 
 
 def _last_time(d: Demonstration, channels: Sequence[str]) -> float:
@@ -121,17 +138,39 @@ def _moved(model: Model, w: Window, offset: np.ndarray) -> tuple[np.ndarray, np.
     return qpos, qvel + step[m.nv :]
 
 
-def _with_true_states(model: Model, recording: Recording) -> Recording:
-    """Return a recording whose stated initial states are corrected for a model's effects on measurements."""
-    if not any(added.effect.misleads_start for added in model.effects):
-        return recording
+def _with_true_states(
+    model: Model, recording: Recording, source: ObservedRecording | None, engine: EngineName, length: float
+) -> Recording:
+    """Return a recording whose stated initial states are corrected for a model's effects on measurements.
+
+    Complete ones that the first readings, over a length [s], show to be true are kept; without a source, none.
+    """
     m, demonstrations = model.scene.model, []
     for number, d in enumerate(recording.demonstrations):
-        if d.qpos is not None or d.qvel is not None:
-            none = np.zeros(0)
-            w = Window(d, number, 0.0, 0.0, *initial_state(m, d), np.zeros(2 * m.nv), (), 0, none)
-            prediction = Prediction(model, (), [w], at_true_time=True)
-            qpos, qvel = prediction.first_state(w, prediction.start)
+        if d.qpos is None and d.qvel is None:
+            demonstrations.append(d)
+            continue
+        none = np.zeros(0)
+        w = Window(d, number, 0.0, 0.0, *initial_state(m, d), np.zeros(2 * m.nv), (), 0, none)
+        prediction = Prediction(model, (), [w], at_true_time=True)
+        qpos, qvel = prediction.first_state(w, prediction.start)
+        differs = not (np.array_equal(qpos, w.qpos) and np.array_equal(qvel, w.qvel))
+        if not (source and differs and _states_all(d) and _follows_unchanged(source, number, engine, length)):
             d = replace(d, qpos=None if d.qpos is None else qpos, qvel=None if d.qvel is None else qvel)
         demonstrations.append(d)
     return replace(recording, demonstrations=tuple(demonstrations))
+
+
+def _follows_unchanged(source: ObservedRecording, number: int, engine: EngineName, length: float) -> bool:
+    """Return whether a model follows first readings better with the stated state as the true one than as a shown one.
+
+    A shown state is simulated from its true time on where one clock shifts all channels. The replay cannot: moved along
+    its velocity to the start of the commands, the state lacks what the velocity changes by, which would count against
+    it.
+    """
+    if (w := _first_window(source, number, engine, length)) is None:
+        return False
+    prediction = Prediction(source.model, (), [w, replace(w, start_shown=False)], engine=engine)
+    shown, true = prediction.residuals([SimulationRequest(k, prediction.start) for k in range(2)])
+    limit = huber_limit([shown, true])
+    return float(huber(true, limit).sum()) < float(huber(shown, limit).sum())
