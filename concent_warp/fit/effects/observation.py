@@ -145,11 +145,8 @@ class NumericalScatter:
 
     def whitened(self, residual: np.ndarray) -> np.ndarray:
         """Return residuals (count,) in units of noise and scatter: (I + D D')^(-1/2) r."""
-        return self._scaled(residual, -0.5)
-
-    def in_noise(self, whitened: np.ndarray) -> np.ndarray:
-        """Return whitened residuals (count,) in units of noise alone: (I + D D')^(1/2) r."""
-        return self._scaled(whitened, 0.5)
+        directions, variance = self._directions
+        return residual + directions @ ((1 / np.sqrt(1 + variance) - 1) * (directions.T @ residual))
 
     def rows(self, chosen: np.ndarray) -> NumericalScatter:
         """Return the scatter of some of the residuals, by their indices."""
@@ -160,10 +157,6 @@ class NumericalScatter:
         """Orthonormal directions (count, K) of the deviations, and the variances along them (K,)."""
         directions, size, _ = np.linalg.svd(self.deviations, full_matrices=False)
         return directions, size**2
-
-    def _scaled(self, residual: np.ndarray, power: float) -> np.ndarray:
-        directions, variance = self._directions
-        return residual + directions @ (((1 + variance) ** power - 1) * (directions.T @ residual))
 
 
 @dataclass(frozen=True)

@@ -183,8 +183,10 @@ def keeps_close(
     for _ in range(cfg.probe_pairs):
         offset = rng.normal(size=2 * m.nv) * spread
         offsets += [offset, -offset]
-    near = len(offsets)
-    offsets += list(cfg.scatter_offset * cfg.state_noise * spread * rng.normal(size=(cfg.probe_pairs, 2 * m.nv)))
+    near, rough = len(offsets), has_touchable_free_body(m)
+    # Smooth motion has no numerical scatter: what small offsets change there is in proportion to them.
+    if rough:
+        offsets += list(cfg.scatter_offset * cfg.state_noise * spread * rng.normal(size=(cfg.probe_pairs, 2 * m.nv)))
     positions, velocities = np.tile(state.qpos, (len(offsets), 1)), np.tile(state.qvel, (len(offsets), 1))
     for row, offset in enumerate(offsets):
         mujoco.mj_integratePos(m, positions[row], offset[: m.nv], 1.0)
@@ -203,7 +205,7 @@ def keeps_close(
         # inf - inf between two samples that diverge
         with np.errstate(invalid="ignore"):
             bend = np.quantile(_rms(away[1:near:2] + away[2:near:2]) / 2, 0.8, axis=0)
-            scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0))
+            scatter = np.sqrt((_rms(away[near:]) ** 2).mean(axis=0)) if rough else np.zeros(len(record))
         scatter = np.clip(np.nan_to_num(scatter), 0.0, cfg.max_scatter_noise)
         curved = np.maximum(curved, np.nan_to_num(bend / np.hypot(1.0, scatter), nan=np.inf))
     wild = np.flatnonzero(curved > cfg.max_curvature)

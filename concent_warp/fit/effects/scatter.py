@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observation import NumericalScatter, ObservationCfg, Window
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
-from concent_warp.simulate.select import EngineName
+from concent_warp.simulate.engine import Variants
+from concent_warp.simulate.replay import commands
+from concent_warp.simulate.select import EngineName, make_engine
 
 if TYPE_CHECKING:
     from concent_warp.model import Model
@@ -29,7 +32,7 @@ def with_scatter(
 ) -> list[Window]:
     """Return windows with the numerical scatter of a model's predictions from their initial states.
 
-    Windows in which nothing touches anything have none.
+    Windows in which nothing touches anything have none, nor have those without the commands to simulate them.
 
     Args:
         model: The model, with its effects at their values.
@@ -41,7 +44,7 @@ def with_scatter(
     if not cfg.scatter_samples:
         return list(windows)
     prediction = Prediction(model, (), [replace(w, scatter=None) for w in windows], engine=engine)
-    rough = [k for k, w in enumerate(windows) if not w.smooth]
+    rough = [k for k, w in enumerate(windows) if not w.smooth and touches(model, w, engine)]
     trials = {k: _shifted(prediction, k, cfg) for k in rough}
     courses = iter(prediction.courses([trial for k in rough for trial in trials[k]]))
     found = list(windows)
@@ -51,22 +54,46 @@ def with_scatter(
     return found
 
 
+def touches(model: Model, w: Window, engine: EngineName) -> bool:
+    """Return whether something touches something in a model's motion from the estimated state of a window on.
+
+    It is taken that nothing does where the recording has no commands: who simulates it says so.
+    """
+    steps = max(int(np.ceil((w.end - w.start) / model.scene.model.opt.timestep - 1e-9)), 1)
+    start = Variants(1, qpos=w.qpos[None], qvel=w.qvel[None])
+    try:
+        ctrl = commands(model.compile(), w.demonstration, steps, w.start)
+    except RecordingError:
+        return False
+    rollout = make_engine(engine, model).run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
+    return bool(rollout.diverged.any() or rollout.touched.any())
+
+
 def _shifted(prediction: Prediction, window: int, cfg: ObservationCfg) -> list[SimulationRequest]:
     """Return simulations of a window that begin within a time step before it, on the way to its initial state."""
     w, values, count = prediction.windows[window], prediction.start, cfg.scatter_samples
     m = prediction.compiled
-    d = mujoco.MjData(m)
-    d.qpos[:], d.qvel[:] = prediction.first_state(w, values)
-    mujoco.mj_forward(m, d)
+    step = m.opt.timestep
+    (course,) = prediction.courses([SimulationRequest(window, values)], 2 * step)
+    acceleration = (course.qvel[1] - course.qvel[0]) / step
     # What presses bodies apart that overlap at the start, by an error of their measured poses, says nothing about them.
-    acceleration = np.zeros(m.nv) if d.ncon else d.qacc
+    acceleration[_touching_dofs(m, course.qpos[0])] = 0.0
     rng, found = np.random.default_rng(0), []
     for k in range(count):
-        early = k / count * m.opt.timestep
+        early = k / count * step
         offset = cfg.scatter_offset * w.spread * rng.normal(size=2 * m.nv)
-        offset -= early * np.concatenate([d.qvel, acceleration])
+        offset -= early * np.concatenate([course.qvel[0], acceleration])
         found.append(SimulationRequest(window, values, offset, early))
     return found
+
+
+def _touching_dofs(m: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Return which degrees of freedom are those of a mechanism or body that touches something, shape (nv,) bool."""
+    d = mujoco.MjData(m)
+    d.qpos[:] = qpos
+    mujoco.mj_fwdPosition(m, d)
+    touching = m.body_rootid[m.geom_bodyid[d.contact.geom[d.contact.dist <= 0].ravel()]]
+    return np.isin(m.body_rootid[m.dof_bodyid], touching)
 
 
 def _scatter(residuals: np.ndarray, prediction: Prediction, cfg: ObservationCfg) -> NumericalScatter | None:

@@ -1,4 +1,4 @@
-"""Windows of recordings, sample by sample, and how fast small differences grow in simulations written down."""
+"""Windows of recordings, sample by sample."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,11 +12,11 @@ from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState
 from concent_warp.fit.effects import observe as observing
 from concent_warp.fit.effects.observation import ObservationCfg, ObservedRecording, first_time, start_spread
-from concent_warp.fit.effects.observe import _calmest, channel_noises, keeps_close, observe
+from concent_warp.fit.effects.observe import _calmest, channel_noises, observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
-from tests.scenes.swinging import NOISE, drawing, swing_scene, swung
+from tests.scenes.swinging import NOISE, drawing, swung
 
 CHAIN = """
 <mujoco>
@@ -159,104 +159,6 @@ def test_the_first_time_is_that_of_the_channel_that_begins_first():
     assert first_time(d, ["angle", "turned", "other"]) == 0.2
     assert first_time(d, ["angle"]) == 0.3
     assert first_time(d, []) == 0.0
-
-
-class Simulated:
-    """An engine whose sensors read what is written down."""
-
-    def __init__(self, sensordata: Any) -> None:
-        self.sensordata, self.calls = sensordata, []
-
-    def run(self, variants: Any, ctrl: np.ndarray, *, record: np.ndarray, bodies: Any) -> Any:
-        self.calls.append((variants, ctrl, record, bodies))
-        found = SimpleNamespace(sensordata=self.sensordata(record))
-        return SimpleNamespace(numpy=lambda: found)
-
-
-BENDS = np.array([4.0, 1.0, 5.0, 2.0, 3.0, 0.5])
-"""Curvature of each pair's mean; the 0.8 quantile of six is the second largest."""
-
-
-def diverging(timestep: float, angle: float = 0.0, turn: float = 0.0) -> Any:
-    """Return readings of an angle and a quaternion; pairs part evenly, and their means bend by `angle` and `turn`."""
-
-    def sensordata(record: np.ndarray) -> np.ndarray:
-        time = record * timestep
-        data = np.zeros((13, len(record), 5))
-        data[:, :, 0], data[:, :, 1] = np.sin(time), 1.0
-        for k, bend in enumerate(BENDS):
-            for row, sign in ((1 + 2 * k, 1.0), (2 + 2 * k, -1.0)):
-                data[row, :, 0] += sign * (k + 1.0) * time + bend * angle * time**2
-                data[row, :, 2] += sign * (k + 1.0) * time + bend * turn * time**2
-        data[3:9, :, 1:] *= -1.0  # the same orientations
-        return data
-
-    return sensordata
-
-
-def reach(engine: Simulated, monkeypatch: Any, *, start: float = 0.5, last: float = 1.9, **noise: float) -> float:
-    monkeypatch.setattr(observing, "make_engine", lambda *_: engine)
-    recording = swung(quaternion=True)
-    return keeps_close(observed(recording, **noise), recording[0], start, last, "mujoco", 3)
-
-
-def test_a_window_ends_where_what_opposite_errors_do_differs_by_some_noise(monkeypatch):
-    # 0.004 * 4 t^2 / 1e-3 > 3 from t = 0.433 on; records are 0.01 s apart.
-    engine = Simulated(diverging(0.005, angle=0.004))
-    assert reach(engine, monkeypatch, angle=1e-3, turned=1e-3) == pytest.approx(0.44)
-    # An orientation turns by twice as much as its quaternion moves, over two of four components.
-    assert reach(Simulated(diverging(0.005, turn=0.004)), monkeypatch, turned=1e-3) == pytest.approx(0.44)
-    assert reach(Simulated(diverging(0.005, angle=0.004)), monkeypatch, turned=1e-3) == pytest.approx(1.4)
-    both = diverging(0.005, angle=0.004, turn=0.01)
-    assert reach(Simulated(both), monkeypatch, angle=1e-3, turned=1e-3) == pytest.approx(0.28)
-    assert reach(Simulated(both), monkeypatch, turned=1e-3, angle=1e-4) == pytest.approx(0.14)
-    assert reach(Simulated(both), monkeypatch, turned=1e-5, angle=1e-3) == pytest.approx(0.12)
-
-
-def test_pairs_start_off_by_the_noise_on_either_side(monkeypatch):
-    engine = Simulated(diverging(0.005))
-    assert reach(engine, monkeypatch, angle=2e-3, turned=1e-3, other=1.0) == pytest.approx(1.4)
-    ((variants, ctrl, record, bodies),) = engine.calls
-    assert (len(variants.qpos), bodies) == (13, [])
-    np.testing.assert_array_equal(record, np.arange(0, 281, 2))
-    recording = swung(quaternion=True)
-    source = observed(recording, angle=2e-3)
-    state = source.state(recording[0], 0.5)
-    qpos, qvel = state.qpos, state.qvel
-    rng = np.random.default_rng(3)
-    np.testing.assert_array_equal([variants.qpos[0], variants.qvel[0]], [qpos, qvel])
-    for k in range(6):
-        offset = rng.normal(size=2) * [2e-3, 2e-3 / 0.03]
-        np.testing.assert_allclose(variants.qpos[1 + 2 * k], qpos + offset[0], rtol=1e-12)
-        np.testing.assert_allclose(variants.qpos[2 + 2 * k], qpos - offset[0], rtol=1e-12)
-        np.testing.assert_allclose(variants.qvel[1 + 2 * k], qvel + offset[1], rtol=1e-12)
-        np.testing.assert_allclose(variants.qvel[2 + 2 * k], qvel - offset[1], rtol=1e-12)
-    action = recording[0].action["servo"]
-    time = 0.5 + 0.005 * np.arange(280)
-    np.testing.assert_array_equal(ctrl[:, 0], np.ravel(action.value)[(time / 0.25 + 1e-9).astype(int)])
-
-
-def test_differences_that_are_not_finite_end_a_window_and_none_is_longer_than_the_longest(monkeypatch):
-    def blown(record: np.ndarray) -> np.ndarray:
-        data = diverging(0.005)(record)
-        data[1:, record * 0.005 > 0.705] = np.inf
-        return data
-
-    assert reach(Simulated(blown), monkeypatch, angle=1e-3) == pytest.approx(0.71)
-    assert reach(Simulated(diverging(0.005)), monkeypatch, last=100.0, angle=1e-3) == pytest.approx(20.0)
-    engine = Simulated(diverging(0.005))
-    assert reach(engine, monkeypatch, last=0.5021, angle=1e-3) == pytest.approx(0.0021)
-    assert len(engine.calls[0][1]) == 1
-
-
-def test_records_are_every_step_where_steps_are_long(monkeypatch):
-    engine = Simulated(diverging(0.02, angle=0.004))
-    monkeypatch.setattr(observing, "make_engine", lambda *_: engine)
-    recording = swung()
-    model = Model(Scene(swing_scene().replace('timestep="0.005"', 'timestep="0.02"')))
-    source = ObservedRecording(model, recording, {"angle": 1e-3})
-    assert keeps_close(source, recording[0], 0.0, 1.0, "mujoco", 0) == pytest.approx(0.44)
-    np.testing.assert_array_equal(engine.calls[0][2], np.arange(51))
 
 
 class Rough:

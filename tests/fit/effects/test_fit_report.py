@@ -42,7 +42,7 @@ PARAMETERS = (
 
 def solver_of(parameters: Any = PARAMETERS, split: Any = None, **options: Any) -> Any:
     split = split or [slice(k, k + 1) for k in range(len(parameters))]
-    names = [SimpleNamespace(name=f"effect_{k}", formula_error=0.0) for k in range(len(split))]
+    names = [SimpleNamespace(name=f"effect_{k}", formula_error=0.0, null_error=0.0) for k in range(len(split))]
     prediction = SimpleNamespace(parameters=parameters, split=split, effects=names)
     scale = np.array([p.scale for p in parameters])
     high = np.array([p.high for p in parameters])

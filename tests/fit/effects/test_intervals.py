@@ -1,9 +1,11 @@
 """Intervals of fitted parameters against their formulas, on sums of a few blocks written by hand."""
 
+import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.effects.effect import Parameter
+from concent_warp.effects.library.contact import ContactCompliance
 from concent_warp.effects.library.joints import JointFriction
 from concent_warp.effects.library.measurement import LengthScale
 from concent_warp.fit.effects.cross_validation import Blocks, Sums
@@ -90,6 +92,34 @@ def test_the_scatter_of_friction_adds_to_the_error_of_its_formula():
     assert each == pytest.approx([0.03 * 2.0, 0.03 * 8.0])
     (exact,) = formula_errors(LengthScale("a"), (p,), np.array([2.0]), 0.005)
     assert exact == pytest.approx(2.0 * 0.005)
+
+
+SETTLING = """<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 .1" solref="0.02 0.4"/>
+    <body name="ball" pos="0 0 1"><freejoint/><geom size=".05" solref="0.02 0.4"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_values_that_a_model_states_roughly_are_uncertain_even_where_they_are_not_changed():
+    compliance = ContactCompliance("ball")
+    parameters = compliance.parameters(mujoco.MjModel.from_xml_string(SETTLING))
+    null = np.array([p.null for p in parameters])
+    np.testing.assert_allclose(null, [0.02, 0.4])
+    np.testing.assert_allclose(formula_errors(compliance, parameters, null, 0.0), 0.025 * null)
+    # Of the changed value, the error of discretisation counts as well: half a percent of the larger deviation.
+    changed = formula_errors(compliance, parameters, np.array([0.02, 0.2]), 0.005)
+    scale = np.array([p.scale for p in parameters])
+    assert changed == pytest.approx(np.hypot(0.005 * 0.2 * scale / scale[1], 0.025 * null))
+    own = formula_errors(JointFriction("a"), parameters[:1], null[:1], 0.0)
+    assert own == pytest.approx([0.0])
+
+
+def test_a_limit_that_is_infinite_by_default_adds_no_error_of_its_null_value():
+    limit = (Parameter("limit", "N", np.inf, 0.0, np.inf, 2.0),)
+    found = formula_errors(ContactCompliance("ball"), limit, np.array([4.0]), 0.005)
+    assert found == pytest.approx([0.005 * 4.0])
 
 
 def test_scores_that_are_alike_in_neighbouring_blocks_widen_the_interval():

@@ -176,10 +176,18 @@ def test_a_leap_that_fails_where_it_promises_most_is_not_gone_on_with():
     assert solver._fit_at(off, right.values, first, 1.0).cost == pytest.approx(right.cost, rel=0.02)
 
 
-def bounced_ratio(cfg: LeastSquaresCfg | None = None) -> np.ndarray:
-    """Return residuals over those of the true initial states, falls told 3 spreads off; shape (falls,)."""
+def bounced_ratio(cfg: LeastSquaresCfg | None = None, *, scatter: bool = False) -> np.ndarray:
+    """Return residuals over those of the true initial states, falls told 3 spreads off; shape (falls,).
+
+    Args:
+        cfg: Settings.
+        scatter: Whether the numerical scatter of predictions counts as noise.
+    """
     recording, errors = bounced(12, off=3.0, seed=1)
     windows = windows_of(recording, length=10.0)
+    assert all(w.scatter is not None for w in windows)
+    if not scatter:
+        windows = [replace(w, scatter=None) for w in windows]
     np.testing.assert_allclose(windows[0].spread, SPREAD)
     solver = Solver(Prediction(drawing(recording), (), windows, threads=1), cfg)
     values = np.zeros(0)
@@ -188,7 +196,7 @@ def bounced_ratio(cfg: LeastSquaresCfg | None = None) -> np.ndarray:
         np.array([np.sqrt(np.mean(r**2)) for r in solver.p.residuals(solver.trials(values, o))])
         for o in (offsets, errors, [np.zeros(4) for _ in windows])
     )
-    assert (told > 30 * true).all()
+    assert (told > (10 if scatter else 30) * true).all()
     return found / true
 
 
@@ -199,6 +207,11 @@ def test_initial_states_far_off_are_found_across_a_bounce():
 def test_derivatives_alone_do_not_find_all_of_these():
     cfg = LeastSquaresCfg(initial_states=InitialStateCfg(sample_spreads=(), restart_samples=0))
     assert (bounced_ratio(cfg) < 1.2).sum() <= 9
+
+
+def test_derivatives_alone_find_all_where_the_scatter_over_the_phase_of_the_time_grid_counts_as_noise():
+    cfg = LeastSquaresCfg(initial_states=InitialStateCfg(sample_spreads=(), restart_samples=0))
+    assert (bounced_ratio(cfg, scatter=True) < 1.1).all()
 
 
 def test_sensitivities_are_those_of_finite_differences():

@@ -56,6 +56,22 @@ def test_effects_of_the_model_come_first_and_take_part(recording, windows):
     ]
 
 
+def test_a_simulation_that_begins_early_follows_commands_and_is_read_at_the_times_of_the_window(recording, windows):
+    values, steps, w = np.array([DAMPING]), 7, windows[0]
+    step = damped(recording, windows).compiled.opt.timestep
+    (course,) = damped(recording, [w]).courses([SimulationRequest(0, values)])
+    later = replace(w, start=w.start + steps * step, qpos=course.qpos[steps], qvel=course.qvel[steps])
+    offset = np.concatenate([course.qpos[0] - course.qpos[steps], course.qvel[0] - course.qvel[steps]])
+    early = SimulationRequest(0, values, offset, steps * step)
+    prediction = damped(recording, [later])
+    found, late = prediction.readers([early, replace(early, early=0.0)])
+    time = np.linspace(0.0, w.end - later.start - steps * step, 60)
+    np.testing.assert_allclose(found("angle", time), course.reader("angle", time + steps * step), atol=1e-9)
+    # It is not taken for the one that begins in the same state at the window's start.
+    assert np.abs(late("angle", time) - found("angle", time)).max() > 0.01
+    assert prediction.readers([early])[0] is found
+
+
 def test_what_was_simulated_lately_is_not_simulated_again(recording, windows):
     prediction = damped(recording, windows)
     first = prediction.residuals([SimulationRequest(0, np.array([DAMPING])), SimulationRequest(1, np.array([DAMPING]))])
