@@ -118,6 +118,9 @@ class SearchCfg:
     reconsidered: Count = 5
     """Most candidates that are tried again in the place of an earlier addition once others are in the model.
     Empirical."""
+    alternatives: Annotated[int, Bounds(0, 1000)] = 1
+    """Most rivals of the first of several effects from which the search is continued, too [-]; 0 for none.
+    Empirical."""
     min_fold_share: Share = 0.8
     """Share of the folds' gains and losses that an accepted effect must gain [-]: 4 of 5. A fold whose motions hardly
     show the effect loses or gains little."""
@@ -266,6 +269,12 @@ class DiagnoseCfg:
     min_gain: float = 0.05
     """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""
+    quiet_min_gain: Share = 0.1
+    """The same where the model leaves no more than noise in size [-]: errors of formulas, too, can be found there, in
+    long recordings. Empirical."""
+    min_explained: Share = 0.2
+    """Share of the discrepancy that the accepted effects must explain if something else is missing, or the model stays
+    as given [-]: what explains less is rather an imitation. That of `SearchCfg.far_min_gain`."""
     max_fits: Count = 8
     """Most screened candidates that are fitted. Empirical: the truth is among the first eight in nearly all scenes."""
     max_additions: Annotated[int, Bounds(1, 1000)] = 3

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.residuals import instrument_noise
+from concent_warp.diagnosis.alternatives import try_alternatives
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
 from concent_warp.diagnosis.failures import locate_failures
 from concent_warp.diagnosis.result import Detectable, Diagnosis, Finding, FinerTimeStep, Verdict
-from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking, least_ratio
 from concent_warp.diagnosis.search.baseline import (
     add_candidate,
     fit_baseline,
@@ -102,6 +103,8 @@ class Procedure:
         self.provisional: int | None = None
         """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was
         left: what takes up an error in a formula explains a part of it."""
+        self.earlier: Sequence[FittedCandidate] = ()
+        """Fits of candidates to the model of the last addition."""
         self.rivals: dict[int, tuple[Rival, ...]] = {}
         """Candidates that explained nearly as much as each addition, and that one itself."""
         self.with_unestablished: list[FittedModel] = []
@@ -122,7 +125,7 @@ class Procedure:
         given = self.baseline()
         with self.budget.until(SEARCH_SHARE):
             fitted, detectable = self.search(given)
-        fitted = self.final_values(self.restore_given(self.simplified(fitted)))
+        fitted = self.final_values(self.restore_given(self.simplified(fitted), given))
         runner.progress(1.0, "done")
         return self.conclude(given, fitted, detectable, issues)
 
@@ -141,6 +144,8 @@ class Procedure:
                 self.budget.cut |= set(range(len(found)))
                 return found, detectable
         fitted, smallest = self.add_effects(fitted, detectable)
+        if len(self._accepted()) > 1:
+            fitted = try_alternatives(self, fitted)
         return fitted, detectable or smallest
 
     def add_effects(
@@ -155,13 +160,16 @@ class Procedure:
                 hide what they change.
         """
         cfg, runner, fitted, first = self.cfg, self.runner, list(fitted), fitted[0]
+        runner.share = max(runner.share, BASELINE_SPAN)
         while True:
             step = len(fitted) - 1
-            if step and not is_lacking(fitted[-1], self.noise_factors, cfg):
+            # What a shorter time step leaves has a structure, too: that of the errors of both steps.
+            explained = step or self.time_step is not None
+            if explained and not is_lacking(fitted[-1], self.noise_factors, cfg):
                 break
             if step and self._is_form_error(fitted[-1], first):
                 if self.provisional is None:
-                    if effects_alone or (step == 1 and is_adequate(fitted[-1], self.noise_factors, cfg)):
+                    if effects_alone:
                         break
                     self.provisional = step
                 elif step > self.provisional:
@@ -175,11 +183,11 @@ class Procedure:
                 continue
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
-            runner.share = BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions
+            runner.share = max(runner.share, BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions)
             recorded = len(self.findings), len(self.groups)
             try:
-                explained = not effects_alone and self._explains(fitted[-1], first, added=step > 0)
-                best, smallest = self.find_addition(fitted[-1], step, explained=explained)
+                adequate = not effects_alone and self._explains(fitted[-1], first, added=step > 0)
+                best, smallest = self.find_addition(fitted[-1], step, explained=adequate)
             except TimeUpError:
                 self.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
                 break
@@ -214,12 +222,19 @@ class Procedure:
     def _explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
         """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
 
+        An effect that leaves more than either is rather an imitation of what is missing, also where what it leaves is
+        little beside the noise.
+
         Args:
             one: The fitted model.
             first: The model as given.
             added: Whether it has effects that the first one lacks.
         """
-        return is_adequate(one, self.noise_factors, self.cfg) or (added and self._is_form_error(one, first))
+        adequate = is_adequate(one, self.noise_factors, self.cfg)
+        if not added:
+            return adequate
+        little = least_ratio(one, self.noise_factors) <= self.cfg.search.explained_ratio
+        return (adequate and little) or self._is_form_error(one, first)
 
     def _accepted(self) -> list[Finding]:
         """Return the accepted effects in the order of their addition."""
@@ -360,20 +375,23 @@ class Procedure:
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        # What shows in the size of the residual no more than noise does must show the clearer in its structure.
-        level = cfg.significance_level if self._is_lacking(base) else cfg.quiet_significance_level
+        if not is_lacking(base, self.noise_factors, cfg):
+            # What shows in the size of the residual no more than noise does must show the clearer in its structure.
+            cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=cfg.quiet_min_gain)
+        level = cfg.significance_level
         null, critical = self._chance(base, screened, level)
         needed = max(critical, cfg.min_gain)
         smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
 
         def finding(c: FittedCandidate) -> Finding:
-            return assess(base, c, null, step, effects, replace(cfg, significance_level=level))
+            return assess(base, c, null, step, effects, cfg)
 
         def short_windows() -> Sequence[Window]:
             return self._windows(base.model, cfg.search.shooting_window)
 
         fits = CandidateFits(base, cfg, self.runner)
         fitted = fits.fit(screened, critical, short_windows)
+        self.earlier = fitted
         if parts and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
@@ -466,7 +484,7 @@ class Procedure:
         """
         span = share * ADDITIONS_SPAN / self.cfg.max_additions
         at_measured = linear_at_measured_states(base, self.cfg.search)
-        tasks = [(base, e, self.cfg.search, at_measured) for e in effects]
+        tasks = [(base, e, self.cfg.search, at_measured, self._earlier_values(e)) for e in effects]
         found = self.runner.run_in_time(screen, tasks, "screening", span)
         screened = [s for s in found if s is not None]
         if len(screened) < len(effects):
@@ -477,6 +495,10 @@ class Procedure:
         names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
         self.runner.progress(self.runner.share, ranking(base, screened, names, self.cfg.seed))
         return self.gradient.apply(base, screened, self.runner) if self.gradient else screened
+
+    def _earlier_values(self, effect: Effect) -> np.ndarray | None:
+        """Return the parameters of an effect as they were fitted before the last addition, shape (P,), if they were."""
+        return next((c.model.effects[-1].array for c in self.earlier if c.effect == effect), None)
 
     def _record(
         self, base: FittedModel, group: Sequence[tuple[FittedCandidate, Finding]], findings: Sequence[Finding]
@@ -584,11 +606,15 @@ class Procedure:
         found = self._nominal(reduced)
         return reduced if found is None else found
 
-    def restore_given(self, fitted: list[FittedModel]) -> list[FittedModel]:
+    def restore_given(self, fitted: list[FittedModel], given: FittedModel) -> list[FittedModel]:
         """Return the fitted models, the last with time step and nominal values as given where others explain no more.
 
-        Effects that were added later may have made them superfluous.
+        Effects that were added later may have made them superfluous. Where the model as given leaves no more than noise
+        and no effect was accepted, it stays as given.
         """
+        if not self._accepted() and not self._is_lacking(given):
+            self.time_step = None
+            return [given]
         last, sentence = fitted[-1], "Open: whether {} beside the effects."
         if self.time_step is not None:
             self.runner.progress(self.runner.share, "restoring the time step")
@@ -711,13 +737,15 @@ class Procedure:
         """
         cfg, last = self.cfg, fitted[-1]
         left, lacked = discrepancies(last, given)
-        unexplained = float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0)) if given.ratio > cfg.adequate_ratio else 0.0
-        adequate = is_adequate(last, self.noise_factors, cfg)
-        form_error = None
-        if not adequate and any(f.accepted for f in self.findings) and self._is_form_error(last, given):
-            adequate, form_error = True, unexplained
+        added = any(f.accepted for f in self.findings)
+        unexplained = (
+            float(np.clip(left / max(lacked, 1e-9), 0.0, 1.0)) if added or given.ratio > cfg.adequate_ratio else 0.0
+        )
+        adequate, form_error = self._explains(last, given, added=added), None
+        if added and is_lacking(last, self.noise_factors, cfg) and self._is_form_error(last, given):
+            form_error = unexplained
         unknown = None
-        if adequate and any(f.accepted for f in self.findings):
+        if adequate and added:
             # What an effect explains with values that may be its null values needs no force of unknown form.
             tested = self.with_unestablished or fitted
             nodes = [given, *(tested[1:] or tested)]
@@ -755,6 +783,7 @@ class Procedure:
             time_step=self.time_step,
             nominal_values=self.nominal_values,
             unsettled=tuple(self.budget.unsettled),
+            explains=verdict != "none_of_these" or unexplained <= 1 - cfg.min_explained,
         )
 
     def _suggested_experiment(self) -> SuggestedExperiment | None:

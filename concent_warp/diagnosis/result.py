@@ -217,11 +217,13 @@ class Diagnosis:
     """Masses, lengths, gains and latencies that the data ask for within their tolerance; factors but for latencies."""
     unsettled: tuple[str, ...] = ()
     """Sentences on what there was no time for, see `DiagnoseCfg.seconds`."""
+    explains: bool = True
+    """Whether the accepted effects explain enough to be in `model`, see `DiagnoseCfg.min_explained`."""
 
     @property
     def model(self) -> Model:
-        """The model with all accepted effects."""
-        return self.models[-1]
+        """The model with all accepted effects; as given where something else is missing that explains far more."""
+        return self.models[-1 if self.explains else 0]
 
     @property
     def accepted(self) -> tuple[Finding, ...]:
@@ -231,7 +233,7 @@ class Diagnosis:
     @property
     def changes_model(self) -> bool:
         """Whether `model` differs from the model as given by more than the values of its own parameters."""
-        return bool(self.accepted or self.nominal_values) or self.time_step is not None
+        return self.explains and (bool(self.accepted or self.nominal_values) or self.time_step is not None)
 
     @property
     def headline(self) -> str:
@@ -294,6 +296,8 @@ class Diagnosis:
             said.append(
                 f"{100 * self.unexplained:.0f} % of the discrepancy stays unexplained by any effect in the library."
             )
+            if not self.explains and self.accepted:
+                said.append("The effects above explain too little to be added: the model stays as given.")
         if self.form_error is not None:
             said.append(
                 f"What is left, {self.ratio[-1]:.2f} x noise, is {100 * self.form_error:.1f} % of the discrepancy: no "

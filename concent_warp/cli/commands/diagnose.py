@@ -181,13 +181,14 @@ def _say_effects(effects: Sequence[Finding]) -> None:
 
 
 def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
-    """Save the model with all accepted effects; say so where none was accepted."""
+    """Save the model with all accepted effects; say so where none was accepted, or those explain too little."""
     path = arguments.apply
     if path is None:
         return
     if not found.changes_model:
         if not arguments.json:
-            say(escape(f"No effect was accepted: {path} was not written."))
+            why = "No effect was accepted" if found.explains else "The accepted effects explain too little"
+            say(escape(f"{why}: {path} was not written."))
         return
     make_folder(path.parent)
     found.model.save(path)

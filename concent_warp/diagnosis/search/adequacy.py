@@ -33,6 +33,16 @@ def is_adequate(base: FittedModel, noise_factors: Mapping[str, float], cfg: Diag
     return robust_noise_ratio(scaled, robust) <= cfg.adequate_ratio and worst <= cfg.adequate_channel_ratio
 
 
+def least_ratio(base: FittedModel, noise_factors: Mapping[str, float]) -> float:
+    """Return the residual of a fitted model over the noise [-], that as large as it may be.
+
+    Args:
+        base: The fitted model.
+        noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
+    """
+    return robust_noise_ratio(_scaled(base, noise_factors), base.cfg.least_squares.robust)
+
+
 def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: DiagnoseCfg) -> bool:
     """Return whether the residual beyond what the noise may be is as much as an effect must remove.
 
@@ -41,8 +51,7 @@ def is_lacking(base: FittedModel, noise_factors: Mapping[str, float], cfg: Diagn
         noise_factors: By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-].
         cfg: Settings.
     """
-    ratio = robust_noise_ratio(_scaled(base, noise_factors), base.cfg.least_squares.robust)
-    return ratio**2 >= 1 + cfg.min_gain
+    return least_ratio(base, noise_factors) ** 2 >= 1 + cfg.min_gain
 
 
 def _scaled(base: FittedModel, noise_factors: Mapping[str, float]) -> list[np.ndarray]:

@@ -13,12 +13,13 @@ import numpy as np
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.baseline import fitted_model, refit_without_effect
+from concent_warp.diagnosis.search.baseline import add_candidate, fitted_model, refit_without_effect
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.search.candidates import has_effect
 from concent_warp.diagnosis.search.evidence import assess, indistinguishable
 from concent_warp.diagnosis.search.fit_candidate import fitted_candidate
 from concent_warp.effects.effect import AddedEffect, Effect
+from concent_warp.fit.effects.least_squares import Fit
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Rival:
     finding: Finding
     added: AddedEffect
     """The effect with its values."""
+    fit: Fit
+    """Its fit, with all other values and the initial states."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,17 @@ def near_best(
     least = cfg.search.restart_min_gain * max(c.share(base) for c in fits)
     near = [(c, f) for c, f in zip(fits, findings, strict=True) if c.share(base) >= least]
     ranked = sorted(near, key=lambda pair: -pair[0].share(base))
-    return tuple(Rival(f, c.model.effects[-1]) for c, f in ranked[: cfg.search.reconsidered])
+    return tuple(Rival(f, c.model.effects[-1], c.fit) for c, f in ranked[: cfg.search.reconsidered])
+
+
+def beside(base: FittedModel, rival: Rival) -> FittedModel:
+    """Return a fitted model with a rival added, all fitted again from where its fit ended."""
+    solver, shapes = base.solver(rival.added.effect), [o.shape for o in base.fit.offsets]
+    # Over other windows than these it has other initial states.
+    start = rival.fit if [o.shape for o in rival.fit.offsets] == shapes else base.fit
+    values = np.concatenate([base.fit.values, rival.added.array])
+    fit = solver.polish(solver.fit(values, start.offsets, start.starts))
+    return add_candidate(base, fitted_candidate(base, rival.added.effect, solver, fit))
 
 
 def reconsider(last: FittedModel, effect: int, among: Sequence[Rival], cfg: DiagnoseCfg) -> Reconsidered | None:

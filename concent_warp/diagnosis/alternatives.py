@@ -1,0 +1,122 @@
+"""The first of several effects replaced by its rivals, and the search continued from each.
+
+Effects are added one at a time, and the first is chosen while the others are still missing: one that stands for parts
+of several then comes before each of them, and what is left leads to a second imitation. A search that keeps a few
+beginnings finds sets of effects that no exchange of a single one leads to (beam search).
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.reconsider import Rival, beside
+
+if TYPE_CHECKING:
+    from concent_warp.diagnosis.procedure import Procedure
+
+KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional", "earlier")
+"""What a search records in its procedure."""
+
+
+def try_alternatives(procedure: Procedure, fitted: list[FittedModel]) -> list[FittedModel]:
+    """Return the fitted models of the search from another first effect, where that leads to a more plausible answer.
+
+    An answer that the data cannot distinguish from it, and that differs by one effect, adds that to the group of the
+    one in whose place it stands.
+
+    Args:
+        procedure: The diagnosis; what it has recorded is that of the returned models afterwards.
+        fitted: The model as given and after each addition, at least two.
+    """
+    cfg, first = procedure.cfg, fitted[0]
+    begun = _recorded(procedure)
+    answers = [(fitted, begun)]
+    equals = set(procedure.groups[0])
+    others = [r for r in procedure.rivals.get(0, ()) if r.finding.name not in equals]
+    for rival in others[: cfg.search.alternatives]:
+        _record(procedure, begun)
+        procedure.runner.progress(procedure.runner.share, f"trying {rival.finding.name} as the first effect")
+        unsettled = f"Open: whether {rival.finding.name} with another effect explains more."
+        found = procedure.budget.attempt(lambda r=rival: _from(procedure, first, r), None, unsettled)
+        if found is not None:
+            answers.append((found, _recorded(procedure)))
+    least = min(answers, key=lambda answer: answer[0][-1].errors.sum())[0][-1]
+    equal = [a for a in answers if not _leaves_more(a[0][-1], least, cfg.search)] or answers[:1]
+    equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
+    best, recorded = equal[0]
+    _record(procedure, recorded)
+    for other, of_other in equal[1:]:
+        if plausibility(other[-1]) > plausibility(best[-1]) - 2 * np.log(cfg.search.max_odds):
+            _add_to_group(procedure, of_other, other[-1])
+    return best
+
+
+def _add_to_group(procedure: Procedure, recorded: dict[str, Any], last: FittedModel) -> None:
+    """Add the effect by which another answer differs from a procedure's to the group of the one that it replaces."""
+    steps = {f.name: f.step for f in procedure.findings if f.accepted}
+    names = {f.name for f in recorded["findings"] if f.accepted}
+    ours, theirs = sorted(steps.keys() - names), sorted(names - steps.keys())
+    if len(ours) == len(theirs) == 1 and theirs[0] not in procedure.groups[steps[ours[0]]]:
+        step = steps[ours[0]]
+        procedure.groups[step] = (*procedure.groups[step], theirs[0])
+        procedure.hypotheses[step] = {**procedure.hypotheses[step], theirs[0]: last.model}
+
+
+def _leaves_more(one: FittedModel, least: FittedModel, cfg: SearchCfg) -> bool:
+    """Return whether the held-out error of a fitted model exceeds the least one by more than they may differ."""
+    difference = one.errors - least.errors
+    error = np.sqrt(len(difference)) * difference.std()
+    return bool(difference.sum() > max(cfg.equal_standard_errors * error, cfg.equal_error * least.errors.sum()))
+
+
+def _from(procedure: Procedure, first: FittedModel, rival: Rival) -> list[FittedModel]:
+    """Return the fitted models of the search that begins with a rival of the first effect."""
+    instead = replace(rival.finding, accepted=True, reason="")
+    procedure.findings = [
+        replace(f, accepted=False, reason="another one explains more beside the others") if f.accepted else f
+        for f in procedure.findings
+        if f.step == 0 and f.name != instead.name
+    ]
+    procedure.findings.insert(0, instead)
+    begun = beside(first, rival)
+    procedure.groups, procedure.hypotheses = [(instead.name,)], [{instead.name: begun.model}]
+    procedure.widening = {0: np.ones(len(instead.parameters))}
+    procedure.rivals = {0: procedure.rivals[0]}
+    procedure.provisional = None
+    return procedure.add_effects([first, begun], ())[0]
+
+
+def plausibility(one: FittedModel) -> float:
+    """Return twice the log posterior of a fitted model's effects, up to a constant.
+
+    Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
+    a Cauchy prior of the effects' sizes and a normal one of nominal values, and the effects' rarity.
+    """
+    prediction, count = one.prediction(), one.blocks.count
+    score = -count * float(np.log(max(one.errors.sum(), 1e-12)))
+    for added, part in zip(one.model.effects, prediction.split, strict=True):
+        null = np.array([p.null for p in prediction.parameters[part]])
+        scale = np.array([p.scale for p in prediction.parameters[part]])
+        away = np.where(np.isfinite(null), (one.fit.values[part] - null) / scale, 0.0)
+        if added.effect.nominal:
+            score -= float((away**2).sum()) / one.cfg.least_squares.prior**2
+        else:
+            score -= float(2 * np.log1p(away**2).sum()) + len(away) * float(np.log(count)) + added.effect.rarity
+    return score
+
+
+def _recorded(procedure: Procedure) -> dict[str, Any]:
+    """Return copies of what a search has recorded."""
+    return {name: copy(getattr(procedure, name)) for name in KEPT}
+
+
+def _record(procedure: Procedure, recorded: dict[str, Any]) -> None:
+    """Set what a search has recorded."""
+    for name, value in recorded.items():
+        setattr(procedure, name, copy(value))
