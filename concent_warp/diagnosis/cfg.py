@@ -264,14 +264,14 @@ class DiagnoseCfg:
     significance_level: OpenShare = 0.05
     """Probability of naming an effect where nothing is missing [-]."""
     quiet_significance_level: OpenShare = 0.005
-    """The same where the model leaves no more than noise in size [-]: such data are the most frequent, and errors of
-    nominal values and formulas have a structure, too."""
+    """The same where the model leaves little more than noise in size, `SearchCfg.explained_ratio` [-]: such data are the
+    most frequent, and errors of nominal values and formulas have a structure, too."""
     min_gain: float = 0.05
     """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""
-    quiet_min_gain: Share = 0.1
-    """The same where the model leaves no more than noise in size [-]: errors of formulas, too, can be found there, in
-    long recordings. Empirical."""
+    quiet_min_gain: Share = 0.125
+    """The same where the model leaves little more than noise in size [-]: errors of formulas, too, can be found there,
+    in long recordings. Empirical."""
     min_explained: Share = 0.2
     """Share of the discrepancy that the accepted effects must explain if something else is missing, or the model stays
     as given [-]: what explains less is rather an imitation. That of `SearchCfg.far_min_gain`."""

@@ -375,7 +375,7 @@ class Procedure:
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
-        if not is_lacking(base, self.noise_factors, cfg):
+        if least_ratio(base, self.noise_factors) <= cfg.search.explained_ratio:
             # What shows in the size of the residual no more than noise does must show the clearer in its structure.
             cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=cfg.quiet_min_gain)
         level = cfg.significance_level
