@@ -264,8 +264,8 @@ class DiagnoseCfg:
     significance_level: OpenShare = 0.05
     """Probability of naming an effect where nothing is missing [-]."""
     quiet_significance_level: OpenShare = 0.005
-    """The same where the model leaves little more than noise in size, `SearchCfg.explained_ratio` [-]: such data are the
-    most frequent, and errors of nominal values and formulas have a structure, too."""
+    """The same where the model leaves little more than noise in size, `SearchCfg.explained_ratio` [-]: such data are
+    the most frequent, and errors of nominal values and formulas have a structure, too."""
     min_gain: float = 0.05
     """Share of the held-out error that an effect must remove [-]; less is significant in long recordings, and means
     little."""
