@@ -20,7 +20,7 @@ from concent_warp.diagnosis.search.reconsider import Rival, beside
 if TYPE_CHECKING:
     from concent_warp.diagnosis.procedure import Procedure
 
-KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional", "earlier")
+KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional")
 """What a search records in its procedure."""
 
 
@@ -34,20 +34,27 @@ def try_alternatives(procedure: Procedure, fitted: list[FittedModel]) -> list[Fi
         procedure: The diagnosis; what it has recorded is that of the returned models afterwards.
         fitted: The model as given and after each addition, at least two.
     """
-    cfg, first = procedure.cfg, fitted[0]
-    begun = _recorded(procedure)
+    cfg, first, budget = procedure.cfg, fitted[0], procedure.budget
+    begun, cut, unsettled = _recorded(procedure), set(budget.cut), list(budget.unsettled)
     answers = [(fitted, begun)]
     equals = set(procedure.groups[0])
-    others = [r for r in procedure.rivals.get(0, ()) if r.finding.name not in equals]
+    others = [
+        r for r in procedure.rivals.get(0, ()) if r.finding.name not in equals and r.finding.p <= cfg.significance_level
+    ]
     for rival in others[: cfg.search.alternatives]:
         _record(procedure, begun)
         procedure.runner.progress(procedure.runner.share, f"trying {rival.finding.name} as the first effect")
-        unsettled = f"Open: whether {rival.finding.name} with another effect explains more."
-        found = procedure.budget.attempt(lambda r=rival: _from(procedure, first, r), None, unsettled)
-        if found is not None:
+        open_question = f"Open: whether {rival.finding.name} with another effect explains more."
+        found = budget.attempt(lambda r=rival: _from(procedure, first, r), None, open_question)
+        if found is not None and budget.cut == cut:
             answers.append((found, _recorded(procedure)))
+            continue
+        # The first answer is none the less complete.
+        budget.cut, budget.unsettled = set(cut), list(unsettled)
+        budget.note(open_question)
+        unsettled = list(budget.unsettled)
     least = min(answers, key=lambda answer: answer[0][-1].errors.sum())[0][-1]
-    equal = [a for a in answers if not _leaves_more(a[0][-1], least, cfg.search)] or answers[:1]
+    equal = [a for a in answers if not _leaves_more(a[0][-1], least, cfg.search)]
     equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
     best, recorded = equal[0]
     _record(procedure, recorded)
@@ -89,6 +96,8 @@ def _from(procedure: Procedure, first: FittedModel, rival: Rival) -> list[Fitted
     procedure.widening = {0: np.ones(len(instead.parameters))}
     procedure.rivals = {0: procedure.rivals[0]}
     procedure.provisional = None
+    if first.windows[0].defect is None:
+        procedure.time_step = None
     return procedure.add_effects([first, begun], ())[0]
 
 

@@ -103,8 +103,6 @@ class Procedure:
         self.provisional: int | None = None
         """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was
         left: what takes up an error in a formula explains a part of it."""
-        self.earlier: Sequence[FittedCandidate] = ()
-        """Fits of candidates to the model of the last addition."""
         self.rivals: dict[int, tuple[Rival, ...]] = {}
         """Candidates that explained nearly as much as each addition, and that one itself."""
         self.with_unestablished: list[FittedModel] = []
@@ -391,7 +389,6 @@ class Procedure:
 
         fits = CandidateFits(base, cfg, self.runner)
         fitted = fits.fit(screened, critical, short_windows)
-        self.earlier = fitted
         if parts and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
@@ -484,7 +481,7 @@ class Procedure:
         """
         span = share * ADDITIONS_SPAN / self.cfg.max_additions
         at_measured = linear_at_measured_states(base, self.cfg.search)
-        tasks = [(base, e, self.cfg.search, at_measured, self._earlier_values(e)) for e in effects]
+        tasks = [(base, e, self.cfg.search, at_measured) for e in effects]
         found = self.runner.run_in_time(screen, tasks, "screening", span)
         screened = [s for s in found if s is not None]
         if len(screened) < len(effects):
@@ -495,10 +492,6 @@ class Procedure:
         names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
         self.runner.progress(self.runner.share, ranking(base, screened, names, self.cfg.seed))
         return self.gradient.apply(base, screened, self.runner) if self.gradient else screened
-
-    def _earlier_values(self, effect: Effect) -> np.ndarray | None:
-        """Return the parameters of an effect as they were fitted before the last addition, shape (P,), if they were."""
-        return next((c.model.effects[-1].array for c in self.earlier if c.effect == effect), None)
 
     def _record(
         self, base: FittedModel, group: Sequence[tuple[FittedCandidate, Finding]], findings: Sequence[Finding]

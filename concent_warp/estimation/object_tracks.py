@@ -138,10 +138,12 @@ def measured_pose(
     if position is None or orientation is None:
         return None
     valid = np.isfinite(orientation.value).all(axis=1)
+    if not valid.any():
+        return None
     turn, clock = Rotation.from_quat(orientation.value[valid], scalar_first=True), orientation.time[valid]
-    time = position.time
-    rotation = Slerp(clock, turn)(np.clip(time, clock[0], clock[-1])) if len(clock) > 1 else turn[[0] * len(time)]
-    return time, position.value, rotation
+    if len(clock) == 1:
+        turn, clock = Rotation.concatenate([turn, turn]), np.array([clock[0], clock[0] + 1.0])
+    return position.time, position.value, Slerp(clock, turn)(np.clip(position.time, clock[0], clock[-1]))
 
 
 def frame_channel(

@@ -7,6 +7,7 @@ import pytest
 
 from concent_warp.cli import main
 from concent_warp.cli.fitted_effects import time_left
+from concent_warp.diagnosis.diagnose import diagnose as diagnosed
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.model import Model
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -87,6 +88,42 @@ def test_where_nothing_is_missing_nothing_is_saved(swing, tmp_path, capsys):
     assert "No discrepancy detected" in said
     assert "Smallest detectable sizes" in said
     assert "was not written" in said
+    assert not out.exists()
+
+
+def test_effects_that_explain_too_little_are_named_and_not_saved(swing, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "m.toml"
+
+    def little(*given, **more) -> Diagnosis:
+        return replace(diagnosed(*given, **more), verdict="none_of_these", unexplained=0.9, explains=False)
+
+    monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", little)
+    assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Missing: joint_damping" in said
+    assert "The effects above explain too little to be added: the model stays as given." in said
+    assert f"The accepted effects explain too little: {out} was not written." in said
+    assert not out.exists()
+    assert diagnose(swing / "demo.h5", "--apply", str(out), "--json") == 0
+    assert json.loads(capsys.readouterr().out)["effects"][0]["accepted"] is True
+    assert not out.exists()
+
+
+def test_where_nothing_explains_the_data_it_says_that_no_effect_was_accepted(swing, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "m.toml"
+
+    def none(*given, **more) -> Diagnosis:
+        found = diagnosed(*given, **more)
+        effects = tuple(replace(f, accepted=False, reason="no better than chance") for f in found.effects)
+        # As a search without an accepted effect ends where much more than noise is left.
+        missing = replace(found, verdict="none_of_these", unexplained=1.0, effects=effects, groups=())
+        return replace(missing, models=found.models[:1], ratio=found.ratio[:1], explains=False)
+
+    monkeypatch.setattr("concent_warp.cli.commands.diagnose.diagnose", none)
+    assert diagnose(swing / "demo.h5", "--apply", str(out)) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"No effect was accepted: {out} was not written." in said
+    assert "explain too little" not in said
     assert not out.exists()
 
 

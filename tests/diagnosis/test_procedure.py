@@ -68,9 +68,9 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         ((3.0, 2.0), 1, 2, None),
         ((1.27, 1.0246), 9, 2, None),
         ((1.27, 1.0248, 1.0), 9, 3, None),
-        ((3.0, 1.24, 1.0), 9, 2, None),  # adequate, and 7 % of the discrepancy is left
+        ((3.0, 1.24, 1.0), 9, 3, 1),  # adequate, but 7 % of the discrepancy is left: one more is tried
         ((2.4, 1.24, 1.0), 9, 3, None),
-        ((5.0, 1.26, 1.0), 9, 3, 1),  # not adequate: one more is tried
+        ((5.0, 1.26, 1.0), 9, 3, 1),
         ((5.0, 1.26, 1.24, 1.0), 9, 3, 1),
         ((5.0, 4.0, 1.24, 1.0), 9, 4, 2),  # adequate after two: one may be superfluous
         ((19.0, 2.01, 2.0, 1.8), 9, 4, 2),  # beyond twice the noise it is no error of form
@@ -92,6 +92,7 @@ def test_effects_are_added_until_none_is_accepted_or_little_is_left(monkeypatch)
         monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
         monkeypatch.setattr(module, "renew_defects", lambda one, cfg, seen=renewed: seen.append((one, cfg)) or one)
         monkeypatch.setattr(made, "simplified", lambda fitted: fitted)
+        monkeypatch.setattr(made, "restore_given", lambda fitted, _given: fitted)
         monkeypatch.setattr(made, "final_values", lambda fitted: fitted)
         monkeypatch.setattr(made, "conclude", lambda *args, concluded=concluded: concluded.append(args))
         made.run()
@@ -116,7 +117,7 @@ def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch)
         ((3.0, 1.53, 1.0), 1.5, 2),  # 1.02 x the largest noise
         ((3.0, 1.55, 1.0), 1.5, 3),
         ((3.0, 1.53, 1.0), 1.0, 3),
-        ((5.0, 1.26, 1.0), 1.01, 2),  # adequate beside it
+        ((5.0, 1.26, 1.0), 1.01, 3),  # adequate beside it, but more than the noise may be
         ((1.5, 1.0), 1.5, 2),
     ):
         made, nodes = procedure(), [node(r) for r in ratios]
@@ -223,7 +224,7 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
         (104.0, 104.0, GIVEN, 0), (104.0, 120.0, GIVEN, 2), (120.0, 104.0, FINER, 0), (120.0, 120.0, FINER, 2),
     ):  # fmt: skip
         made = procedure()
-        made.time_step = "found"
+        made.time_step, made.findings = "found", [finding("a", 0.5)]
         last = node(1.0, 100.0, effects=1, timestep=FINER, nominal=2)
         monkeypatch.setattr(
             module, "at_given_step", lambda one, errors=errors: node(1.0, errors, 1, nominal=len(one.model.effects) - 1)
@@ -234,7 +235,7 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
             lambda one, errors=nominal_errors: node(1.0, errors * one.errors.sum() / 100, 1, timestep=one.timestep),
         )
         first = node(3.0)
-        after = made.restore_given([first, last])
+        after = made.restore_given([first, last], first)
         assert after[0] is first
         assert (after[1].timestep, len(after[1].model.effects) - 1) == (timestep, nominal)
         assert made.time_step == ("found" if timestep == FINER else None)
@@ -242,7 +243,7 @@ def test_time_step_and_nominal_values_are_restored_where_they_explain_no_more_at
     for name in ("at_given_step", "without_nominal_values"):
         monkeypatch.setattr(module, name, lambda *_: pytest.fail("nothing to restore"))
     nodes = [node(3), node(1.0, effects=1)]
-    assert plain.restore_given(nodes) == nodes
+    assert plain.restore_given(nodes, nodes[0]) == nodes
 
 
 def test_the_answer_starts_with_the_model_as_given(monkeypatch):
@@ -323,7 +324,8 @@ def test_a_dropped_addition_leaves_the_effects_that_were_reconsidered_beside_it(
 def rivals(*names: str, step: int = 0) -> tuple[Rival, ...]:
     """Return effects that explained nearly as much as each other."""
     added: Any = "added"
-    return tuple(Rival(finding(n, 0.5, step=step), added) for n in names)
+    fit: Any = "fit"
+    return tuple(Rival(finding(n, 0.5, step=step), added, fit) for n in names)
 
 
 def test_earlier_additions_are_reconsidered_beside_later_ones(monkeypatch):
@@ -746,8 +748,11 @@ def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monke
         ((1.2,), [], None, "none_needed", 0.0, False),
         ((1.25,), [], None, "none_needed", 0.0, False),
         ((1.26,), [], None, "none_of_these", 1.0, False),
-        ((3.0, 1.25), [("a",)], None, "effect", (1.25**2 - 1) / 8, False),
-        ((3.0, 1.1), [("a",), ("b", "c")], None, "group", (1.1**2 - 1) / 8, False),
+        ((3.0, 1.25), [("a",)], None, "effect", (1.25**2 - 1) / 8, True),  # 7 % of the discrepancy
+        ((3.0, 1.1), [("a",), ("b", "c")], None, "group", (1.1**2 - 1) / 8, True),
+        ((3.0, 1.02), [("a",)], None, "effect", (1.02**2 - 1) / 8, False),  # no more than noise
+        ((1.5, 1.1), [("a",)], None, "effect", (1.1**2 - 1) / (1.5**2 - 1), False),  # little beside the noise
+        ((1.5, 1.11), [("a",)], None, "none_of_these", (1.11**2 - 1) / (1.5**2 - 1), False),
         ((3.0, 2.0), [("a",)], None, "none_of_these", 3 / 8, False),
         ((3.0, 0.9), [("a",)], None, "effect", 0.0, False),
         ((3.0, 4.0), [], None, "none_of_these", 1.0, False),
@@ -764,11 +769,12 @@ def test_additions_that_explain_nothing_over_longer_windows_are_taken_back(monke
     ],
 )
 def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown, verdict, unexplained, form_error):
-    made = procedure()
+    made, added = procedure(), bool(groups) or unknown is not None
     made.groups = groups
     made.findings = [
-        finding("late", 0.1, step=1), finding("no", 0.9, accepted=False), finding("first", 0.2),
-        finding("less", 0.8, accepted=False), finding("later", 0.95, accepted=False, step=1),
+        finding("late", 0.1, accepted=added, step=1), finding("no", 0.9, accepted=False),
+        finding("first", 0.2, accepted=added), finding("less", 0.8, accepted=False),
+        finding("later", 0.95, accepted=False, step=1),
     ]  # fmt: skip
     # A share below zero stands for an error of form.
     force = None if unknown is None else SimpleNamespace(share=abs(unknown), form_error=unknown < 0)
@@ -778,14 +784,15 @@ def test_verdicts_follow_from_what_is_left(monkeypatch, ratios, groups, unknown,
     assert found.verdict == verdict
     assert found.unexplained == pytest.approx(unexplained)
     assert found.ratio == tuple(10 * r for r in ratios)
-    assert [f.name for f in found.effects] == ["first", "late", "no", "less", "later"]
+    order = ["first", "late", "no", "less", "later"] if added else ["no", "less", "first", "later", "late"]
+    assert [f.name for f in found.effects] == order
     assert found.groups == tuple(groups)
     assert (found.detectable, found.issues, found.seed) == (("size",), ("a gap",), 0)
     assert [m.name for m in found.models] == [str(ratios[0]), *(f"delivered {r}" for r in ratios[1:])]
     assert (found.where, found.next_experiment) == ((), None)
     assert found.form_error == (pytest.approx(unexplained) if form_error else None)
     # Where much more than noise is left, no force of unknown form is needed to show that something is missing.
-    tested = ratios[-1] <= 1.25 or ratios == (5.0, 1.3) or form_error
+    tested = ratios[-1] <= 1.1 or ratios == (5.0, 1.3) or form_error
     assert found.unknown_force is (force if tested else None)
 
 
@@ -826,6 +833,8 @@ def test_failures_and_an_experiment_explain_what_was_found(monkeypatch):
 class MadeUp(SimpleNamespace):
     """A fitted candidate."""
 
+    fit = "its fit"
+
     def share(self, base: Any) -> float:
         """Return its gain over a baseline."""
         return self.gain - getattr(base, "less", 0.0)
@@ -850,8 +859,9 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
         module, "detectable_size", lambda _b, s, needed: notes.update(needed=needed) or (s if s != "s2" else None)
     )
 
-    def assess(base, c, _null, step, _effects, _cfg):
+    def assess(base, c, _null, step, _effects, cfg):
         notes["bases"].append(base)
+        notes["level"], notes["min_gain"] = cfg.significance_level, cfg.min_gain
         return finding(c.name, c.share(base), accepted=gains[c.name][1], step=step)
 
     class Fits:
@@ -893,7 +903,7 @@ def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
     assert made.widening == {1: "width of a"}
     assert [{n: m.name for n, m in models.items()} for models in made.hypotheses] == [{"a": "model a", "b": "model b"}]
     assert list(made.rivals) == [1]
-    assert [(r.finding.name, r.added) for r in made.rivals[1]] == [(n, f"added {n}") for n in "bdca"]
+    assert [(r.finding.name, r.added, r.fit) for r in made.rivals[1]] == [(n, f"added {n}", "its fit") for n in "bdca"]
     assert [(f.name, f.accepted, f.reason, f.step) for f in made.findings] == [
         ("a", True, "", 1),
         ("b", False, "another one explains more", 1),
@@ -922,14 +932,30 @@ def test_where_nothing_is_accepted_findings_are_kept_by_gain(monkeypatch):
     assert (made.groups, made.rivals) == ([], {})
 
 
-def test_a_residual_within_the_noise_is_not_searched(monkeypatch):
-    for ratio, count in ((1.0246, 0), (1.0248, 1)):
-        made = procedure()
-        (best, sizes), notes = searched(monkeypatch, made, {"a": (0.9, True)}, np.zeros(10), ratio)
-        assert (best is not None) == bool(count)
+def test_a_residual_that_is_little_more_than_noise_is_searched_at_a_stricter_level(monkeypatch):
+    for ratio, factor, level, gain in (
+        (1.0, 1.0, 0.005, 0.125),
+        (1.09, 1.0, 0.005, 0.125),
+        (1.11, 1.0, 0.05, 0.05),
+        (1.3, 1.2, 0.005, 0.125),  # 1.08 x the largest noise
+        (1.33, 1.2, 0.05, 0.05),
+    ):
+        made, null = procedure(), np.arange(1001) / 1000
+        made.noise_factors = {"angle": factor}
+        (best, sizes), notes = searched(monkeypatch, made, {"a": (0.9, True)}, null, ratio)
+        assert best.name == "a"
         assert sizes == ("s1", "s3")
-        assert ("critical" in notes) == bool(count)
-        assert len(made.findings) == len(made.groups) == count
+        assert notes["critical"] == notes["needed"] == pytest.approx(1 - level)
+        assert notes["level"] == level
+        assert len(made.findings) == len(made.groups) == 1
+        # Where chance is less than that, an effect must still remove a share of the error.
+        other = procedure()
+        other.noise_factors = made.noise_factors
+        _, notes = searched(monkeypatch, other, {"a": (0.9, True)}, np.zeros(10), ratio)
+        assert (notes["needed"], notes["min_gain"]) == (gain, gain)
+    stricter = procedure(quiet_significance_level=0.001)
+    _, notes = searched(monkeypatch, stricter, {"a": (0.9, True)}, np.arange(1001) / 1000, 1.0)
+    assert notes["critical"] == pytest.approx(0.999)
 
 
 def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
@@ -1111,7 +1137,8 @@ def test_parts_are_candidates_where_no_other_one_explains_the_data(monkeypatch, 
     made, parts = procedure(), Parts(monkeypatch, fits)
     added, sizes = parts.find(made, ratio)
     assert added == ("part" if needed else "whole" if whole else None)
-    assert sizes == ("whole 0.05", "other 0.05")
+    least = 0.125 if ratio <= 1.1 else 0.05
+    assert sizes == (f"whole {least}", f"other {least}")
     first, rest = ["whole", "other"], [["part"]] if needed else []
     assert parts.screened == [first, *rest]
     # Chance has the best of all of them, for those that were fitted before as well.

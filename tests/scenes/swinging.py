@@ -44,6 +44,7 @@ def swung(
     seconds: float = 2.0,
     seed: int = 0,
     told: float = 0.0,
+    delay: float = 0.0,
     quaternion: bool = False,
     timestep: float = TIMESTEP,
 ) -> Recording:
@@ -54,6 +55,7 @@ def swung(
         seconds: Length.
         seed: Of the noise.
         told: By how much the initial angle that the recording tells is off [rad].
+        delay: From a command to the servo [s].
         quaternion: Whether the orientation of the arm is measured too.
         timestep: Of the simulation [s]; that of the recording's scene is `TIMESTEP`.
     """
@@ -66,7 +68,8 @@ def swung(
     command = np.array([0.8, -0.5, 0.3, -0.8, 0.6, 0.0, -0.3, 0.5] * (1 + len(at) // 8))[: len(at)]
     rows = []
     for k in range(steps + 1):
-        d.ctrl[0] = command[min(int(k * m.opt.timestep / 0.25 + 1e-9), len(at) - 1)]
+        given = max(k * m.opt.timestep - delay, 0.0)
+        d.ctrl[0] = command[min(int(given / 0.25 + 1e-9), len(at) - 1)]
         mujoco.mj_forward(m, d)
         rows.append(d.sensordata.copy())
         mujoco.mj_step(m, d)

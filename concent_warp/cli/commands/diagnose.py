@@ -187,7 +187,7 @@ def _save_accepted(arguments: Arguments, found: Diagnosis) -> None:
         return
     if not found.changes_model:
         if not arguments.json:
-            why = "No effect was accepted" if found.explains else "The accepted effects explain too little"
+            why = "The accepted effects explain too little" if found.accepted else "No effect was accepted"
             say(escape(f"{why}: {path} was not written."))
         return
     make_folder(path.parent)

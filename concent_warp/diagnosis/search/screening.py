@@ -21,11 +21,7 @@ RANKED = 4
 
 
 def screen(
-    base: FittedModel,
-    effect: Effect,
-    cfg: SearchCfg | None = None,
-    at_measured: tuple[Linear, ...] = (),
-    earlier: np.ndarray | None = None,
+    base: FittedModel, effect: Effect, cfg: SearchCfg | None = None, at_measured: tuple[Linear, ...] = ()
 ) -> ScreenedCandidate:
     """Return a candidate with the gain that a fit is expected to have.
 
@@ -38,7 +34,6 @@ def screen(
         effect: The candidate.
         cfg: Settings.
         at_measured: See `linear_at_measured_states`; computed where not given.
-        earlier: Parameters of the effect that were fitted beside other effects, shape (P,); one more scanned value.
     """
     cfg = cfg or SearchCfg()
     solver = base.solver(effect)
@@ -60,11 +55,10 @@ def screen(
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
         before = base.held_out(plain).own()
         gain = max(gain, _linear_gain(base, there, plain, before))
-    scanned = _scanned_values(solver, values, earlier)
-    scanned_gain, start = _scan(solver, base, values, base.fit.offsets, scanned)
+    scanned_gain, start = _scan(solver, base, values, base.fit.offsets)
     measured = False
     if far:
-        other_gain, other = _scan(solver, base, values, zero, scanned)
+        other_gain, other = _scan(solver, base, values, zero)
         if other_gain > scanned_gain:
             scanned_gain, start, measured = other_gain, other, True
     return ScreenedCandidate(effect, gain, scanned_gain, start, pieces, measured)
@@ -144,33 +138,8 @@ def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Li
     return float((before.sum() - errors.sum()) / max(before.sum(), 1e-12))
 
 
-def _scanned_values(solver: Solver, values: np.ndarray, earlier: np.ndarray | None) -> list[np.ndarray]:
-    """Return the parameters that are tried, each (P,): one away from its null value, and earlier values.
-
-    Args:
-        solver: Solver of the candidate.
-        values: Parameters at their null values, shape (P,).
-        earlier: Parameters of the effect that were fitted before, if any.
-    """
-    trials = []
-    for k, parameter in enumerate(solver.p.parameters):
-        if k < solver.p.owned:
-            continue
-        for value in parameter.scan:
-            moved = values.copy()
-            moved[k] = value
-            trials.append(moved)
-    if earlier is not None:
-        trials.append(np.concatenate([values[: solver.p.owned], earlier]))
-    return trials
-
-
 def _scan(
-    solver: Solver,
-    base: FittedModel,
-    values: np.ndarray,
-    offsets: Sequence[np.ndarray],
-    trials: Sequence[np.ndarray],
+    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
 ) -> tuple[float, np.ndarray]:
     """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
 
@@ -181,8 +150,15 @@ def _scan(
         base: The fitted baseline.
         values: Parameters at their null values, shape (P,).
         offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
-        trials: The parameters that are tried, each (P,).
     """
+    trials = []
+    for k, parameter in enumerate(solver.p.parameters):
+        if k < solver.p.owned:
+            continue
+        for value in parameter.scan:
+            moved = values.copy()
+            moved[k] = value
+            trials.append(moved)
     best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
     if not trials:
         return best, start

@@ -75,7 +75,7 @@ def _shifted(prediction: Prediction, window: int, cfg: ObservationCfg) -> list[S
     m = prediction.compiled
     step = m.opt.timestep
     (course,) = prediction.courses([SimulationRequest(window, values)], 2 * step)
-    acceleration = (course.qvel[1] - course.qvel[0]) / step
+    acceleration = np.nan_to_num((course.qvel[1] - course.qvel[0]) / step, posinf=0.0, neginf=0.0)
     # What presses bodies apart that overlap at the start, by an error of their measured poses, says nothing about them.
     acceleration[_touching_dofs(m, course.qpos[0])] = 0.0
     rng, found = np.random.default_rng(0), []

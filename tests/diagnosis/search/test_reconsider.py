@@ -44,8 +44,9 @@ def finding(name: str, **changes: Any) -> Finding:
 
 def rival(name: str, alone: FittedModel | None = None, **changes: Any) -> Rival:
     """Return a rival, with the values that it had when no other effect was in the model."""
-    (added,) = (alone or fitted(name)).model.effects
-    return Rival(finding(name, **changes), added)
+    alone = alone or fitted(name)
+    (added,) = alone.model.effects
+    return Rival(finding(name, **changes), added, alone.fit)
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,11 @@ class MadeUp:
         """A model in which the candidate comes last."""
         return SimpleNamespace(effects=("own", f"added {self.name}"))
 
+    @property
+    def fit(self) -> str:
+        """Its fit."""
+        return f"fit of {self.name}"
+
     def share(self, base: Any) -> float:
         """Return the gain over a baseline."""
         return self.gain - base
@@ -93,7 +99,7 @@ def near(gains: dict[str, float], base: float = 0.0, **changes: Any) -> list[str
     given: Any = base
     cfg = replace(CFG, search=replace(SearchCfg(), **changes))
     found = near_best(given, fits, [finding(n, accepted=g > 0.5) for n, g in gains.items()], cfg)
-    assert [r.added for r in found] == [f"added {r.finding.name}" for r in found]
+    assert [(r.added, r.fit) for r in found] == [(f"added {r.finding.name}", f"fit of {r.finding.name}") for r in found]
     return [r.finding.name for r in found]
 
 

@@ -1,0 +1,317 @@
+"""The search continued from a rival of the first of several effects: a pendulum with a hidden damping and delay.
+
+Of a lag, a delay and a damping, the lag explains most while both others are missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis import alternatives as module
+from concent_warp.diagnosis import procedure as procedure_module
+from concent_warp.diagnosis.alternatives import KEPT, _from, plausibility, try_alternatives
+from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.reconsider import Rival, beside
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.effects.effect import Effect
+from concent_warp.effects.library.joints import JointDamping
+from concent_warp.effects.library.nominal import NominalGain
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from concent_warp.simulate.time_limit import TimeUpError
+from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
+
+DELAY = 0.03
+"""From a command to the servo [s]."""
+RECORDING = swung(seconds=3.0, delay=DELAY)
+EFFECTS = ("joint_damping", "actuator_delay", "actuator_lag")
+
+
+def searching(alternatives: int, *, recording=RECORDING, max_additions: int = 3) -> Procedure:
+    """Return a procedure that looks for a lag, a delay and a damping, from some rivals of the first."""
+    cfg = DiagnoseCfg(
+        jobs=1, explain=False, effects=EFFECTS, max_additions=max_additions, nominal=NominalCfg(enabled=False),
+        search=SearchCfg(alternatives=alternatives),
+    )  # fmt: skip
+    return Procedure(drawing(recording), recording, cfg)
+
+
+def names(one: FittedModel) -> list[str]:
+    return [added.effect.name for added in one.model.effects]
+
+
+def accepted(made: Procedure) -> list[str]:
+    return [f.name for f in made.findings if f.accepted]
+
+
+@pytest.fixture(scope="module")
+def greedy() -> tuple[Procedure, list[FittedModel]]:
+    """Return a search that adds one effect after another, and its fitted models."""
+    made = searching(0)
+    return made, made.search(made.baseline())[0]
+
+
+@pytest.fixture(scope="module")
+def continued() -> Diagnosis:
+    """Return the diagnosis whose search is continued from the best rival of the first effect."""
+    return searching(1).run()
+
+
+def resumed(greedy: tuple[Procedure, list[FittedModel]], alternatives: int) -> Procedure:
+    """Return a procedure with what such a search has recorded."""
+    made = searching(alternatives)
+    for name in (*KEPT, "noise", "noise_factors"):
+        setattr(made, name, getattr(greedy[0], name))
+    return made
+
+
+def test_an_effect_that_stands_for_parts_of_others_comes_first_where_one_is_added_after_another(greedy):
+    made, fitted = greedy
+    assert [r.finding.name for r in made.rivals[0]] == ["actuator_lag", "actuator_delay", "joint_damping"]
+    assert [names(one)[-1:] for one in fitted] == [[], ["actuator_lag"], ["joint_damping"], ["actuator_delay"]]
+    assert accepted(made) == ["actuator_lag", "joint_damping", "actuator_delay"]
+
+
+def test_the_search_from_its_best_rival_finds_the_effects_that_are_missing(continued):
+    assert continued.verdict == "effect"
+    assert [(f.name, f.step) for f in continued.accepted] == [("actuator_delay", 0), ("joint_damping", 1)]
+    delay, damping = (f.parameters[0] for f in continued.accepted)
+    assert delay.low < DELAY < delay.high
+    assert damping.low < DAMPING < damping.high
+    # One ratio for the model as given and each addition: none of the first search.
+    assert len(continued.ratio) == len(continued.models) == 3
+    assert continued.ratio[-1] == pytest.approx(1.0, abs=0.05)
+    assert continued.groups == (("actuator_delay",), ("joint_damping",))
+
+
+def test_findings_are_those_of_the_answer_alone(continued):
+    first = [f for f in continued.effects if f.step == 0]
+    assert sorted(f.name for f in first) == sorted(EFFECTS)
+    (lag,) = (f for f in first if f.name == "actuator_lag")
+    assert (lag.accepted, lag.reason) == (False, "another one explains more beside the others")
+    assert {f.step for f in continued.effects} == {0, 1}
+
+
+def test_an_alternative_that_leaves_more_changes_nothing(greedy, monkeypatch):
+    made, fitted = resumed(greedy, 1), greedy[1]
+    before = {name: getattr(made, name) for name in KEPT}
+    monkeypatch.setattr(made, "add_effects", lambda begun, _: (begun, ()))  # it finds no second effect
+    assert try_alternatives(made, fitted) is fitted
+    assert {name: getattr(made, name) for name in KEPT} == before
+
+
+def test_as_many_rivals_are_tried_as_asked_for_and_none_of_the_group_of_the_first(greedy, monkeypatch):
+    for alternatives, group, tried in (
+        (0, ("actuator_lag",), []),
+        (1, ("actuator_lag",), ["actuator_delay"]),
+        (2, ("actuator_lag",), ["actuator_delay", "joint_damping"]),
+        (9, ("actuator_lag",), ["actuator_delay", "joint_damping"]),
+        (1, ("actuator_lag", "actuator_delay"), ["joint_damping"]),
+    ):
+        made, begun = resumed(greedy, alternatives), []
+        made.provisional = 1
+        assert made.time_step is None
+        made.groups = [group, *made.groups[1:]]
+
+        def add(fitted, _, begun=begun, made=made):
+            begun.append(names(fitted[-1])[-1])
+            # Each begins with its own effect, and with nothing of an earlier one.
+            assert accepted(made) == begun[-1:]
+            assert made.groups == [(begun[-1],)]
+            assert list(made.rivals) == [0]
+            assert made.provisional is None
+            assert made.time_step is None
+            made.time_step = FinerTimeStep(0.01, 0.002, 1.0, 0.5, 0.4, 0.6)
+            return fitted, ()
+
+        monkeypatch.setattr(made, "add_effects", add)
+        try_alternatives(made, greedy[1])
+        assert begun == tried
+        assert made.groups[0] == group
+        assert (made.provisional, made.time_step) == (1, None)
+
+
+def test_a_single_effect_has_no_alternatives(monkeypatch):
+    monkeypatch.setattr(procedure_module, "try_alternatives", lambda *_: pytest.fail("one effect was added"))
+    made = searching(1, max_additions=1)
+    made.search(made.baseline())
+    assert len(accepted(made)) == 1
+
+
+def test_an_alternative_that_there_is_no_time_for_is_named_and_the_answer_stays(greedy, monkeypatch):
+    made, fitted = resumed(greedy, 1), greedy[1]
+
+    def late(*_):
+        raise TimeUpError
+
+    monkeypatch.setattr(made, "add_effects", late)
+    assert try_alternatives(made, fitted) is fitted
+    assert made.budget.unsettled == ["Open: whether actuator_delay with another effect explains more."]
+    assert made.budget.cut == set()
+    assert accepted(made) == accepted(greedy[0])
+
+
+def test_a_search_from_a_rival_begins_with_that_effect_alone(greedy):
+    made, (first, *_) = resumed(greedy, 1), greedy[1]
+    made.cfg = replace(made.cfg, max_additions=1)
+    rival = next(r for r in made.rivals[0] if r.finding.name == "joint_damping")
+    _, begun = _from(made, first, rival)
+    assert names(begun) == accepted(made) == ["joint_damping"]
+    assert {f.step for f in made.findings} == {0}
+    assert (made.groups, list(made.hypotheses[0])) == ([("joint_damping",)], ["joint_damping"])
+    assert made.hypotheses[0]["joint_damping"] is begun.model
+    assert [w.tolist() for w in made.widening.values()] == [[1.0]]
+
+
+@pytest.fixture(scope="module")
+def base() -> FittedModel:
+    """Return a pendulum that lacks its damping, fitted."""
+    recording = swung(seconds=1.0)
+    windows = windows_of(recording)
+    return fit_baseline(drawing(recording), windows, cut_blocks(windows))
+
+
+def added(base: FittedModel, effect: Effect) -> FittedModel:
+    """Return a fitted model with an effect."""
+    return add_candidate(base, fit_candidate(base, screen(base, effect)))
+
+
+def rival_of(one: FittedModel) -> Rival:
+    """Return the last effect of a fitted model as a rival."""
+    evidence = Finding("rival", (), "", (), 0.5, 0.4, 0.6, 0.01, 0.01, False, 0, ())
+    return Rival(evidence, one.model.effects[-1], one.fit)
+
+
+def test_a_rival_is_added_from_where_its_fit_ended(base):
+    damped = added(base, JointDamping("hinge"))
+    found = beside(base, rival_of(damped))
+    assert names(found) == ["joint_damping"]
+    assert found.fit.values == pytest.approx([DAMPING], rel=0.05)
+    assert found.fit.cost <= 1.001 * damped.fit.cost
+    assert found.errors.sum() < 0.1 * base.errors.sum()
+
+
+def test_over_other_windows_a_rival_has_the_initial_states_of_the_model(base):
+    damped, windows = added(base, JointDamping("hinge")), windows_of(swung(seconds=1.0), 0.5)
+    cut = fit_baseline(base.model, windows, cut_blocks(windows))
+    assert len(cut.fit.offsets) == 2 * len(damped.fit.offsets)
+    found = beside(cut, rival_of(damped))
+    assert len(found.fit.offsets) == len(windows)
+    assert found.fit.values == pytest.approx([DAMPING], rel=0.05)
+
+
+def at(one: FittedModel, value: float) -> FittedModel:
+    """Return a fitted model with its only parameter at a value, its errors as they are."""
+    return replace(one, fit=replace(one.fit, values=np.array([value])))
+
+
+def test_an_effect_is_the_more_plausible_the_more_it_explains_and_costs_the_logarithm_of_the_blocks(base):
+    damped, count = added(base, JointDamping("hinge")), base.blocks.count
+    assert plausibility(damped) > plausibility(base) + 10
+    assert plausibility(base) == pytest.approx(-count * np.log(base.errors.sum()))
+    idle = at(replace(damped, errors=base.errors), 0.0)
+    assert plausibility(base) - plausibility(idle) == pytest.approx(np.log(count))
+    half = replace(base, errors=base.errors / 2)
+    assert plausibility(half) - plausibility(base) == pytest.approx(count * np.log(2))
+
+
+def test_each_parameter_of_an_effect_counts(base):
+    effect = effect_class("stribeck_friction")("hinge")
+    parameters = base.solver(effect).p.parameters
+    assert len(parameters) > 1
+    rubbed = fit_baseline(base.model.add(effect, [p.null for p in parameters]), base.windows, base.blocks)
+    idle = replace(rubbed, errors=base.errors, fit=replace(rubbed.fit, values=np.array([p.null for p in parameters])))
+    expected = len(parameters) * np.log(base.blocks.count) + effect.rarity
+    assert plausibility(base) - plausibility(idle) == pytest.approx(expected)
+
+
+def test_larger_effects_and_rare_ones_are_less_plausible(base, monkeypatch):
+    damped = added(base, JointDamping("hinge"))
+    (scale,) = (p.scale for p in damped.prediction().parameters)
+    least, large = plausibility(at(damped, 0.0)), plausibility(at(damped, 3 * scale))
+    assert least - large == pytest.approx(2 * np.log(10))  # Cauchy's density, squared for twice its logarithm
+    monkeypatch.setattr(JointDamping, "rarity", 6.0)
+    assert least - plausibility(at(damped, 0.0)) == pytest.approx(6.0)
+
+
+def test_nominal_values_cost_what_they_are_off_and_nothing_for_their_number(base):
+    gain = added(base, NominalGain("servo"))
+    ((scale, null),) = ((p.scale, p.null) for p in gain.prediction().parameters)
+    same = -base.blocks.count * np.log(gain.errors.sum())
+    assert plausibility(at(gain, null)) == pytest.approx(same)
+    prior = gain.cfg.least_squares.prior
+    assert plausibility(at(gain, null)) - plausibility(at(gain, null + 2 * scale)) == pytest.approx(4 / prior**2)
+
+
+def settled(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, answer: FittedModel, odds: float) -> Any:
+    """Return a procedure after an alternative that has a damping and a delay beside those of the first search.
+
+    Args:
+        greedy: That search.
+        monkeypatch: Of the test.
+        answer: Last model of the alternative.
+        odds: By how much the alternative is the more plausible, twice the logarithm.
+    """
+    made = resumed(greedy, 1)
+    last = greedy[1][2]
+    made.groups, made.hypotheses = made.groups[:2], made.hypotheses[:2]
+    made.findings = [f for f in made.findings if f.step < 2]
+    assert accepted(made) == ["actuator_lag", "joint_damping"]
+
+    def add(begun, _):
+        (damping,) = (f for f in greedy[0].findings if f.accepted and f.name == "joint_damping")
+        made.findings = [*made.findings, damping]
+        made.groups, made.hypotheses = [*made.groups, ("joint_damping",)], [*made.hypotheses, {}]
+        return [*begun, answer], ()
+
+    monkeypatch.setattr(made, "add_effects", add)
+    monkeypatch.setattr(module, "plausibility", lambda one: odds if one is answer else 0.0)
+    return made, try_alternatives(made, greedy[1][:3])[-1], last
+
+
+def test_the_more_plausible_of_answers_that_explain_as_much_counts(greedy, monkeypatch):
+    for odds, chosen in ((100.0, "actuator_delay"), (-100.0, "actuator_lag")):
+        answer = replace(greedy[1][2])
+        made, found, last = settled(greedy, monkeypatch, answer, odds)
+        assert found is (answer if odds > 0 else last)
+        assert accepted(made) == [chosen, "joint_damping"]
+        # The other is so much less plausible that it is not named.
+        assert made.groups == [(chosen,), ("joint_damping",)]
+
+
+def test_the_effect_of_an_answer_that_is_nearly_as_plausible_joins_the_group_of_the_one_it_replaces(
+    greedy, monkeypatch
+):
+    limit = 2 * float(np.log(SearchCfg().max_odds))
+    for odds, named in ((-0.99 * limit, True), (-1.01 * limit, False)):
+        answer = replace(greedy[1][2])
+        made, _, _ = settled(greedy, monkeypatch, answer, odds)
+        assert accepted(made) == ["actuator_lag", "joint_damping"]
+        assert made.groups == [("actuator_lag", "actuator_delay") if named else ("actuator_lag",), ("joint_damping",)]
+        assert (made.hypotheses[0].get("actuator_delay") is answer.model) == named
+        assert "actuator_delay" not in greedy[0].hypotheses[0]
+
+
+def test_a_more_plausible_answer_that_leaves_more_does_not_count(greedy, monkeypatch):
+    for more, chosen in ((1.019, "actuator_delay"), (1.021, "actuator_lag")):  # within 2 %
+        answer = replace(greedy[1][2], errors=more * greedy[1][2].errors)
+        made, found, _ = settled(greedy, monkeypatch, answer, 100.0)
+        assert (found is answer) == (chosen == "actuator_delay")
+        assert accepted(made)[0] == chosen
+
+
+def test_an_answer_that_leaves_less_counts_whatever_its_plausibility(greedy, monkeypatch):
+    answer = replace(greedy[1][2], errors=0.5 * greedy[1][2].errors)
+    made, found, _ = settled(greedy, monkeypatch, answer, -100.0)
+    assert found is answer
+    assert accepted(made) == ["actuator_delay", "joint_damping"]
+    assert made.groups == [("actuator_delay",), ("joint_damping",)]
