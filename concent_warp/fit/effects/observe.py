@@ -21,7 +21,7 @@ from concent_warp.fit.effects.observation import (
     start_spread,
 )
 from concent_warp.fit.effects.prediction import turn
-from concent_warp.fit.effects.scatter import with_scatter
+from concent_warp.fit.effects.scatter import touches, with_scatter
 from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.replay import commands
 from concent_warp.simulate.select import EngineName, make_engine
@@ -144,18 +144,7 @@ def moves_untouched(model: Model, windows: Sequence[Window], engine: EngineName)
         return False
     if not _can_touch(m):
         return True
-    simulator = make_engine(engine, model)
-    for w in windows:
-        steps = max(int(np.ceil((w.end - w.start) / m.opt.timestep - 1e-9)), 1)
-        start = Variants(1, qpos=w.qpos[None], qvel=w.qvel[None])
-        try:
-            ctrl = commands(m, w.demonstration, steps, w.start)
-        except RecordingError:  # it has no commands; who simulates it says so
-            return False
-        rollout = simulator.run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
-        if rollout.diverged.any() or rollout.touched.any():
-            return False
-    return True
+    return all(touches(model, w, engine) is False for w in windows)
 
 
 def _can_touch(m: mujoco.MjModel) -> bool:

@@ -54,17 +54,17 @@ def with_scatter(
     return found
 
 
-def touches(model: Model, w: Window, engine: EngineName) -> bool:
+def touches(model: Model, w: Window, engine: EngineName) -> bool | None:
     """Return whether something touches something in a model's motion from the estimated state of a window on.
 
-    It is taken that nothing does where the recording has no commands: who simulates it says so.
+    None where the recording has no commands to simulate it; who simulates it says so.
     """
     steps = max(int(np.ceil((w.end - w.start) / model.scene.model.opt.timestep - 1e-9)), 1)
     start = Variants(1, qpos=w.qpos[None], qvel=w.qvel[None])
     try:
         ctrl = commands(model.compile(), w.demonstration, steps, w.start)
     except RecordingError:
-        return False
+        return None
     rollout = make_engine(engine, model).run(start, ctrl, record=[0], bodies=[], contacts="touched").numpy()
     return bool(rollout.diverged.any() or rollout.touched.any())
 
