@@ -7,24 +7,47 @@ beginnings finds sets of effects that no exchange of a single one leads to (beam
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import SearchCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.result import Detectable, Finding, FinerTimeStep
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.reconsider import Rival, beside
-
-if TYPE_CHECKING:
-    from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.tasks import TaskRunner
+from concent_warp.diagnosis.time_budget import TimeBudget
+from concent_warp.model import Model
 
 KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional")
 """What a search records in its procedure."""
 
 
-def try_alternatives(procedure: Procedure, fitted: list[FittedModel]) -> list[FittedModel]:
+class Search(Protocol):
+    """A diagnosis that can continue its search, see `concent_warp.diagnosis.procedure`."""
+
+    cfg: DiagnoseCfg
+    runner: TaskRunner
+    budget: TimeBudget
+    findings: list[Finding]
+    groups: list[tuple[str, ...]]
+    hypotheses: list[dict[str, Model]]
+    widening: dict[int, np.ndarray]
+    rivals: dict[int, tuple[Rival, ...]]
+    time_step: FinerTimeStep | None
+    provisional: int | None
+
+    def add_effects(
+        self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
+    ) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
+        """Return the fitted models with one more for each effect that is added, and the detectable sizes of all."""
+        ...
+
+
+def try_alternatives(procedure: Search, fitted: list[FittedModel]) -> list[FittedModel]:
     """Return the fitted models of the search from another first effect, where that leads to a more plausible answer.
 
     An answer that the data cannot distinguish from it, and that differs by one effect, adds that to the group of the
@@ -64,7 +87,7 @@ def try_alternatives(procedure: Procedure, fitted: list[FittedModel]) -> list[Fi
     return best
 
 
-def _add_to_group(procedure: Procedure, recorded: dict[str, Any], last: FittedModel) -> None:
+def _add_to_group(procedure: Search, recorded: Mapping[str, Any], last: FittedModel) -> None:
     """Add the effect by which another answer differs from a procedure's to the group of the one that it replaces."""
     steps = {f.name: f.step for f in procedure.findings if f.accepted}
     names = {f.name for f in recorded["findings"] if f.accepted}
@@ -82,7 +105,7 @@ def _leaves_more(one: FittedModel, least: FittedModel, cfg: SearchCfg) -> bool:
     return bool(difference.sum() > max(cfg.equal_standard_errors * error, cfg.equal_error * least.errors.sum()))
 
 
-def _from(procedure: Procedure, first: FittedModel, rival: Rival) -> list[FittedModel]:
+def _from(procedure: Search, first: FittedModel, rival: Rival) -> list[FittedModel]:
     """Return the fitted models of the search that begins with a rival of the first effect."""
     instead = replace(rival.finding, accepted=True, reason="")
     procedure.findings = [
@@ -120,12 +143,12 @@ def plausibility(one: FittedModel) -> float:
     return score
 
 
-def _recorded(procedure: Procedure) -> dict[str, Any]:
+def _recorded(procedure: Search) -> dict[str, Any]:
     """Return copies of what a search has recorded."""
     return {name: copy(getattr(procedure, name)) for name in KEPT}
 
 
-def _record(procedure: Procedure, recorded: dict[str, Any]) -> None:
+def _record(procedure: Search, recorded: Mapping[str, Any]) -> None:
     """Set what a search has recorded."""
     for name, value in recorded.items():
         setattr(procedure, name, copy(value))
