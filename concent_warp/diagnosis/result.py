@@ -248,6 +248,7 @@ class Diagnosis:
             "verdict": self.verdict,
             "effects": [f.to_json() for f in self.effects],
             "groups": [list(group) for group in self.groups],
+            "explains": self.explains,
             "where": [dict(place) for place in self.where],
             "unexplained": self.unexplained,
             "unknown_force": None if self.unknown_force is None else self.unknown_force.to_json(),

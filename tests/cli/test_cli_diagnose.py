@@ -197,6 +197,7 @@ def test_readings_that_are_all_noise_are_reported_to_be_and_no_effect_explains_t
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "none_of_these"
     assert document["unexplained"] > 0.5
+    assert document["explains"] is (document["unexplained"] <= 0.8)
     assert document["issues"] == ["demo_0, angle: the readings scatter like noise, no motion shows in them."]
 
 
