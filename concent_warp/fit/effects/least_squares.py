@@ -312,8 +312,9 @@ class Solver:
             upper_bounds = {w: start_cost(residuals[w], offsets[w], limit, self.cfg.robust) for w in outlying}
             if not outlying:
                 continue
+            near = {w: starts[w] for w in outlying if not self.p.windows[w].smooth}
             there, found, left = self.search.refined(
-                fit.values, begin, outlying, self.cfg.initial_states.iterations, upper_bounds
+                fit.values, begin, outlying, self.cfg.initial_states.iterations, upper_bounds, near
             )
             for w in outlying:
                 if start_cost(left[w], there[w], limit, self.cfg.robust) < start_cost(
