@@ -67,7 +67,7 @@ def page(rows: Sequence[Row], earlier: Sequence[Row], every: Sequence[DataSet], 
 with another step, other integrators, contacts, bristle friction and gears with rotor inertia, one on Drake. Encoders
 quantise, clocks jitter, readings are lost, sensors have a latency below 0.5 ms; nominal masses, lengths and gains are
 wrong by up to 1 %, also where nothing is hidden; noise is stated in half of the sets. Each diagnosis has 300 s on two
-cores; one that takes longer counts as wrong.
+cores and is told that it has 285 s (`--seconds`); one that takes longer, or is unsettled then, counts as wrong.
 
 A quarter of the effects x rigs, the rigs `grasp` and `insertion`, and half of the Drake data are locked by a rule on
 their names, fixed before any result: `benchmarks/independent/split.json`.

@@ -44,6 +44,8 @@ class CandidateFits:
         """Candidates that there was no time to fit."""
         self.unrefined: list[Effect] = []
         """Effects whose fits there was no time to refine."""
+        self.restarted: set[tuple[int, float, float]] = set()
+        """Fits that have been restarted from the best, by index and both costs: again it would be the same."""
 
     def fit(
         self,
@@ -53,16 +55,21 @@ class CandidateFits:
     ) -> list[FittedCandidate]:
         """Return fits of the promising candidates, the most promising first, after those of earlier calls.
 
+        Candidates of a later call must promise enough beside the best of the earlier ones, too.
+
         Args:
             screened: All candidates that were not among those of an earlier call.
-            critical_gain: Gain that chance reaches at the significance level.
+            critical_gain: Gain that a candidate needs: what chance reaches at the significance level, or more.
             short_windows: Returns the windows of a multiple-shooting fit.
         """
         least = self.search.min_expected_gain * critical_gain
+        if self.fits:
+            least = max(least, self.search.explained_min_gain * self._best().share(self.base))
         promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
-        self.fitted += self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
-        if not self.fits:
-            return []
+        more = self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
+        self.fitted += more
+        if not more:
+            return self.fits
         pairs = zip(self.fits, self.fitted, strict=True)
         expected = np.array([max(c.share(self.base), s.expected_gain) for c, s in pairs])
         if expected.max() < self.cfg.min_gain:  # none explains enough to be accepted, however well it is fitted
@@ -112,7 +119,10 @@ class CandidateFits:
             before, best = list(self.fits), self._best()
             k_best, least = self.fits.index(best), search.close_min_gain * best.share(base)
             close = [k for k, c in enumerate(self.fits) if c is not best and expected[k] > least]
-            self._refit(close, restart_candidate, "fitting rivals again", best.fit, search)
+            pairs = {k: (k, self.fits[k].fit.cost, best.fit.cost) for k in close}
+            anew = [k for k in close if pairs[k] not in self.restarted]
+            self.restarted |= {pairs[k] for k in anew}
+            self._refit(anew, restart_candidate, "fitting rivals again", best.fit, search)
             near = [k for k in close if self.fits[k].share(base) > least]
             if any(self.fits[k].errors.sum() > (1 + search.equal_error) * best.errors.sum() for k in near):
                 self._refit([*near, k_best], polish_candidate, "refining initial states", search)

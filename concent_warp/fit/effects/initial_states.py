@@ -60,6 +60,9 @@ class InitialStateCfg:
     samples are tried for such windows in addition to damped steps."""
     sample_spreads: tuple[float, ...] = (0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
     """Spreads of the states sampled about an iterate, in standard deviations of the linear fit [-]; empty for none."""
+    restart_ratio: float = 1.4
+    """The same beyond which a window is restarted from other samples [-]: errors of contact models leave as much as
+    `outlier_ratio` in good fits, too. Empirical."""
     restart_samples: int = 128
     """States sampled about the measured one, of which the likeliest restarts an outlying window; 0 for none."""
     restart_spreads: tuple[float, ...] = (0.5, 1.0, 2.0)
@@ -175,7 +178,7 @@ class InitialStateSearch:
             [
                 w
                 for w in windows
-                if size[w] > self.cfg.outlier_ratio * max(1.0, float(np.median(size))) and not self.p.windows[w].smooth
+                if size[w] > self.cfg.restart_ratio * max(1.0, float(np.median(size))) and not self.p.windows[w].smooth
             ]
             if iterations == self.cfg.iterations
             else []
