@@ -55,8 +55,11 @@ class SearchCfg:
     """Largest fitted error of an initial state, in units of its standard deviation, up to which sensitivities are taken
     at the fitted states alone and not at the measured ones too: 1 sigma."""
     min_expected_gain: float = 0.5
-    """Expected gain over the critical one, above which a screened candidate is fitted [-]: linear extrapolation is
+    """Expected gain over the needed one, above which a screened candidate is fitted [-]: linear extrapolation is
     taken to be right to a factor of 2."""
+    remainder_promise: Share = 0.75
+    """Share of the gain that `DiagnoseCfg.max_remainder` asks for which a screened candidate must promise to be fitted
+    [-]: little is left there, and residuals are nearly in proportion to an effect's size."""
     fits_of_each: Count = 3
     """Most candidates that are fitted of one effect on the same elements, such as parts of one body [-]: those of one
     effect must not take the places of all others. Empirical."""

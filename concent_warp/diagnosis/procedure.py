@@ -387,13 +387,13 @@ class Procedure:
         def short_windows() -> Sequence[Window]:
             return self._windows(base.model, cfg.search.shooting_window)
 
-        least = self._least_after_provisional(base)
+        least = self._least_promise(base)
         fits = CandidateFits(base, cfg, self.runner)
-        fitted = fits.fit(screened, max(critical, least), short_windows)
+        fitted = fits.fit(screened, needed, short_windows, least)
         if parts and self._leaves_more(base, fitted):
             more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
             null, critical = self._chance(base, [*screened, *more], level)
-            fitted = fits.fit(more, max(critical, least), short_windows)
+            fitted = fits.fit(more, max(critical, cfg.min_gain), short_windows, least)
         for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
             self.budget.note(sentence, step if decides else None)
         if not fitted and fits.left:
@@ -416,15 +416,16 @@ class Procedure:
         self._record(base, group, findings)
         return group[0][0], smallest
 
-    def _least_after_provisional(self, base: FittedModel) -> float:
-        """Return the share of the error of a model with a provisional addition that another effect must explain.
+    def _least_promise(self, base: FittedModel) -> float:
+        """Return the gain that an effect beside a provisional addition must promise, 0 where there is none.
 
-        It is 0 without one. See `DiagnoseCfg.max_remainder`: an effect that makes an earlier one superfluous explains
-        as much.
+        It is a share of what `DiagnoseCfg.max_remainder` asks for; an effect that makes an earlier one superfluous
+        explains as much.
         """
         if self.provisional is None:
             return 0.0
-        return (1 - self.cfg.max_remainder) * max(1 - 1 / base.ratio**2, 0.0)
+        needed = (1 - self.cfg.max_remainder) * max(1 - 1 / base.ratio**2, 0.0)
+        return self.cfg.search.remainder_promise * needed
 
     def _candidates(self, base: FittedModel) -> tuple[list[Effect], list[Effect]]:
         """Return the effects that a fitted model may lack, and those considered only where none of these explains it.

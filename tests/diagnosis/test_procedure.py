@@ -873,8 +873,8 @@ def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.n
         def unsettled(self, _name):
             return []
 
-        def fit(self, _screened, critical, _windows):
-            notes["critical"] = critical
+        def fit(self, _screened, needed, _windows, _promise):
+            notes["asked"] = needed
             return fitted
 
     def refit(base, rivals):
@@ -895,7 +895,7 @@ def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
     (best, sizes), notes = searched(monkeypatch, made, gains, np.arange(101) / 1000)
     assert best.name == "a"
     assert sizes == ("s1", "s3")
-    assert notes["critical"] == pytest.approx(0.095)
+    assert notes["asked"] == pytest.approx(0.095)
     assert notes["needed"] == pytest.approx(0.095)
     assert notes["null"] == (400, 0)
     assert "rivals" not in notes
@@ -945,7 +945,7 @@ def test_a_residual_that_is_little_more_than_noise_is_searched_at_a_stricter_lev
         (best, sizes), notes = searched(monkeypatch, made, {"a": (0.9, True)}, null, ratio)
         assert best.name == "a"
         assert sizes == ("s1", "s3")
-        assert notes["critical"] == notes["needed"] == pytest.approx(1 - level)
+        assert notes["asked"] == notes["needed"] == pytest.approx(1 - level)
         assert notes["level"] == level
         assert len(made.findings) == len(made.groups) == 1
         # Where chance is less than that, an effect must still remove a share of the error.
@@ -955,7 +955,7 @@ def test_a_residual_that_is_little_more_than_noise_is_searched_at_a_stricter_lev
         assert (notes["needed"], notes["min_gain"]) == (gain, gain)
     stricter = procedure(quiet_significance_level=0.001)
     _, notes = searched(monkeypatch, stricter, {"a": (0.9, True)}, np.arange(1001) / 1000, 1.0)
-    assert notes["critical"] == pytest.approx(0.999)
+    assert notes["asked"] == pytest.approx(0.999)
 
 
 def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
@@ -1086,8 +1086,8 @@ class Parts:
             def unsettled(self, _name):
                 return []
 
-            def fit(self, screened, critical, _windows):
-                notes.fitted.append((screened, critical))
+            def fit(self, screened, needed, _windows, _promise):
+                notes.fitted.append((screened, needed))
                 self.fits += [found[s] for s in screened if s in found]
                 return self.fits
 
@@ -1143,10 +1143,20 @@ def test_parts_are_candidates_where_no_other_one_explains_the_data(monkeypatch, 
     assert parts.screened == [first, *rest]
     # Chance has the best of all of them, for those that were fitted before as well.
     assert parts.null == [first, *([[*first, "part"]] if needed else [])]
-    assert parts.fitted == [(first, 0.02), *((screened, 0.03) for screened in rest)]
+    assert parts.fitted == [(screened, least) for screened in (first, *rest)]  # more than chance reaches
     assert all(among == (["whole", "other", "part"] if needed else first) for among in parts.among)
     assert {f.p for f in made.findings} == ({0.03} if needed else {0.02} if whole else set())
     assert len(made.findings) == len(fits) - (not needed)
+
+
+def test_beside_a_provisional_addition_candidates_must_promise_what_it_left():
+    made = procedure()
+    assert (made.cfg.max_remainder, made.cfg.search.remainder_promise) == (0.15, 0.75)
+    assert made._least_promise(node(2.0)) == 0
+    made.provisional = 1
+    # 1 - 1 / 2^2 of the squared residual is more than noise.
+    assert made._least_promise(node(2.0)) == pytest.approx(0.75 * 0.85 * 0.75)
+    assert made._least_promise(node(0.9)) == 0
 
 
 def test_parts_of_an_effect_that_was_asked_for_are_candidates_from_the_start(monkeypatch):

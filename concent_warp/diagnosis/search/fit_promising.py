@@ -50,8 +50,9 @@ class CandidateFits:
     def fit(
         self,
         screened: Sequence[ScreenedCandidate],
-        critical_gain: float,
+        needed_gain: float,
         short_windows: Callable[[], Sequence[Window]],
+        least_promise: float = 0.0,
     ) -> list[FittedCandidate]:
         """Return fits of the promising candidates, the most promising first, after those of earlier calls.
 
@@ -59,10 +60,11 @@ class CandidateFits:
 
         Args:
             screened: All candidates that were not among those of an earlier call.
-            critical_gain: Gain that a candidate needs: what chance reaches at the significance level, or more.
+            needed_gain: Gain that a candidate needs to be accepted.
             short_windows: Returns the windows of a multiple-shooting fit.
+            least_promise: Expected gain below which none is fitted, whatever is needed.
         """
-        least = self.search.min_expected_gain * critical_gain
+        least = max(self.search.min_expected_gain * needed_gain, least_promise)
         if self.fits:
             least = max(least, self.search.explained_min_gain * self._best().share(self.base))
         promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)

@@ -197,6 +197,26 @@ def test_candidates_of_a_later_call_are_fitted_and_refined_beside_those_of_earli
     assert [s.name for s in search.fitted] == ["a", "b"]
 
 
+def test_candidates_of_a_later_call_must_promise_enough_beside_the_best(monkeypatch):
+    assert SearchCfg().explained_min_gain == 0.3
+    tasks = Tasks(monkeypatch, {n: made(n, 0.8, ratio=1.2) for n in "ab"})
+    search = fits_of([])
+    search.fit([screened("a", 0.8)], 0.1, list)
+    refined = [d for d in tasks.done if d[0] != "fit"]
+    tasks.done.clear()
+    assert [c.name for c in search.fit([screened("b", 0.23)], 0.1, list)] == ["a"]  # less than 0.3 of 0.8
+    assert tasks.done == []  # what was fitted before has been refined
+    assert refined
+    assert [c.name for c in search.fit([screened("b", 0.25)], 0.1, list)] == ["a", "b"]
+
+
+def test_candidates_below_a_least_promise_are_not_fitted(monkeypatch):
+    for least, fitted in ((0.0, "ab"), (0.3, "a"), (0.5, "")):
+        Tasks(monkeypatch, {n: made(n, 0.5, ratio=1.2) for n in "ab"})
+        found = fits_of([]).fit([screened("a", 0.4), screened("b", 0.2)], 0.1, list, least)
+        assert [c.name for c in found] == list(fitted)
+
+
 def test_fits_near_the_best_that_ended_at_their_scanned_value_are_searched_from_it(monkeypatch):
     tasks = Tasks(monkeypatch, {})
     names = ("best", "near", "moved", "noise", "null", "far")
@@ -315,13 +335,24 @@ def test_candidates_that_cannot_explain_enough_to_be_accepted_are_not_refined(mo
         (0.9 * least, 0.9 * least, False),
         (1.1 * least, 0.9 * least, True),
         (0.9 * least, 1.1 * least, True),  # it may have ended in a local minimum
-        (least, 0.0, True),
+        (least, 0.1 * least, True),
     ):
         tasks = Tasks(monkeypatch, {n: made(n, gain, ratio=1.3) for n, gain in (("a", fitted), ("b", 0.8 * least))})
         search = fits_of([])
         found = search.fit([screened("a", promised), screened("b", 0.5 * least)], -1.0, list)
         assert {c.name for c in found} == {"a", "b"}
         assert any(d[0] != "fit" for d in tasks.done) is refined
+
+
+def test_a_fit_is_restarted_from_the_best_again_only_if_one_of_them_has_changed(monkeypatch):
+    one = np.array([1.0])
+    best, near = made("best", 0.8, 100.0, errors=one), made("near", 0.75, 110.0, errors=1.01 * one)
+    tasks, expected = Tasks(monkeypatch, {}), np.array([0.8, 0.75])
+    search = fits_of([best, near])
+    for better, restarts in ((best, 1), (best, 1), (replace(best, cost=99.0), 2)):
+        search.fits[0] = better
+        search.refit_rivals(expected)
+        assert [d for d in tasks.done if d[0] == "restart"] == restarts * [("restart", "near", "best")]
 
 
 def test_rivals_are_refitted_as_long_as_a_cost_falls(monkeypatch):
