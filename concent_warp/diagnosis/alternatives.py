@@ -17,6 +17,7 @@ import numpy as np
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Detectable, Finding, FinerTimeStep
 from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.evidence import surprise
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import TimeBudget
@@ -133,13 +134,12 @@ def plausibility(one: FittedModel) -> float:
     prediction, count = one.prediction(), one.blocks.count
     score = -count * float(np.log(max(one.errors.sum(), 1e-12)))
     for added, part in zip(one.model.effects, prediction.split, strict=True):
-        null = np.array([p.null for p in prediction.parameters[part]])
-        scale = np.array([p.scale for p in prediction.parameters[part]])
-        away = np.where(np.isfinite(null), (one.fit.values[part] - null) / scale, 0.0)
+        parameters, values = prediction.parameters[part], one.fit.values[part]
         if added.effect.nominal:
+            away = np.array([(v - p.null) / p.scale for v, p in zip(values, parameters, strict=True)])
             score -= float((away**2).sum()) / one.cfg.least_squares.prior**2
         else:
-            score -= float(2 * np.log1p(away**2).sum()) + len(away) * float(np.log(count)) + added.effect.rarity
+            score -= surprise(added.effect, parameters, values, count)
     return score
 
 

@@ -14,7 +14,7 @@ from concent_warp.simulate.time_limit import TimeUpError, stop_at
 
 T = TypeVar("T")
 
-SEARCH_SHARE, TOGETHER_SHARE = 0.75, 0.9
+SEARCH_SHARE, TOGETHER_SHARE = 0.8, 0.9
 """Shares of the time after which the search for effects ends, and the fit of all that were accepted."""
 
 

@@ -66,6 +66,9 @@ class Parameter:
     """Typical difference from the null value: the standard deviation of the prior, and the unit of a fit's steps."""
     scan: tuple[float, ...] = ()
     """Values to try where the sensitivity at the null value is zero or misleading, as for effects with a threshold."""
+    typical: float = 0.0
+    """The same in the odds between effects that explain as much, where it is more than `scale`: what experience expects
+    may be more than a step over which motion is linear."""
 
 
 class Effect:

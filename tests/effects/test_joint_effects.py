@@ -103,3 +103,10 @@ def test_offset_pendulum_hangs_where_its_encoder_reads_less_by_the_offset():
 def test_offset_leaves_the_springs_of_a_joint_where_they_are_in_space():
     cart = move(world(SPRUNG, JointOffset("rail"), 0.03), 0.2, qpos=[-0.03])
     np.testing.assert_allclose(cart.qpos, -0.03, atol=1e-9)
+
+
+def test_a_rotor_as_heavy_as_its_link_is_typical():
+    m = world(CART).compile()
+    (inertia,) = Armature("rail").parameters(m)
+    assert inertia.typical == pytest.approx(m.dof_M0[0])
+    assert inertia.scale < inertia.typical

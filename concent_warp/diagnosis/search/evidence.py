@@ -11,7 +11,7 @@ from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.candidates import label
 from concent_warp.diagnosis.search.null_distribution import null_p_value
-from concent_warp.effects.effect import Effect
+from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, formula_errors
 
@@ -168,10 +168,22 @@ def _plausibility(base: FittedModel, c: FittedCandidate, f: Finding) -> float:
     a Cauchy prior of sizes, and the effect's rarity.
     """
     prediction = base.prediction(c.effect)
-    scale = np.array([p.scale for p in prediction.parameters[prediction.owned :]])
-    away = np.array([(p.value - p.null) if np.isfinite(p.null) else 0.0 for p in f.parameters]) / scale
-    fit = -_log_errors(base, c) - len(scale) * np.log(base.blocks.count)
-    return float(fit - 2 * np.log1p(away**2).sum() - c.effect.rarity)
+    added = prediction.parameters[prediction.owned :]
+    return -_log_errors(base, c) - surprise(c.effect, added, [p.value for p in f.parameters], base.blocks.count)
+
+
+def surprise(effect: Effect, parameters: Sequence[Parameter], values: Sequence[float], count: int) -> float:
+    """Return minus twice the log prior of an effect, up to a constant: its rarity, number of parameters, and sizes.
+
+    Args:
+        effect: The effect.
+        parameters: Its parameters.
+        values: Their values.
+        count: Observations, for Schwarz's criterion.
+    """
+    scale = np.array([max(p.scale, p.typical) for p in parameters])
+    away = np.array([v - p.null if np.isfinite(p.null) else 0.0 for v, p in zip(values, parameters, strict=True)])
+    return float(2 * np.log1p((away / scale) ** 2).sum() + len(scale) * np.log(count) + effect.rarity)
 
 
 def detectable_size(base: FittedModel, s: ScreenedCandidate, share: float) -> Detectable | None:

@@ -47,11 +47,14 @@ class JointEffect(Effect):
         return slide if (kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)).all() else hinge
 
     def parameter_per_joint(
-        self, name: str, unit: str, null: np.ndarray, scale: np.ndarray, high: np.ndarray
+        self, name: str, unit: str, null: np.ndarray, scale: np.ndarray, high: np.ndarray, typical: float = 0.0
     ) -> tuple[Parameter, ...]:
-        """Return one parameter a joint, from 0 up."""
+        """Return one parameter a joint, from 0 up; `typical` is in units of the scale."""
         rows = zip(self.target, null, high, scale, strict=True)
-        return tuple(Parameter(f"{name}[{t}]", unit, float(n), 0.0, float(h), float(s)) for t, n, h, s in rows)
+        return tuple(
+            Parameter(f"{name}[{t}]", unit, float(n), 0.0, float(h), float(s), typical=typical * float(s))
+            for t, n, h, s in rows
+        )
 
 
 class DryFriction(JointEffect):
@@ -131,11 +134,11 @@ class Armature(JointEffect):
     confusions = ("mass", "inertia", "actuator_lag")
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:
-        """Return one inertia for each joint."""
+        """Return one inertia for each joint; behind a gear it is typically that of the link (inertia matching)."""
         ids = self.ids(m)
         inertia, null = m.dof_M0[dof_of(m, ids)], m.dof_armature[dof_of(m, ids)]
         return self.parameter_per_joint(
-            "inertia", self.units(m, "kg m^2", "kg"), null, 0.3 * inertia, null + 10 * inertia
+            "inertia", self.units(m, "kg m^2", "kg"), null, 0.3 * inertia, null + 10 * inertia, 1 / 0.3
         )
 
     def fields(self, m: mujoco.MjModel) -> tuple[str, ...]:  # noqa: ARG002

@@ -22,6 +22,7 @@ from concent_warp.diagnosis.search.evidence import (
     fitted_parameters,
     indistinguishable,
     removed_by_channel,
+    surprise,
 )
 from concent_warp.diagnosis.search.null_distribution import max_gain_under_null, null_p_value
 from concent_warp.diagnosis.search.screening import _linear_gain, _scan, projected_residuals, robust_sum
@@ -213,6 +214,17 @@ def fitted(errors: np.ndarray, **changes: Any) -> Any:
         std=np.full(4, 0.1),  # pyright: ignore
     )
     return replace(base, **changes)
+
+
+def test_a_size_is_no_surprise_below_what_is_typical():
+    effect: Any = SimpleNamespace(rarity=0.0)
+    for typical, unit in ((0.0, 0.3), (0.1, 0.3), (2.0, 2.0)):
+        sizes = [Parameter("a", "-", 1.0, 0.0, 9.0, 0.3, typical=typical)]
+        assert surprise(effect, sizes, [1.0], 1) == 0
+        assert surprise(effect, sizes, [1.0 + unit], 1) == pytest.approx(2 * np.log(2))
+        assert surprise(effect, 3 * sizes, 3 * [1.0], 10) == pytest.approx(3 * np.log(10))
+    rare: Any = SimpleNamespace(rarity=6.0)
+    assert surprise(rare, [Parameter("a", "-", np.inf, 0.0, 9.0, 0.3)], [5.0], 1) == 6
 
 
 def test_plausibility_is_schwarzs_criterion_with_a_cauchy_prior():
