@@ -14,16 +14,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Detectable, Finding, FinerTimeStep
 from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.evidence import surprise
+from concent_warp.diagnosis.search.evidence import leaves_more, surprise
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import TimeBudget
 from concent_warp.model import Model
 
-KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional")
+KEPT = ("findings", "groups", "hypotheses", "widening", "rivals", "time_step", "provisional", "form_corrected")
 """What a search records in its procedure."""
 
 
@@ -40,6 +40,7 @@ class Search(Protocol):
     rivals: dict[int, tuple[Rival, ...]]
     time_step: FinerTimeStep | None
     provisional: int | None
+    form_corrected: bool
 
     def add_effects(
         self, fitted: list[FittedModel], detectable: tuple[Detectable, ...]
@@ -51,8 +52,9 @@ class Search(Protocol):
 def try_alternatives(procedure: Search, fitted: list[FittedModel]) -> list[FittedModel]:
     """Return the fitted models of the search from another first effect, where that leads to a more plausible answer.
 
-    An answer that the data cannot distinguish from it, and that differs by one effect, adds that to the group of the
-    one in whose place it stands.
+    Answers count that explain as much as the best, or leave little more than noise: what one with more parameters
+    explains beyond that is weighed by their number. An answer that the data cannot distinguish from the best, and that
+    differs by one effect, adds that to the group of the one in whose place it stands.
 
     Args:
         procedure: The diagnosis; what it has recorded is that of the returned models afterwards.
@@ -78,7 +80,11 @@ def try_alternatives(procedure: Search, fitted: list[FittedModel]) -> list[Fitte
         budget.note(open_question)
         unsettled = list(budget.unsettled)
     least = min(answers, key=lambda answer: answer[0][-1].errors.sum())[0][-1]
-    equal = [a for a in answers if not _leaves_more(a[0][-1], least, cfg.search)]
+    equal = [
+        (found, recorded)
+        for found, recorded in answers
+        if not leaves_more(found[-1].errors, least.errors, cfg.search) or found[-1].ratio <= cfg.search.explained_ratio
+    ]
     equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
     best, recorded = equal[0]
     _record(procedure, recorded)
@@ -99,13 +105,6 @@ def _add_to_group(procedure: Search, recorded: Mapping[str, Any], last: FittedMo
         procedure.hypotheses[step] = {**procedure.hypotheses[step], theirs[0]: last.model}
 
 
-def _leaves_more(one: FittedModel, least: FittedModel, cfg: SearchCfg) -> bool:
-    """Return whether the held-out error of a fitted model exceeds the least one by more than they may differ."""
-    difference = one.errors - least.errors
-    error = np.sqrt(len(difference)) * difference.std()
-    return bool(difference.sum() > max(cfg.equal_standard_errors * error, cfg.equal_error * least.errors.sum()))
-
-
 def _from(procedure: Search, first: FittedModel, rival: Rival) -> list[FittedModel]:
     """Return the fitted models of the search that begins with a rival of the first effect."""
     instead = replace(rival.finding, accepted=True, reason="")
@@ -119,7 +118,7 @@ def _from(procedure: Search, first: FittedModel, rival: Rival) -> list[FittedMod
     procedure.groups, procedure.hypotheses = [(instead.name,)], [{instead.name: begun.model}]
     procedure.widening = {0: np.ones(len(instead.parameters))}
     procedure.rivals = {0: procedure.rivals[0]}
-    procedure.provisional = None
+    procedure.provisional, procedure.form_corrected = None, False
     if first.windows[0].defect is None:
         procedure.time_step = None
     return procedure.add_effects([first, begun], ())[0]
@@ -139,7 +138,7 @@ def plausibility(one: FittedModel) -> float:
             away = np.array([(v - p.null) / p.scale for v, p in zip(values, parameters, strict=True)])
             score -= float((away**2).sum()) / one.cfg.least_squares.prior**2
         else:
-            score -= surprise(added.effect, parameters, values, count)
+            score -= surprise(added.effect, parameters, values.tolist(), count)
     return score
 
 

@@ -289,6 +289,9 @@ class DiagnoseCfg:
     form_error_ratio: Positive = 2.0
     """RMS residual over noise up to which a remainder may be an error in the formulas of accepted effects [-], if it is
     less than `UnknownForceCfg.min_share` of the first discrepancy. Empirical."""
+    max_form_error: Share = 0.25
+    """Share of the first discrepancy up to which such a remainder may be one that is more, if a flexible correction of
+    the effects takes it away [-]: formulas are right to a half, a quarter in squares."""
     max_remainder: Share = 0.15
     """Share of such a remainder that a further effect may leave, if it is to be named all the same [-]: one that is
     missing explains nearly all of it, one that takes up an error in a formula a part. Empirical."""

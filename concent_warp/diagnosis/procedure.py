@@ -31,8 +31,9 @@ from concent_warp.diagnosis.search.baseline import (
 )
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.candidates import candidates, label
-from concent_warp.diagnosis.search.evidence import assess, detectable_size, profile_widening
+from concent_warp.diagnosis.search.evidence import assess, detectable_size, leaves_more, profile_widening
 from concent_warp.diagnosis.search.fit_promising import CandidateFits
+from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.gradient_start import GradientStarts
 from concent_warp.diagnosis.search.grouping import group_indistinguishable
 from concent_warp.diagnosis.search.joint_fit import (
@@ -53,7 +54,7 @@ from concent_warp.diagnosis.search.reconsider import Rival, near_best, reconside
 from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.search.time_step import at_given_step, finer_time_step, renew_defects
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
-from concent_warp.diagnosis.search.unknown_force import unknown_force
+from concent_warp.diagnosis.search.unknown_force import unknown_force, with_interleaved_folds
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
 from concent_warp.diagnosis.time_budget import SEARCH_SHARE, TOGETHER_SHARE, TimeBudget, in_words
 from concent_warp.effects.effect import Effect
@@ -103,6 +104,8 @@ class Procedure:
         self.provisional: int | None = None
         """Index of an addition that stays only if it makes an earlier one superfluous, or explains nearly all that was
         left: what takes up an error in a formula explains a part of it."""
+        self.form_corrected = False
+        """Whether a flexible correction of the last addition, and no other effect, takes away what it left."""
         self.rivals: dict[int, tuple[Rival, ...]] = {}
         """Candidates that explained nearly as much as each addition, and that one itself."""
         self.with_unestablished: list[FittedModel] = []
@@ -183,6 +186,7 @@ class Procedure:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
             runner.share = max(runner.share, BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions)
             recorded = len(self.findings), len(self.groups)
+            correction = None if effects_alone else self._correction(fitted[-1], first)
             try:
                 adequate = not effects_alone and self._explains(fitted[-1], first, added=step > 0)
                 best, smallest = self.find_addition(fitted[-1], step, explained=adequate)
@@ -195,7 +199,11 @@ class Procedure:
                 self._forget(*recorded)
                 fitted = self._adopt(fitted, finer)
                 continue
+            if best is not None and correction is not None and not self._explains_more(fitted[-1], best, correction):
+                self._take_back(*recorded)
+                best = None
             if best is None:
+                self.form_corrected = self._is_corrected(fitted[-1], correction)
                 break
             fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
         return fitted, detectable
@@ -215,7 +223,46 @@ class Procedure:
         Little is then left beside the discrepancy of the first model, and little beside the noise.
         """
         left, lacked = discrepancies(one, first)
-        return left < self.cfg.unknown_force.min_share * lacked and one.ratio <= self.cfg.form_error_ratio
+        share = self.cfg.max_form_error if self.form_corrected else self.cfg.unknown_force.min_share
+        return left < share * lacked and one.ratio <= self.cfg.form_error_ratio
+
+    def _correction(self, one: FittedModel, first: FittedModel) -> np.ndarray | None:
+        """Return the held-out errors of a model with a flexible correction of the effects that were added.
+
+        It is None where there are none, and where they leave more than errors in their formulas may be.
+        """
+        left, lacked = discrepancies(one, first)
+        added = [a.effect for a in one.model.effects[len(first.model.effects) :] if not a.effect.nominal]
+        if not added or left >= self.cfg.max_form_error * lacked or one.ratio > self.cfg.form_error_ratio:
+            return None
+        self.runner.progress(self.runner.share, "correcting the formulas of the effects")
+        unsettled = "Open: whether what is left is an error in the formulas of the effects."
+        correct = partial(flexible_correction, one, added, self.cfg, self._results)
+        return self.budget.attempt(correct, None, unsettled)
+
+    def _explains_more(self, one: FittedModel, best: FittedCandidate, correction: np.ndarray) -> bool:
+        """Return whether a candidate explains what a flexible correction of the effects of a model does not."""
+        errors = with_interleaved_folds(add_candidate(one, best)).errors
+        return leaves_more(correction, errors, self.cfg.search)
+
+    def _is_corrected(self, one: FittedModel, correction: np.ndarray | None) -> bool:
+        """Return whether a flexible correction of the effects of a model leaves little more than noise."""
+        if correction is None:
+            return False
+        left = correction.sum() / max(float(with_interleaved_folds(one).errors.sum()), 1e-12)
+        return one.ratio * float(np.sqrt(left)) <= self.cfg.search.explained_ratio
+
+    def _take_back(self, findings: int, groups: int) -> None:
+        """Refuse the effect that was accepted after so many findings and groups."""
+        reason = "explains no more than a flexible correction of the effects before it"
+        self.groups, self.hypotheses = self.groups[:groups], self.hypotheses[:groups]
+        self.findings[findings:] = [
+            replace(f, accepted=False, reason=reason) if f.accepted else f for f in self.findings[findings:]
+        ]
+
+    def _results(self, task: Callable[..., ScreenedCandidate], tasks: Sequence[tuple[Any, ...]]) -> Any:
+        """Return the results of a task for each tuple of arguments."""
+        return run_tasks(task, tasks, self.cfg.jobs)
 
     def _explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
         """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
@@ -755,10 +802,17 @@ class Procedure:
             tested = self.with_unestablished or fitted
             nodes = [given, *(tested[1:] or tested)]
             unknown = self.budget.attempt(
-                lambda: unknown_force(nodes, cfg, lambda task, tasks: run_tasks(task, tasks, cfg.jobs)),
+                lambda: unknown_force(nodes, cfg, self._results),
                 None,
                 "Open: whether a force of unknown form explains more.",
             )
+        if (
+            unknown is not None
+            and self.form_corrected
+            and not unknown.form_error
+            and unknown.share < cfg.max_form_error
+        ):
+            unknown = replace(unknown, form_error=True)
         verdict: Verdict = "none_needed"
         lacking = unknown is not None and not unknown.form_error
         if not adequate or lacking:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Family = Literal["joints", "objects", "contact", "world", "measurement"]
 Kind = Literal["joint", "actuator", "body", "geom", "sensor", "none"]
+Variable = Literal["joint velocity"]
 Reader = Callable[[str, np.ndarray], np.ndarray]
 """Given a sensor's name and times [s], shape (T,), returns what the model predicts then, shape (T, dim)."""
 
@@ -103,6 +104,8 @@ class Effect:
     special_cases: ClassVar[tuple[str, ...]] = ()
     """Names of effects of fewer parameters that it equals at some of its values; it is not named beside one of them
     that explains as much."""
+    variables: ClassVar[tuple[Variable, ...]] = ()
+    """What its formula is a function of, where a force of no known form in the same variable corrects it."""
     formula_error: ClassVar[float] = 0.0
     """Standard deviation of the effect's size between repeated measurements, relative to it [-]: by how much what the
     formula leaves out (wear, temperature, place) changes its parameters. Part of their intervals."""

@@ -109,6 +109,17 @@ def test_an_alternative_that_leaves_more_changes_nothing(greedy, monkeypatch):
     assert {name: getattr(made, name) for name in KEPT} == before
 
 
+def test_beyond_the_noise_the_plausible_answer_counts_and_not_the_one_that_leaves_least(greedy, monkeypatch):
+    # The other answer leaves 10 % more. Its plausibility decides where that is little more than noise.
+    for ratio, plausible, taken in ((1.05, 5.0, True), (1.05, -5.0, False), (1.2, 5.0, False)):
+        made, fitted = resumed(greedy, 1), greedy[1]
+        other = replace(fitted[-1], errors=1.1 * fitted[-1].errors)
+        monkeypatch.setattr(FittedModel, "ratio", property(lambda one, o=other, r=ratio: r if one is o else 1.0))
+        monkeypatch.setattr(made, "add_effects", lambda begun, _, other=other: ([*begun, other], ()))
+        monkeypatch.setattr(module, "plausibility", lambda one, o=other, p=plausible: p if one is o else 0.0)
+        assert (try_alternatives(made, fitted)[-1] is other) is taken
+
+
 def test_as_many_rivals_are_tried_as_asked_for_and_none_of_the_group_of_the_first(greedy, monkeypatch):
     for alternatives, group, tried in (
         (0, ("actuator_lag",), []),

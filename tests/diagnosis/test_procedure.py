@@ -14,7 +14,7 @@ from concent_warp.diagnosis.cfg import CheckDataCfg, DiagnoseCfg, NominalCfg, Se
 from concent_warp.diagnosis.check_data import _is_white, check_data
 from concent_warp.diagnosis.failures import _force_entries, _span_entry, _with_starts
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.result import Finding
+from concent_warp.diagnosis.result import Finding, UnknownForceFound
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
 from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.diagnosis.tasks import TaskRunner
@@ -41,7 +41,9 @@ def node(
     ratio: float, errors: float = 1.0, effects: int = 0, name: str = "", timestep: float = GIVEN, nominal: int = 0
 ) -> Any:
     """Return a fitted model: some nominal values come before its effects."""
-    added = [SimpleNamespace(effect=SimpleNamespace(nominal=k < nominal)) for k in range(nominal + effects)]
+    added = [
+        SimpleNamespace(effect=SimpleNamespace(nominal=k < nominal, variables=())) for k in range(nominal + effects)
+    ]
     model = SimpleNamespace(effects=added, name=name)
     # Residuals of one size, beyond the limit of the robust loss nowhere.
     piece = SimpleNamespace(residual=np.full(4, float(ratio)))
@@ -126,6 +128,60 @@ def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch)
         assert made.add_effects(nodes[:1], ())[0] == nodes[:count]
         assert is_lacking(node(1.02 * factor), made.noise_factors, made.cfg) is False
         assert is_lacking(node(1.03 * factor), made.noise_factors, made.cfg)
+
+
+@pytest.mark.parametrize(
+    ("corrected", "explains_more", "added", "form"),
+    [
+        (None, False, True, False),  # no formula to correct
+        (0.5, True, True, False),
+        (0.5, False, False, True),  # 1.3 x noise becomes 0.92
+        (0.8, False, False, False),  # 1.16
+    ],
+)
+def test_an_effect_beside_others_must_explain_more_than_a_correction_of_these(
+    monkeypatch, corrected, explains_more, added, form
+):
+    made, nodes = procedure(), [node(3.0), node(1.3, effects=1), node(1.0, effects=2)]
+
+    def find(_base, step, **_):
+        made.groups.append((f"effect {step}",))
+        made.hypotheses.append({})
+        made.findings.append(finding(f"effect {step}", 0.6, accepted=True, step=step))
+        return nodes[step + 1], ()
+
+    monkeypatch.setattr(module, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(module, "renew_defects", lambda one, _cfg: one)
+    monkeypatch.setattr(module, "with_interleaved_folds", lambda one: one)
+    monkeypatch.setattr(made, "find_addition", find)
+    errors = None if corrected is None else np.array([corrected / 2] * 2)
+    monkeypatch.setattr(made, "_correction", lambda one, _first: None if one is nodes[0] else errors)
+    monkeypatch.setattr(made, "_explains_more", lambda *_: explains_more)
+    assert made.add_effects(nodes[:1], ())[0] == nodes[: 2 + added]
+    assert made.form_corrected is form
+    assert made.groups == [("effect 0",), ("effect 1",)][: 1 + added]
+    first, second = made.findings
+    assert first.accepted
+    assert second.accepted is added
+    assert second.reason == ("" if added else "explains no more than a flexible correction of the effects before it")
+
+
+def test_a_force_in_the_variables_of_a_corrected_formula_is_its_error(monkeypatch):
+    force = UnknownForceFound("a force", 0.3, 0.01, 0.2, None)
+    monkeypatch.setattr(module, "unknown_force", lambda *_: force)
+    for corrected, most, verdict in (
+        (True, 0.25, "effect"),
+        (True, 0.15, "none_of_these"),
+        (False, 0.25, "none_of_these"),
+    ):
+        made = procedure(max_form_error=most)
+        made.form_corrected = corrected
+        made.findings, made.groups = [finding("effect", 0.6, accepted=True)], [("effect",)]
+        found = made.conclude(node(3.0), [node(3.0), node(1.2, effects=1)], (), [])
+        assert found.verdict == verdict
+        assert (found.form_error is not None) is (verdict == "effect")
 
 
 def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):

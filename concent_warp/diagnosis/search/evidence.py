@@ -156,6 +156,13 @@ def _leaves_as_little(c: FittedCandidate, other: FittedCandidate, cfg: SearchCfg
     return bool(difference.sum() <= slack * bound)
 
 
+def leaves_more(errors: np.ndarray, least: np.ndarray, cfg: SearchCfg) -> bool:
+    """Return whether the held-out errors of blocks, shape (B,), exceed the least ones by more than they may differ."""
+    difference = errors - least
+    error = np.sqrt(len(difference)) * difference.std()
+    return bool(difference.sum() > max(cfg.equal_standard_errors * error, cfg.equal_error * least.sum()))
+
+
 def _log_errors(base: FittedModel, c: FittedCandidate) -> float:
     """Return minus twice the log likelihood of a candidate, up to a constant: noise of unknown size, blocks of time."""
     return float(base.blocks.count * np.log(max(c.errors.sum(), 1e-12)))

@@ -73,16 +73,16 @@ def _best_force(
         cfg: DiagnoseCfg.
         results: See `Results`.
     """
-    base = _with_interleaved_folds(replace(base, engine="mujoco"))
-    left = base.errors if rival is None else _with_interleaved_folds(rival).errors
+    base = with_interleaved_folds(replace(base, engine="mujoco"))
+    left = base.errors if rival is None else with_interleaved_folds(rival).errors
     instead = 1 - float(left.sum() / base.errors.sum())
     settings = cfg.unknown_force
-    screened = list(results(screen, [(base, force, cfg.search) for force in _forces(base, settings)]))
+    screened = list(results(screen, [(base, force, cfg.search) for force in forces(base, settings)]))
     if not screened:
         return None
     tried = [_with_prior(base, s, share) for s in screened for share in settings.expected_shares]
-    tried += [_combined(base, screened, share) for share in settings.expected_shares]
-    errors = [_held_out(base, s) for s in tried]
+    tried += [combined(base, screened, share) for share in settings.expected_shares]
+    errors = [held_out(base, s) for s in tried]
     gains = [1 - float(e.sum() / base.errors.sum()) for e in errors]
     best = int(np.argmax(gains))
     more = gains[best] - instead
@@ -103,13 +103,13 @@ def _best_force(
     )
 
 
-def _held_out(base: FittedModel, s: ScreenedCandidate) -> np.ndarray:
+def held_out(base: FittedModel, s: ScreenedCandidate) -> np.ndarray:
     """Return the held-out error of each block, shape (B,), after a linear step with the sensitivities."""
     pieces = with_residuals(s.pieces, base.pieces)
     return base.held_out(pieces).own()
 
 
-def _with_interleaved_folds(base: FittedModel) -> FittedModel:
+def with_interleaved_folds(base: FittedModel) -> FittedModel:
     """Return a fitted model whose blocks are assigned to folds in turn, also where its folds are whole demonstrations.
 
     A force of no known form predicts nothing at positions that were not visited, and few throws visit the same ones.
@@ -131,7 +131,7 @@ def _with_prior(base: FittedModel, s: ScreenedCandidate, share: float) -> Screen
     return replace(s, pieces=tuple(replace(piece, jacobian=piece.jacobian * scale) for piece in s.pieces))
 
 
-def _combined(base: FittedModel, screened: Sequence[ScreenedCandidate], share: float) -> ScreenedCandidate:
+def combined(base: FittedModel, screened: Sequence[ScreenedCandidate], share: float) -> ScreenedCandidate:
     """Return all forces at once, expected to explain the same each, together a share of the error."""
     own = base.pieces[0].jacobian.shape[1]
     parts = [_with_prior(base, s, share / len(screened)).pieces for s in screened]
@@ -142,7 +142,7 @@ def _combined(base: FittedModel, screened: Sequence[ScreenedCandidate], share: f
     return replace(screened[0], pieces=pieces)
 
 
-def _forces(base: FittedModel, cfg: UnknownForceCfg) -> list[Effect]:
+def forces(base: FittedModel, cfg: UnknownForceCfg) -> list[Effect]:
     """Return the forces that are tested: on all joints by position and by velocity, and several on each free body."""
     m = base.model.compile()
     qpos, qvel = _visited(base, m)

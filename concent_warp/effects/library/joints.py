@@ -60,6 +60,7 @@ class JointEffect(Effect):
 class DryFriction(JointEffect):
     """Friction that holds the joint at rest."""
 
+    variables = ("joint velocity",)
     formula_error = FRICTION_SCATTER
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
@@ -106,6 +107,7 @@ class JointDamping(JointEffect):
     source = f"viscous friction; MuJoCo's joint damping ({MUJOCO})"
     signature = "residual torque in proportion to velocity"
     confusions = ("joint_friction", "actuator_gain", "air_drag")
+    variables = ("joint velocity",)
     formula_error = FRICTION_SCATTER
 
     def parameters(self, m: mujoco.MjModel) -> tuple[Parameter, ...]:

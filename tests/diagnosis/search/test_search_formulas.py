@@ -29,12 +29,12 @@ from concent_warp.diagnosis.search.screening import _linear_gain, _scan, project
 from concent_warp.diagnosis.search.unknown_force import (
     _best_force,
     _body_forces,
-    _combined,
     _listed,
     _spread_out,
-    _with_interleaved_folds,
     _with_prior,
+    combined,
     unknown_force,
+    with_interleaved_folds,
 )
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce
@@ -318,7 +318,7 @@ def test_labels_have_targets_where_names_are_shared():
 
 def test_folds_of_forces_are_dealt_in_turn():
     base = base_of(blocks=replace(blocks(), fold=np.zeros(COUNT, int)))
-    found = _with_interleaved_folds(base)
+    found = with_interleaved_folds(base)
     assert found.blocks.fold.tolist() == [0, 1, 2, 3, 4, 0, 1, 2]
     expected = HeldOut(block_sums(base.pieces, found.blocks, LIMIT), found.blocks, 10.0).own()
     np.testing.assert_allclose(found.errors, expected)
@@ -333,7 +333,7 @@ def test_priors_of_forces_expect_the_same_of_each_basis_function():
     np.testing.assert_allclose(square[1:], [each, 0, each, each])
     for p, q in zip(found.pieces, parts, strict=True):
         np.testing.assert_array_equal(p.jacobian[:, 0], q.jacobian[:, 0])
-    both = _combined(base, [s, screened_of(2, 2)], 0.3)
+    both = combined(base, [s, screened_of(2, 2)], 0.3)
     assert both.pieces[0].jacobian.shape == (ROWS, 1 + 4 + 2)
     square = np.sum([(p.jacobian**2).sum(axis=0) for p in both.pieces], axis=0)
     half = 0.15 * base.errors.sum() / 100
@@ -458,7 +458,7 @@ def test_the_best_force_must_be_large_and_significant(monkeypatch):
     )
     explains = ScreenedCandidate(force, 0.1, 0.0, np.zeros(2), parts)
     useless = replace(screened_of(9, 1, other))
-    monkeypatch.setattr(module, "_forces", lambda *_: [other, force])
+    monkeypatch.setattr(module, "forces", lambda *_: [other, force])
     cfg = DiagnoseCfg()
 
     def results(_task, tasks):
@@ -469,9 +469,9 @@ def test_the_best_force_must_be_large_and_significant(monkeypatch):
     assert found is not None
     assert found.words == "a force"
     assert found.instead is None
-    again = _with_interleaved_folds(replace(model, engine="mujoco"))
+    again = with_interleaved_folds(replace(model, engine="mujoco"))
     tried = [_with_prior(again, s, x) for s in (useless, explains) for x in (0.02, 0.1, 0.5)]
-    tried += [_combined(again, [useless, explains], x) for x in (0.02, 0.1, 0.5)]
+    tried += [combined(again, [useless, explains], x) for x in (0.02, 0.1, 0.5)]
     errors = [
         HeldOut(block_sums([replace(p, residual=b.residual) for p, b in zip(s.pieces, again.pieces, strict=True)],
                            again.blocks, LIMIT), again.blocks, 10.0).own().sum() for s in tried
@@ -494,7 +494,7 @@ def test_the_best_force_must_be_large_and_significant(monkeypatch):
     rival = replace(model, pieces=tuple(replace(p, residual=0.9 * p.residual) for p in model.pieces))
     beaten = _best_force(model, rival, 1.0, cfg, results)
     assert beaten is not None
-    less = 1 - _with_interleaved_folds(rival).errors.sum() / again.errors.sum()
+    less = 1 - with_interleaved_folds(rival).errors.sum() / again.errors.sum()
     assert beaten.instead == pytest.approx(less)
     assert beaten.share == pytest.approx(min((gain - less) * model.ratio**2, 1.0))
     assert beaten.p >= found.p

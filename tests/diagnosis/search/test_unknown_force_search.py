@@ -13,7 +13,7 @@ from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.screening import screen
-from concent_warp.diagnosis.search.unknown_force import _best_force, _forces, unknown_force
+from concent_warp.diagnosis.search.unknown_force import _best_force, forces, unknown_force
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce
 from concent_warp.fit.effects.cross_validation import cut_blocks
@@ -153,7 +153,7 @@ def test_the_unknown_force_is_not_tested_where_the_residual_is_noise():
 def test_bumps_lie_where_the_joint_was():
     force_models = [
         force.force_model(mujoco.MjModel.from_xml_string(rail()))
-        for force in _forces(nodes_of(ridden())[0], CFG.unknown_force)
+        for force in forces(nodes_of(ridden())[0], CFG.unknown_force)
     ]
     position, velocity = force_models
     assert isinstance(position, UnknownJointForce)

@@ -1,0 +1,107 @@
+"""A flexible correction of an effect's formula, and what an effect beside it must explain: a damped pendulum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.fit_candidate import fit_candidate
+from concent_warp.diagnosis.search.form_error import flexible_correction
+from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
+from concent_warp.diagnosis.tasks import run_tasks
+from concent_warp.effects.effect import Effect
+from concent_warp.effects.registry import effect_class
+from concent_warp.fit.effects.cross_validation import cut_blocks
+from tests.scenes.swinging import DAMPING, drawing, swung, windows_of
+
+CFG = DiagnoseCfg(jobs=1, explain=False)
+RECORDING = swung(damping=DAMPING / 50)
+
+
+def effect(name: str) -> Effect:
+    return effect_class(name)("hinge")
+
+
+def results(task: Any, tasks: Any) -> Any:
+    return run_tasks(task, tasks, 1)
+
+
+@pytest.fixture(scope="module")
+def lacking() -> FittedModel:
+    """Return the model as given, which lacks the damping."""
+    windows = windows_of(RECORDING)
+    return fit_baseline(drawing(RECORDING), windows, cut_blocks(windows), "mujoco")
+
+
+def with_effect(base: FittedModel, name: str) -> FittedModel:
+    return add_candidate(base, fit_candidate(base, screen(base, effect(name))))
+
+
+@pytest.fixture(scope="module")
+def rubbing(lacking) -> FittedModel:
+    """Return the model with dry friction in the place of the damping: the wrong formula of the right variable."""
+    return with_effect(lacking, "joint_friction")
+
+
+def test_a_flexible_correction_takes_away_what_a_wrong_formula_leaves(rubbing):
+    errors = with_interleaved_folds(rubbing).errors
+    corrected = flexible_correction(rubbing, [effect("joint_friction")], CFG, results)
+    assert corrected is not None
+    assert corrected.shape == errors.shape
+    assert corrected.sum() < 0.7 * errors.sum()
+    # About the noise: as the damping itself leaves.
+    assert rubbing.ratio > 1.3
+    assert rubbing.ratio * np.sqrt(corrected.sum() / errors.sum()) < 1.1
+
+
+def test_an_effect_of_other_variables_has_no_correction(rubbing):
+    assert effect("armature").variables == ()
+    assert flexible_correction(rubbing, [effect("armature")], CFG, results) is None
+    assert flexible_correction(rubbing, [], CFG, results) is None
+
+
+def procedure() -> Procedure:
+    return Procedure(drawing(RECORDING), RECORDING, CFG)
+
+
+def test_only_what_may_be_an_error_of_a_formula_is_corrected(lacking, rubbing):
+    left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
+    for share, ratio, corrected in ((left + 0.05, 9.0, True), (left - 0.05, 9.0, False), (left + 0.05, 1.1, False)):
+        made = procedure()
+        made.cfg = replace(CFG, max_form_error=share, form_error_ratio=ratio)
+        assert (made._correction(rubbing, lacking) is not None) is corrected
+    assert procedure()._correction(lacking, lacking) is None
+
+
+def test_an_effect_beside_another_must_explain_what_a_correction_of_that_does_not(rubbing):
+    made = procedure()
+    correction = flexible_correction(rubbing, [effect("joint_friction")], CFG, results)
+    assert correction is not None
+    damping = fit_candidate(rubbing, screen(rubbing, effect("joint_damping")))
+    armature = fit_candidate(rubbing, screen(rubbing, effect("armature")))
+    assert not made._explains_more(rubbing, armature, correction)
+    # The same without a correction worth the name.
+    assert made._explains_more(rubbing, damping, with_interleaved_folds(rubbing).errors)
+    assert made._is_corrected(rubbing, correction)
+    assert not made._is_corrected(rubbing, with_interleaved_folds(rubbing).errors)
+    assert not made._is_corrected(rubbing, None)
+
+
+def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, rubbing):
+    made = procedure()
+    left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
+    force = replace(CFG.unknown_force, min_share=0.0)
+    made.cfg = replace(CFG, max_form_error=left + 0.05, form_error_ratio=9.0, unknown_force=force)
+    assert not made._is_form_error(rubbing, lacking)
+    made.form_corrected = True
+    assert made._is_form_error(rubbing, lacking)
+    made.cfg = replace(made.cfg, max_form_error=left - 0.05)
+    assert not made._is_form_error(rubbing, lacking)
