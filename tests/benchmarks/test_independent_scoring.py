@@ -159,7 +159,7 @@ def test_the_figures_take_each_set_where_it_belongs(scoring):
     assert found["nothing hidden, false alarms"] == "50 %"
     assert found["two effects, both and nothing else"] == "50 %"
     assert found["contact geometry, exactly right"] == "100 %"
-    assert found["came to a result in time"] == "90 %"
+    assert found["came to a settled result in time"] == "90 %"
 
 
 def test_the_page_shows_what_is_wrong_and_the_earlier_state(script):

@@ -168,7 +168,7 @@ class InitialStateSearch:
             upper_bounds: Costs by window to fall below; the fit of a window ends where the falls of its cost do not
                 suffice for it, see `InitialStateCfg.max_expected_falls`.
             known: Derivatives by window from a point nearby, which serve for as long as steps along them lower the cost
-                as they predict.
+                as they predict; a window with a bound is not found before its own predict no more.
         """
         offsets, starts, rng = [np.array(o) for o in offsets], {}, np.random.default_rng(0)
         residuals = self.p.residuals(self.trials(values, offsets))
@@ -282,6 +282,9 @@ class InitialStateSearch:
                         best = int(np.argmin(costs))
                         offsets[w], residuals[w] = there[best], seen[best]
                     if not tried[k]:
+                        if w in upper_bounds:  # another start: the derivatives may be those of another valley
+                            del known[w]
+                            moving.append(w)
                         continue
                     if fall < cfg.known_share * steps[k].fall:
                         del known[w]
