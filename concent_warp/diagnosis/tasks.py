@@ -13,6 +13,9 @@ T = TypeVar("T")
 Progress = Callable[[float, str], None]
 """Called with the share done, 0..1, and what is being done."""
 
+LAST_SHARE = 0.97
+"""Share that no tasks exceed, however many there are: all is done at the end only."""
+
 
 def ignore_progress(share: float, text: str) -> None:
     """Ignore the progress, see `Progress`."""
@@ -55,8 +58,9 @@ class TaskRunner:
         results: list[T | None] = []
         for i, result in enumerate(self.results(task, arguments)):
             results.append(result)
-            self.progress(self.share + span * (i + 1) / max(len(arguments), 1), f"{text}, {i + 1} of {len(arguments)}")
-        self.share += span
+            share = self.share + span * (i + 1) / max(len(arguments), 1)
+            self.progress(min(share, LAST_SHARE), f"{text}, {i + 1} of {len(arguments)}")
+        self.share = min(self.share + span, LAST_SHARE)
         return results
 
     def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T | None]:
