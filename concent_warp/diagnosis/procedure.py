@@ -28,6 +28,7 @@ from concent_warp.diagnosis.search.baseline import (
     fit_baseline,
     refit_from_rivals,
     refit_without_effect,
+    without_effect,
 )
 from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.search.candidates import candidates, label
@@ -110,6 +111,8 @@ class Procedure:
         """Candidates that explained nearly as much as each addition, and that one itself."""
         self.with_unestablished: list[FittedModel] = []
         """The fitted models with all effects, where some are removed that are not established."""
+        self.reduced: list[FittedModel] = []
+        """The last fitted model without one of its effects each, as refitted when that was tried."""
         self.budget = TimeBudget(cfg.seconds)
 
     def run(self) -> Diagnosis:
@@ -631,6 +634,7 @@ class Procedure:
             refit = partial(lambda given: list(run_tasks(refit_without_effect, given, self.cfg.jobs)), tasks)
             if (reduced := self.budget.attempt(refit, None, unsettled)) is None:
                 break
+            self.reduced = reduced
             reduced = [self._with_nominal_instead(one, last) for one in reduced]
             shares = [_gain_over(one, last) for one in reduced]
             least = int(np.argmin(shares))
@@ -726,7 +730,7 @@ class Procedure:
             final = replace(f, parameters=parameters[owned + k])
             unsettled = f"Not refitted: the model without {f.name}, for its gain beside the other effects."
             without = fitted[0]
-            if not alone:
+            if not alone and (without := without_effect(last, owned + k, self.reduced)) is None:
                 without = attempt(partial(refit_without_effect, last, owned + k), None, unsettled)
             if without is not None:
                 final = joint_finding(f, parameters[owned + k], last, without, self.cfg.seed)

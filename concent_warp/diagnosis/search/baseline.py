@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import is_
 
 import numpy as np
 
@@ -55,6 +56,22 @@ def refit_without_effect(last: FittedModel, effect: int) -> FittedModel:
     solver = replace(last, model=model).solver()
     fit = solver.polish(solver.fit(offsets=last.fit.offsets, starts=last.fit.starts))
     return fitted_model(solver.p.model(fit.values), last.windows, last.blocks, fit, last.engine, last.cfg)
+
+
+def without_effect(last: FittedModel, effect: int, among: Sequence[FittedModel]) -> FittedModel | None:
+    """Return which of some models is the last one without an effect, fitted to the same windows; None for none.
+
+    Args:
+        last: The fitted model.
+        effect: Index of the effect.
+        among: Fitted models.
+    """
+    left = [added.effect for i, added in enumerate(last.model.effects) if i != effect]
+    for one in among:
+        same_windows = len(one.windows) == len(last.windows) and all(map(is_, one.windows, last.windows))
+        if same_windows and [added.effect for added in one.model.effects] == left:
+            return one
+    return None
 
 
 def add_candidate(base: FittedModel, added: FittedCandidate) -> FittedModel:

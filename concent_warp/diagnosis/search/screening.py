@@ -18,6 +18,8 @@ FIRST_RANKING = "first ranking"
 """How the text of the progress begins that has it."""
 RANKED = 4
 """Candidates in it."""
+FIRST_SCANNED = 0.5
+"""Share of the squared residual in the windows in which scanned values are tried first [-]."""
 
 
 def screen(
@@ -108,7 +110,11 @@ def with_residuals(pieces: Sequence[Linear], of: Sequence[Linear]) -> tuple[Line
 
 
 def projected_residuals(
-    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
+    solver: Solver,
+    base: FittedModel,
+    values: np.ndarray,
+    offsets: Sequence[np.ndarray],
+    windows: Sequence[int] | None = None,
 ) -> list[np.ndarray]:
     """Return residuals by window without what a change of the initial states takes up to first order, each (n,).
 
@@ -117,10 +123,13 @@ def projected_residuals(
         base: The fitted baseline; the dependence on the initial states is its own.
         values: Parameters, shape (P,).
         offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
+        windows: Indices of the windows; by default all.
     """
-    residuals = solver.p.residuals(solver.trials(values, offsets))
-    found = []
-    for r, a, o in zip(residuals, base.fit.starts, offsets, strict=True):
+    mine = range(len(offsets)) if windows is None else windows
+    trials = solver.trials(values, offsets)
+    residuals, found = solver.p.residuals([trials[w] for w in mine]), []
+    for w, r in zip(mine, residuals, strict=True):
+        a, o = base.fit.starts[w], offsets[w]
         near = cauchy_weight(o, base.cfg.least_squares.robust)
         inner = np.linalg.solve(a.T @ a + np.diag(near), a.T @ r + near * o)
         found.append(r - a @ inner)
@@ -162,10 +171,17 @@ def _scan(
     best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
     if not trials:
         return best, start
-    before = robust_sum(base, [piece.residual for piece in base.pieces])
+    before = np.array([robust_sum(base, [piece.residual]) for piece in base.pieces])
+    total = max(float(before.sum()), 1e-12)
+    order = np.argsort(before)[::-1]
+    first = int(np.searchsorted(np.cumsum(before[order]), FIRST_SCANNED * total)) + 1
     for moved in trials:
-        after = robust_sum(base, projected_residuals(solver, base, moved, offsets))
-        gain = (before - after) / max(before, 1e-12)
+        left = 0.0
+        for windows in (order[:first].tolist(), order[first:].tolist()):
+            # What leaves more in some windows than the best so far in all is simulated in no others.
+            if windows and left < (1 - best) * total:
+                left += robust_sum(base, projected_residuals(solver, base, moved, offsets, windows))
+        gain = 1 - left / total
         if gain > best:
             best, start = gain, moved
     return best, start

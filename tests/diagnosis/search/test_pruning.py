@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import CheckpointedRunner
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline, refit_without_effect
+from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline, refit_without_effect, without_effect
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
 from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.tasks import ignore_progress
@@ -43,6 +45,16 @@ def test_a_model_without_one_of_its_effects_is_fitted_again(nodes):
     assert [a.effect.name for a in alone.model.effects] == ["joint_damping"]
     assert alone.model.effects[0].values[0] == pytest.approx(DAMPING, rel=0.05)
     assert alone.ratio == pytest.approx(last.ratio, rel=0.02)
+
+
+def test_a_model_without_an_effect_that_was_refitted_already_is_found_again(nodes):
+    given, _, last = nodes[1]
+    alone = refit_without_effect(last, 0)
+    refitted = replace(last, fit=replace(last.fit))
+    assert without_effect(refitted, 0, [given, alone]) is alone
+    assert without_effect(refitted, 1, [given, alone]) is None
+    other = replace(alone, windows=tuple(replace(w) for w in alone.windows))
+    assert without_effect(refitted, 0, [other]) is None
 
 
 @pytest.mark.parametrize("kept", [False, True])

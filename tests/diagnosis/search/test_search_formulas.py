@@ -159,26 +159,42 @@ def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monk
     ]
     solver: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters, owned=1), high=np.array([9.0, 9.0, 8.0]))
     base, tried = base_of(), []
-    before = robust_sum(base, [p.residual for p in base.pieces])
+    before = [robust_sum(base, [p.residual]) for p in base.pieces]
+    largest = int(np.argmax(before))
 
-    def left(_solver, _base, values, offsets):
-        tried.append((values.tolist(), offsets))
-        share = {1.0: 0.9, 2.0: 0.6}.get(values[1], 0.8)
-        return [np.full(1, np.sqrt(share * before))]
+    def of_windows(share):
+        """Return what leaves a share of each window's squared residual."""
 
+        def residuals(_solver, _base, values, offsets, windows):
+            tried.append((values.tolist(), offsets, list(windows)))
+            return [np.full(1, np.sqrt(share(values) * before[w])) for w in windows]
+
+        return residuals
+
+    monkeypatch.setattr(screening, "robust_sum", lambda _base, rs: sum(float(r @ r) for r in rs))
+    reduced = tuple(replace(p, residual=np.full(1, np.sqrt(b))) for p, b in zip(base.pieces, before, strict=True))
+    base = replace(base, pieces=reduced)
+    left = of_windows(lambda values: {1.0: 0.9, 2.0: 0.6}.get(values[1], 0.8))
     monkeypatch.setattr(screening, "projected_residuals", left)
-    monkeypatch.setattr(
-        screening, "robust_sum", lambda _base, rs: sum(float(r @ r) for r in rs) if len(rs[0]) == 1 else before
-    )
     gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
-    assert [t[0] for t in tried] == [[0.5, 1.0, np.inf], [0.5, 2.0, np.inf], [0.5, 0.0, 3.0]]
-    assert all(t[1] is OFFSETS for t in tried)
+    in_turn = [[0.5, 1.0, np.inf], [0.5, 2.0, np.inf], [0.5, 0.0, 3.0]]
+    assert [values for values, _, windows in tried if largest in windows] == in_turn
+    assert all(offsets is OFFSETS for _, offsets, _ in tried)
+    assert sorted(w for values, _, windows in tried if values == in_turn[0] for w in windows) == list(
+        range(len(before))
+    )
     assert gain == pytest.approx(0.4)
     assert start.tolist() == [0.5, 2.0, np.inf]
-    monkeypatch.setattr(screening, "projected_residuals", lambda *_: [np.full(1, np.sqrt(1.1 * before))])
+    tried.clear()
+    monkeypatch.setattr(screening, "projected_residuals", of_windows(lambda _: 1.1))
     gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
     assert gain == 0.0
     assert start.tolist() == [0.5, 0.0, 8.0]
+    tried.clear()
+    monkeypatch.setattr(screening, "projected_residuals", of_windows(lambda _: 100.0))
+    assert _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)[0] == 0.0
+    # What leaves more in the first windows than the model in all is simulated in no others.
+    assert len(tried) == 3
     none: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters[:1], owned=1), high=np.array([9.0]))
     assert _scan(none, base, np.array([0.5]), OFFSETS)[0] == 0.0
 
