@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,9 @@ RANKED = 4
 """Candidates in it."""
 FIRST_SCANNED = 0.5
 """Share of the squared residual in the windows in which scanned values are tried first [-]."""
+WORSE = 1.5
+"""Squared residual that a scanned value leaves there, over the least of those before, above which none beyond it is
+tried [-]. Empirical."""
 
 
 def screen(
@@ -152,7 +155,9 @@ def _scan(
 ) -> tuple[float, np.ndarray]:
     """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
 
-    Threshold effects such as adhesion or backlash have no sensitivity at their null value.
+    Threshold effects such as adhesion or backlash have no sensitivity at their null value. Values that gain nothing in
+    the windows with the largest residuals are simulated in no others, and those beyond one that is far worse there than
+    an earlier one in no window.
 
     Args:
         solver: Solver of the candidate.
@@ -160,28 +165,34 @@ def _scan(
         values: Parameters at their null values, shape (P,).
         offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
     """
-    trials = []
+    best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
+    before = np.array([robust_sum(base, [piece.residual]) for piece in base.pieces])
+    order = np.argsort(before)[::-1]
+    count = int(np.searchsorted(np.cumsum(before[order]), FIRST_SCANNED * before.sum())) + 1
+    first, rest = order[:count].tolist(), order[count:].tolist()
+    first_before, total = float(before[first].sum()), max(float(before.sum()), 1e-12)
+    for k, outward in _outward(solver, values):
+        least = np.inf
+        for value in outward:
+            moved = values.copy()
+            moved[k] = value
+            left = robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
+            least = min(least, left)
+            if left > max(WORSE * least, first_before):
+                break
+            if left >= first_before:
+                continue
+            if rest:
+                left += robust_sum(base, projected_residuals(solver, base, moved, offsets, rest))
+            if 1 - left / total > best:
+                best, start = 1 - left / total, moved
+    return best, start
+
+
+def _outward(solver: Solver, values: np.ndarray) -> Iterator[tuple[int, list[float]]]:
+    """Yield the scanned values of each parameter of a candidate, on each side from the nearest to its null value on."""
     for k, parameter in enumerate(solver.p.parameters):
         if k < solver.p.owned:
             continue
-        for value in parameter.scan:
-            moved = values.copy()
-            moved[k] = value
-            trials.append(moved)
-    best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
-    if not trials:
-        return best, start
-    before = np.array([robust_sum(base, [piece.residual]) for piece in base.pieces])
-    total = max(float(before.sum()), 1e-12)
-    order = np.argsort(before)[::-1]
-    first = int(np.searchsorted(np.cumsum(before[order]), FIRST_SCANNED * total)) + 1
-    for moved in trials:
-        left = 0.0
-        for windows in (order[:first].tolist(), order[first:].tolist()):
-            # What leaves more in some windows than the best so far in all is simulated in no others.
-            if windows and left < (1 - best) * total:
-                left += robust_sum(base, projected_residuals(solver, base, moved, offsets, windows))
-        gain = 1 - left / total
-        if gain > best:
-            best, start = gain, moved
-    return best, start
+        yield k, sorted((v for v in parameter.scan if v < values[k]), reverse=True)
+        yield k, sorted(v for v in parameter.scan if v > values[k])

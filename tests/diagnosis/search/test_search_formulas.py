@@ -151,52 +151,68 @@ OFFSETS = (np.zeros(2),)
 """Errors of the initial states."""
 
 
-def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monkeypatch):
-    parameters = [
-        Parameter("own", "-", 0.0, 0.0, 9.0, 1.0, scan=(5.0,)),
-        Parameter("a", "-", 0.0, 0.0, 9.0, 1.0, scan=(1.0, 2.0)),
-        Parameter("b", "-", np.inf, 0.0, 9.0, 1.0, scan=(3.0,)),
-    ]
-    solver: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters, owned=1), high=np.array([9.0, 9.0, 8.0]))
+def scanning(monkeypatch, parameters, share):
+    """Return what `_scan` finds, and the values and windows that it simulates.
+
+    Args:
+        monkeypatch: Replaces residuals.
+        parameters: Those of the model and of the candidate; the first is the model's own.
+        share: Returns the share of each window's squared residual that values leave.
+    """
+    high = np.array([p.high for p in parameters])
+    solver: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters, owned=1), high=high)
     base, tried = base_of(), []
     before = [robust_sum(base, [p.residual]) for p in base.pieces]
-    largest = int(np.argmax(before))
+    reduced = tuple(replace(p, residual=np.full(1, np.sqrt(b))) for p, b in zip(base.pieces, before, strict=True))
 
-    def of_windows(share):
-        """Return what leaves a share of each window's squared residual."""
-
-        def residuals(_solver, _base, values, offsets, windows):
-            tried.append((values.tolist(), offsets, list(windows)))
-            return [np.full(1, np.sqrt(share(values) * before[w])) for w in windows]
-
-        return residuals
+    def residuals(_solver, _base, values, offsets, windows):
+        assert offsets is OFFSETS
+        tried.append((values.tolist(), list(windows)))
+        return [np.full(1, np.sqrt(share(values) * before[w])) for w in windows]
 
     monkeypatch.setattr(screening, "robust_sum", lambda _base, rs: sum(float(r @ r) for r in rs))
-    reduced = tuple(replace(p, residual=np.full(1, np.sqrt(b))) for p, b in zip(base.pieces, before, strict=True))
-    base = replace(base, pieces=reduced)
-    left = of_windows(lambda values: {1.0: 0.9, 2.0: 0.6}.get(values[1], 0.8))
-    monkeypatch.setattr(screening, "projected_residuals", left)
-    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
-    in_turn = [[0.5, 1.0, np.inf], [0.5, 2.0, np.inf], [0.5, 0.0, 3.0]]
-    assert [values for values, _, windows in tried if largest in windows] == in_turn
-    assert all(offsets is OFFSETS for _, offsets, _ in tried)
-    assert sorted(w for values, _, windows in tried if values == in_turn[0] for w in windows) == list(
-        range(len(before))
+    monkeypatch.setattr(screening, "projected_residuals", residuals)
+    gain, start = _scan(
+        solver, replace(base, pieces=reduced), np.array([0.5, *(p.null for p in parameters[1:])]), OFFSETS
     )
+    return gain, start.tolist(), tried, before
+
+
+OWN = Parameter("own", "-", 0.0, 0.0, 9.0, 1.0, scan=(5.0,))
+
+
+def test_scanned_values_are_tried_one_at_a_time_and_the_best_starts_the_fit(monkeypatch):
+    parameters = [
+        OWN,
+        Parameter("a", "-", 0.0, 0.0, 9.0, 1.0, scan=(1.0, 2.0)),
+        Parameter("b", "-", np.inf, 0.0, 8.0, 1.0, scan=(3.0,)),
+    ]
+    left = {1.0: 0.9, 2.0: 0.6}
+    gain, start, tried, before = scanning(monkeypatch, parameters, lambda values: left.get(values[1], 0.8))
+    largest = int(np.argmax(before))
+    in_turn = [[0.5, 1.0, np.inf], [0.5, 2.0, np.inf], [0.5, 0.0, 3.0]]
+    assert [values for values, windows in tried if largest in windows] == in_turn
+    for values in in_turn:
+        assert sorted(w for other, windows in tried if other == values for w in windows) == list(range(len(before)))
     assert gain == pytest.approx(0.4)
-    assert start.tolist() == [0.5, 2.0, np.inf]
-    tried.clear()
-    monkeypatch.setattr(screening, "projected_residuals", of_windows(lambda _: 1.1))
-    gain, start = _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)
+    assert start == [0.5, 2.0, np.inf]
+    gain, start, tried, _ = scanning(monkeypatch, parameters, lambda _: 1.1)
     assert gain == 0.0
-    assert start.tolist() == [0.5, 0.0, 8.0]
-    tried.clear()
-    monkeypatch.setattr(screening, "projected_residuals", of_windows(lambda _: 100.0))
-    assert _scan(solver, base, np.array([0.5, 0.0, np.inf]), OFFSETS)[0] == 0.0
-    # What leaves more in the first windows than the model in all is simulated in no others.
-    assert len(tried) == 3
-    none: Any = SimpleNamespace(p=SimpleNamespace(parameters=parameters[:1], owned=1), high=np.array([9.0]))
-    assert _scan(none, base, np.array([0.5]), OFFSETS)[0] == 0.0
+    assert start == [0.5, 0.0, 8.0]
+    # What gains nothing in the windows with the largest residuals is simulated in no others.
+    assert [values for values, _ in tried] == in_turn
+    assert scanning(monkeypatch, [OWN], lambda _: 0.5)[:3] == (0.0, [0.5], [])
+
+
+def test_scanned_values_beyond_one_that_is_far_worse_are_not_tried(monkeypatch):
+    parameters = [OWN, Parameter("a", "-", 3.0, 0.0, 9.0, 1.0, scan=(9.0, 1.0, 4.0, 2.0, 5.0, 0.0))]
+    left = {2.0: 1.2, 1.0: 1.9, 4.0: 1.2, 5.0: 0.7, 9.0: 1.3}
+    gain, start, tried, _ = scanning(monkeypatch, parameters, lambda values: left[values[1]])
+    assert list(dict.fromkeys(values[1] for values, _ in tried)) == [2.0, 1.0, 4.0, 5.0, 9.0]
+    assert (gain, start) == (pytest.approx(0.3), [0.5, 5.0])
+    # Where all leave more than the model at its own initial states, as long as one is no worse than an earlier one.
+    _, _, tried, _ = scanning(monkeypatch, parameters, lambda values: 3.0 - 0.1 * abs(values[1] - 3.0))
+    assert [values[1] for values, _ in tried] == [2.0, 1.0, 0.0, 4.0, 5.0, 9.0]
 
 
 class OneEffect:
