@@ -57,6 +57,9 @@ class SearchCfg:
     min_expected_gain: float = 0.5
     """Expected gain over the needed one, above which a screened candidate is fitted [-]: linear extrapolation is
     taken to be right to a factor of 2."""
+    min_scanned_gain: float = 0.25
+    """The same where a scanned value gains something: the best one may lie between two, and what has a threshold is far
+    from linear. Empirical."""
     remainder_promise: Share = 0.75
     """Share of the gain that `DiagnoseCfg.max_remainder` asks for which a screened candidate must promise to be fitted
     [-]: little is left there, and residuals are nearly in proportion to an effect's size."""

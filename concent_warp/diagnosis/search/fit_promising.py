@@ -64,10 +64,10 @@ class CandidateFits:
             short_windows: Returns the windows of a multiple-shooting fit.
             least_promise: Expected gain below which none is fitted, whatever is needed.
         """
-        least = max(self.search.min_expected_gain * needed_gain, least_promise)
         if self.fits:
-            least = max(least, self.search.explained_min_gain * self._best().share(self.base))
-        promising = sorted((s for s in screened if s.expected_gain > least), key=lambda s: -s.expected_gain)
+            least_promise = max(least_promise, self.search.explained_min_gain * self._best().share(self.base))
+        promising = [s for s in screened if s.expected_gain > max(self._least_share(s) * needed_gain, least_promise)]
+        promising.sort(key=lambda s: -s.expected_gain)
         more = self._fit_in_batches(_a_few_of_each(promising, self.search.fits_of_each)[: self.cfg.max_fits])
         self.fitted += more
         if not more:
@@ -89,6 +89,10 @@ class CandidateFits:
         if self._best().ratio > self.cfg.adequate_ratio and self._left() > self.cfg.unknown_force.min_share:
             self._initialise_by_multiple_shooting(short_windows)
         return self.fits
+
+    def _least_share(self, s: ScreenedCandidate) -> float:
+        """Return the expected gain over the needed one, above which a candidate is fitted [-]."""
+        return self.search.min_scanned_gain if s.scanned_gain > 0 else self.search.min_expected_gain
 
     def unsettled(self, name: Callable[[Effect], str]) -> list[tuple[str, bool]]:
         """Return sentences on what there was no time for, and whether it may change which effect is the best.

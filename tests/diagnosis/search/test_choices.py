@@ -217,6 +217,15 @@ def test_candidates_below_a_least_promise_are_not_fitted(monkeypatch):
         assert [c.name for c in found] == list(fitted)
 
 
+def test_candidates_of_which_a_scanned_value_gains_something_may_promise_less(monkeypatch):
+    assert (SearchCfg().min_expected_gain, SearchCfg().min_scanned_gain) == (0.5, 0.25)
+    for expected, scanned_gain, fitted in ((0.051, 0.0, "a"), (0.049, 0.0, ""), (0.049, 0.01, "a"), (0.024, 0.01, "")):
+        Tasks(monkeypatch, {"a": made("a", 0.5, ratio=1.2)})
+        candidate = screened("a", expected)
+        candidate.scanned_gain, candidate.start = scanned_gain, np.array([9.0])
+        assert [c.name for c in fits_of([]).fit([candidate], 0.1, list)] == list(fitted)
+
+
 def test_fits_near_the_best_that_ended_at_their_scanned_value_are_searched_from_it(monkeypatch):
     tasks = Tasks(monkeypatch, {})
     names = ("best", "near", "moved", "noise", "null", "far")
