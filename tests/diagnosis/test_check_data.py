@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.check_data import check_data
+from concent_warp.diagnosis.cfg import CheckDataCfg
+from concent_warp.diagnosis.check_data import _is_white, check_data
 from concent_warp.recording.recording import Channel
 from tests.scenes.swinging import swung
 
@@ -51,3 +52,56 @@ def test_clean_data_are_not_remarked_on():
 )
 def test_doubtful_data_are_reported_with_their_place(change, words):
     assert check_data(spoiled(change)) == [words]
+
+
+def said_of(time: np.ndarray, value: np.ndarray, noise: float | None = 1e-3, more: bool = False) -> list[str]:
+    """Return what is said of a channel."""
+    recording = swung(seconds=0.5)
+    (d,) = recording.demonstrations
+    measured = {"x": Channel(time, value, noise)}
+    if more:
+        measured["clean"] = d.measured["angle"]
+    return check_data(replace(recording, demonstrations=(replace(d, measured=measured),)))
+
+
+def test_thresholds_of_the_check_of_the_data():
+    time = np.arange(40) * 0.01
+    swing = np.sin(9 * time)[:, None]
+    late = time.copy()
+    late[20:] += 0.09
+    assert said_of(late, swing) == []
+    late[20:] += 0.0011
+    late[30:] += 0.5
+    assert said_of(late, swing) == ["demo_0, x: 2 gaps of up to 0.51 s between samples 0.01 s apart."]
+    lost = swing.copy()
+    lost[:8] = np.nan
+    assert said_of(time, lost) == []
+    lost[:9] = np.nan
+    assert said_of(time, lost) == ["demo_0, x: 22 % of the samples are missing."]
+    assert said_of(time[:10], 0 * swing[:10]) == []
+    assert said_of(time[:11], 0 * swing[:11]) == ["demo_0, x: the reading never changes."]
+    two = np.concatenate([0 * swing, swing], axis=1)
+    assert said_of(time, two) == []
+    assert said_of(time[:2], swing[:2]) == []
+    assert said_of(time[:1], swing[:1]) == ["demo_0, x: only 1 sample, which carries no information."]
+    white = np.where(np.arange(40) % 2, 1.0, -1.0)[:, None] * np.random.default_rng(0).uniform(0.5, 1, (40, 1))
+    said = ["demo_0, x: the readings scatter like noise, no motion shows in them."]
+    std = float(white.std())
+    assert said_of(time, white, std / 3.01) == said
+    assert said_of(time, white, std / 2.99) == []
+    assert said_of(time, white, None) == said
+    assert said_of(time, white, None, more=True) == []
+    assert said_of(time[:29], white[:29], None) == []
+    assert said_of(time[:30], white[:30], None) == said
+
+
+def test_readings_are_white_where_all_that_move_differ_as_independent_ones():
+    cfg, rng = CheckDataCfg(), np.random.default_rng(1)
+    white, swing = rng.normal(size=(100, 1)), np.sin(np.arange(100) / 9)[:, None]
+    assert _is_white(white, cfg)
+    assert _is_white(np.hstack([white, 0 * white]), cfg)
+    assert not _is_white(np.hstack([white, swing]), cfg)
+    assert not _is_white(0 * white, cfg)
+    ratio = np.mean(np.diff(white, axis=0) ** 2) / white.var()
+    assert _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 0.999))
+    assert not _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 1.001))

@@ -1,18 +1,27 @@
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from concent_warp.diagnosis import failures as module
-from concent_warp.diagnosis.cfg import FailureCfg
-from concent_warp.diagnosis.failures import _unexplained_forces, _with_starts, locate_failures
+from concent_warp.diagnosis.cfg import FailureCfg, SearchCfg
+from concent_warp.diagnosis.failures import (
+    _force_entries,
+    _span_entry,
+    _unexplained_forces,
+    _with_starts,
+    locate_failures,
+)
 from concent_warp.diagnosis.forces.locate import locate_forces
 from concent_warp.errors import RecordingError
 from concent_warp.fit.effects.observe import observe
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.scene.scene import Scene
+from tests.scenes.swinging import drawing, swung, windows_of
 
 XML = """
 <mujoco>
@@ -96,3 +105,43 @@ def test_replay_starts_where_the_window_was_fitted_to_start():
     np.testing.assert_allclose(np.asarray(moved.demonstrations[0].qpos, dtype=float), [0.004])
     assert locate_failures(model(), started_off, NO_FORCES) != []
     assert locate_failures(model(), started_off, NO_FORCES, windows=windows, offsets=[offset] * len(windows)) == []
+
+
+def test_failures_name_spans_and_significant_forces_by_size():
+    span: Any = SimpleNamespace(
+        demonstration="d", channels=("angle", "rate"), phase="all", start=0.1, end=0.2, body="arm", direction="",
+        ratio=3.0, sentence=lambda demonstration: f"said {demonstration}",
+    )  # fmt: skip
+    assert _span_entry(span, True) == {
+        "demonstration": "d", "channel": "angle", "phase": "all", "start": 0.1, "end": 0.2, "body": "arm",
+        "direction": None, "ratio": 3.0, "sentence": "said True",
+    }  # fmt: skip
+    from tests.diagnosis.forces.test_describe import body, joint, phase
+
+    forces: Any = SimpleNamespace(
+        joints=[joint(ratio=2.0), joint(joint="other", ratio=9.0, significant=False)],
+        bodies=[body(phase(), phase(phase="free", significant=False), ratio=5.0), body(phase(), ratio=1.0)],
+    )
+    found = _force_entries(forces)
+    assert [(f["channel"], f["body"], f["phase"], f["ratio"]) for f in found] == [
+        (None, "block", "slide", 5.0), ("hinge", None, None, 2.0), (None, "block", "slide", 1.0),
+    ]  # fmt: skip
+    assert found[1]["sentence"].startswith("hinge: ")
+    assert found[0]["sentence"].startswith("block, slide")
+    assert all(f["start"] is None and f["end"] is None and f["demonstration"] is None for f in found)
+
+
+def test_replays_start_where_the_first_window_of_a_demonstration_was_fitted_to():
+    recording = swung(seconds=0.5)
+    windows = windows_of(recording, length=0.25)
+    (d,) = recording.demonstrations
+    assert len(windows) > 1
+    offsets = [np.array([0.5, -2.0]) + k for k in range(len(windows))]
+    (moved,) = _with_starts(drawing(recording), recording, windows, offsets).demonstrations
+    first = windows[0]
+    np.testing.assert_allclose(np.asarray(moved.qpos), first.qpos + 0.5 * first.spread[0])
+    np.testing.assert_allclose(np.asarray(moved.qvel), first.qvel - 2.0 * first.spread[1])
+    (same,) = _with_starts(drawing(recording), recording, windows[1:], offsets[1:]).demonstrations
+    assert same.qpos is d.qpos
+    assert same.qvel is d.qvel
+    assert SearchCfg().max_rounds == 3

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure as module
-from concent_warp.diagnosis.cfg import CheckDataCfg, DiagnoseCfg, NominalCfg, SearchCfg
-from concent_warp.diagnosis.check_data import _is_white, check_data
-from concent_warp.diagnosis.failures import _force_entries, _span_entry, _with_starts
+from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding, UnknownForceFound
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
@@ -20,7 +18,6 @@ from concent_warp.diagnosis.search.reconsider import Reconsidered, Rival
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.intervals import FittedParameter
-from concent_warp.recording.recording import Channel
 from concent_warp.simulate.time_limit import TimeUpError
 from tests.scenes.swinging import drawing, swung, windows_of
 
@@ -1025,97 +1022,6 @@ def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkey
     assert made.seen[-1][1] == "ranked ['a', 'b']"
     made.gradient = SimpleNamespace(apply=lambda _base, screened, _runner: screened[::-1])
     assert made._screened(node(2.0), ["a", "b"], 0) == ["B", "A"]
-
-
-def spoiled(time: np.ndarray, value: np.ndarray, noise: float | None = 1e-3, more: bool = False) -> list[str]:
-    """Return what is said of a channel."""
-    (d,) = RECORDING.demonstrations
-    measured = {"x": Channel(time, value, noise)}
-    if more:
-        measured["clean"] = d.measured["angle"]
-    return check_data(replace(RECORDING, demonstrations=(replace(d, measured=measured),)))
-
-
-def test_thresholds_of_the_check_of_the_data():
-    time = np.arange(40) * 0.01
-    swing = np.sin(9 * time)[:, None]
-    late = time.copy()
-    late[20:] += 0.09
-    assert spoiled(late, swing) == []
-    late[20:] += 0.0011
-    late[30:] += 0.5
-    assert spoiled(late, swing) == ["demo_0, x: 2 gaps of up to 0.51 s between samples 0.01 s apart."]
-    lost = swing.copy()
-    lost[:8] = np.nan
-    assert spoiled(time, lost) == []
-    lost[:9] = np.nan
-    assert spoiled(time, lost) == ["demo_0, x: 22 % of the samples are missing."]
-    assert spoiled(time[:10], 0 * swing[:10]) == []
-    assert spoiled(time[:11], 0 * swing[:11]) == ["demo_0, x: the reading never changes."]
-    two = np.concatenate([0 * swing, swing], axis=1)
-    assert spoiled(time, two) == []
-    assert spoiled(time[:2], swing[:2]) == []
-    assert spoiled(time[:1], swing[:1]) == ["demo_0, x: only 1 sample, which carries no information."]
-    white = np.where(np.arange(40) % 2, 1.0, -1.0)[:, None] * np.random.default_rng(0).uniform(0.5, 1, (40, 1))
-    said = ["demo_0, x: the readings scatter like noise, no motion shows in them."]
-    std = float(white.std())
-    assert spoiled(time, white, std / 3.01) == said
-    assert spoiled(time, white, std / 2.99) == []
-    assert spoiled(time, white, None) == said
-    assert spoiled(time, white, None, more=True) == []
-    assert spoiled(time[:29], white[:29], None) == []
-    assert spoiled(time[:30], white[:30], None) == said
-
-
-def test_readings_are_white_where_all_that_move_differ_as_independent_ones():
-    cfg, rng = CheckDataCfg(), np.random.default_rng(1)
-    white, swing = rng.normal(size=(100, 1)), np.sin(np.arange(100) / 9)[:, None]
-    assert _is_white(white, cfg)
-    assert _is_white(np.hstack([white, 0 * white]), cfg)
-    assert not _is_white(np.hstack([white, swing]), cfg)
-    assert not _is_white(0 * white, cfg)
-    ratio = np.mean(np.diff(white, axis=0) ** 2) / white.var()
-    assert _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 0.999))
-    assert not _is_white(white, replace(cfg, white_noise_ratio=ratio / 2 * 1.001))
-
-
-def test_failures_name_spans_and_significant_forces_by_size():
-    span: Any = SimpleNamespace(
-        demonstration="d", channels=("angle", "rate"), phase="all", start=0.1, end=0.2, body="arm", direction="",
-        ratio=3.0, sentence=lambda demonstration: f"said {demonstration}",
-    )  # fmt: skip
-    assert _span_entry(span, True) == {
-        "demonstration": "d", "channel": "angle", "phase": "all", "start": 0.1, "end": 0.2, "body": "arm",
-        "direction": None, "ratio": 3.0, "sentence": "said True",
-    }  # fmt: skip
-    from tests.diagnosis.forces.test_describe import body, joint, phase
-
-    forces: Any = SimpleNamespace(
-        joints=[joint(ratio=2.0), joint(joint="other", ratio=9.0, significant=False)],
-        bodies=[body(phase(), phase(phase="free", significant=False), ratio=5.0), body(phase(), ratio=1.0)],
-    )
-    found = _force_entries(forces)
-    assert [(f["channel"], f["body"], f["phase"], f["ratio"]) for f in found] == [
-        (None, "block", "slide", 5.0), ("hinge", None, None, 2.0), (None, "block", "slide", 1.0),
-    ]  # fmt: skip
-    assert found[1]["sentence"].startswith("hinge: ")
-    assert found[0]["sentence"].startswith("block, slide")
-    assert all(f["start"] is None and f["end"] is None and f["demonstration"] is None for f in found)
-
-
-def test_replays_start_where_the_first_window_of_a_demonstration_was_fitted_to():
-    windows = windows_of(swung(seconds=0.5), length=0.25)
-    (d,) = RECORDING.demonstrations
-    assert len(windows) > 1
-    offsets = [np.array([0.5, -2.0]) + k for k in range(len(windows))]
-    (moved,) = _with_starts(MODEL, RECORDING, windows, offsets).demonstrations
-    first = windows[0]
-    np.testing.assert_allclose(np.asarray(moved.qpos), first.qpos + 0.5 * first.spread[0])
-    np.testing.assert_allclose(np.asarray(moved.qvel), first.qvel - 2.0 * first.spread[1])
-    (same,) = _with_starts(MODEL, RECORDING, windows[1:], offsets[1:]).demonstrations
-    assert same.qpos is d.qpos
-    assert same.qvel is d.qvel
-    assert SearchCfg().max_rounds == 3
 
 
 class Parts:
