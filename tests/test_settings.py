@@ -27,6 +27,7 @@ CHANGED_IN_PLACE = {
     "PlyElement",
     "VariantResult",
     "ResetCandidate",
+    "SearchRecord",
     "RunFolder",
     "Iteration",
     "_Claims",

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis import procedure
 from concent_warp.diagnosis import tasks as task_module
 from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
 from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.search import context
 from concent_warp.diagnosis.search.candidate import ScreenedCandidate
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
@@ -38,7 +38,7 @@ def counted(monkeypatch):
         return run_tasks(work, given, jobs)
 
     monkeypatch.setattr(task_module, "run_tasks_in_time", watched)
-    monkeypatch.setattr(procedure, "run_tasks", watched)
+    monkeypatch.setattr(context, "run_tasks", watched)
     return tasks
 
 

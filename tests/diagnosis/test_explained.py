@@ -11,10 +11,11 @@ import pytest
 from concent_warp.diagnosis import procedure as module
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.search import additions, context, revision
 from concent_warp.diagnosis.search.adequacy import is_adequate, least_ratio
 from concent_warp.model import Model
 from concent_warp.scene.scene import Scene
-from tests.diagnosis.test_procedure import FINER, finding, node, procedure
+from tests.diagnosis.made_up import FINER, finding, node, procedure
 from tests.scenes.swinging import swing_scene
 
 
@@ -48,22 +49,22 @@ def test_an_effect_that_leaves_more_than_little_noise_and_more_than_an_error_of_
     left, first, factor, added, explains
 ):
     made = procedure()
-    made.noise_factors = {"angle": factor}
-    assert made._explains(node(left), node(first), added=added) is explains
+    made.context.noise_factors = {"angle": factor}
+    assert made.context.explains(node(left), node(first), added=added) is explains
     if added and not explains and left < 1.25:
-        assert is_adequate(node(left), made.noise_factors, made.cfg)
+        assert is_adequate(node(left), made.context.noise_factors, made.context.cfg)
 
 
 def test_the_ratio_up_to_which_an_effect_is_an_explanation_is_a_setting():
     made = procedure(search=replace(SearchCfg(), explained_ratio=1.2))
-    assert made._explains(node(1.19), node(1.5), added=True)
-    assert not made._explains(node(1.21), node(1.5), added=True)
+    assert made.context.explains(node(1.19), node(1.5), added=True)
+    assert not made.context.explains(node(1.21), node(1.5), added=True)
 
 
 def test_an_imitation_makes_the_verdict_none_of_these(monkeypatch):
     monkeypatch.setattr(module, "unknown_force", lambda *_: pytest.fail("more than that is missing"))
     made = procedure()
-    made.findings, made.groups = [finding("a", 0.5)], [("a",)]
+    made.record.findings, made.record.groups = [finding("a", 0.5)], [("a",)]
     found = made.conclude(node(1.5), [node(1.5), node(1.2, effects=1)], (), ())
     assert (found.verdict, found.form_error) == ("none_of_these", None)
     assert found.unexplained == pytest.approx(0.44 / 1.25)
@@ -71,9 +72,9 @@ def test_an_imitation_makes_the_verdict_none_of_these(monkeypatch):
 
 
 def test_where_what_is_left_may_be_an_error_of_a_formula_one_more_effect_is_tried(monkeypatch):
-    for name in ("finer_time_step", "with_nominal_values"):
-        monkeypatch.setattr(module, name, lambda *_: None)
-    monkeypatch.setattr(module, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
     for left, explained in ((1.09, True), (1.2, True), (1.9, True), (2.1, False)):
         made, asked = procedure(), []
 
@@ -81,30 +82,30 @@ def test_where_what_is_left_may_be_an_error_of_a_formula_one_more_effect_is_trie
             asked.append(explained)
             return (None if step else node(left, effects=1)), ()
 
-        monkeypatch.setattr(made, "find_addition", find)
-        made.add_effects([node(9.0)], ())
+        monkeypatch.setattr(made.additions.finder, "find", find)
+        made.additions.add_effects([node(9.0)], ())
         # An effect must then be established beside the others; beside the model as given it need not be.
         assert asked == [False, explained]
 
 
 def test_a_search_ends_with_a_shorter_time_step_that_leaves_no_more_than_noise(monkeypatch):
-    monkeypatch.setattr(module, "with_nominal_values", lambda *_: None)
-    monkeypatch.setattr(module, "time_step_finding", lambda *_: "found")
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
     given, asked = node(3.0, 100.0), []
     for ratio, factor, more in ((1.02, 1.0, False), (1.03, 1.0, True), (1.4, 1.4, False), (1.5, 1.4, True)):
         made, finer = procedure(), node(ratio, 10.0, timestep=FINER)
-        made.noise_factors = {"angle": factor}
-        monkeypatch.setattr(made, "_finer", lambda one, finer=finer: finer if one is given else None)
-        monkeypatch.setattr(made, "find_addition", lambda base, *_, **_k: asked.append(base) or (None, ()))
+        made.context.noise_factors = {"angle": factor}
+        monkeypatch.setattr(made.additions, "_finer", lambda one, finer=finer: finer if one is given else None)
+        monkeypatch.setattr(made.additions.finder, "find", lambda base, *_, **_k: asked.append(base) or (None, ()))
         asked.clear()
-        assert made.add_effects([given], ())[0] == [finer]
-        assert made.time_step == "found"
+        assert made.additions.add_effects([given], ())[0] == [finer]
+        assert made.record.time_step == "found"
         assert bool(asked) is more
 
 
 def test_a_model_that_leaves_no_more_than_noise_stays_as_given_where_no_effect_was_accepted(monkeypatch):
     for name in ("at_given_step", "without_nominal_values"):
-        monkeypatch.setattr(module, name, lambda one: one)
+        monkeypatch.setattr(revision, name, lambda one: one)
     for ratio, found, stays in (
         (1.02, [], True),
         (1.02, [finding("a", 0.5, accepted=False)], True),
@@ -112,22 +113,22 @@ def test_a_model_that_leaves_no_more_than_noise_stays_as_given_where_no_effect_w
         (1.02, [finding("a", 0.5)], False),
     ):
         made, given = procedure(), node(ratio, 100.0)
-        made.time_step, made.findings = "found", list(found)
+        made.record.time_step, made.record.findings = "found", list(found)
         last = node(1.0, 90.0, timestep=FINER, nominal=2)
-        fitted = made.restore_given([given, last], given)
+        fitted = made.revision.restore_given([given, last], given)
         assert fitted == ([given] if stays else [given, last])
-        assert made.time_step == (None if stays else "found")
+        assert made.record.time_step == (None if stays else "found")
         if stays:
-            found_values = made.final_values(fitted)
+            found_values = made.revision.final_values(fitted)
             assert found_values == [given]
-            assert made.nominal_values == ()
+            assert made.record.nominal_values == ()
             assert made.conclude(given, fitted, (), ()).changes_model is False
 
 
 @pytest.mark.parametrize(("left", "explains"), [(1.7, True), (1.84, True), (1.85, False), (2.1, False)])
 def test_the_model_stays_as_given_where_accepted_effects_explain_less_than_a_fifth(left, explains):
     made, given, last = procedure(), node(2.0, name="given"), node(left, effects=1, name="last")
-    made.findings, made.groups = [finding("a", 0.06)], [("a",)]
+    made.record.findings, made.record.groups = [finding("a", 0.06)], [("a",)]
     found = made.conclude(given, [given, last], (), ())
     assert found.verdict == "none_of_these"
     assert found.unexplained == pytest.approx(min((left**2 - 1) / 3, 1.0))
@@ -146,7 +147,7 @@ def test_without_an_accepted_effect_the_model_is_as_given():
 def test_the_least_share_that_effects_must_explain_is_a_setting():
     for least, explains in ((0.1, True), (0.2, False), (0.0, True)):
         made, given = procedure(min_explained=least), node(2.0)
-        made.findings, made.groups = [finding("a", 0.06)], [("a",)]
+        made.record.findings, made.record.groups = [finding("a", 0.06)], [("a",)]
         assert made.conclude(given, [given, node(1.9, effects=1)], (), ()).explains is explains
     assert DiagnoseCfg().min_explained == SearchCfg().far_min_gain
 
@@ -155,7 +156,7 @@ def test_effects_that_are_named_are_in_the_model_however_much_they_leave(monkeyp
     """The share of a discrepancy that is itself hardly above the noise means little."""
     monkeypatch.setattr(module, "unknown_force", lambda *_: None)
     made, given = procedure(), node(1.04)
-    made.findings, made.groups = [finding("a", 0.2)], [("a",)]
+    made.record.findings, made.record.groups = [finding("a", 0.2)], [("a",)]
     found = made.conclude(given, [given, node(1.035, effects=1)], (), ())
     assert found.unexplained > 0.8
     assert (found.verdict, found.explains, found.changes_model) == ("effect", True, True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis import procedure, time_budget
+from concent_warp.diagnosis import time_budget
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import VERDICTS
@@ -168,7 +168,7 @@ def test_many_names_are_counted():
 
 
 def test_shares_of_the_time_leave_some_for_the_end():
-    assert 0 < procedure.SEARCH_SHARE < procedure.TOGETHER_SHARE < 1
+    assert 0 < time_budget.SEARCH_SHARE < time_budget.TOGETHER_SHARE < 1
 
 
 def test_more_tasks_than_expected_are_never_the_whole():

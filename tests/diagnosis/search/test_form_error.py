@@ -76,9 +76,9 @@ def test_only_what_may_be_an_error_of_a_formula_is_corrected(lacking, rubbing):
     left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
     for share, ratio, corrected in ((left + 0.05, 9.0, True), (left - 0.05, 9.0, False), (left + 0.05, 1.1, False)):
         made = procedure()
-        made.cfg = replace(CFG, max_form_error=share, form_error_ratio=ratio)
-        assert (made._correction(rubbing, lacking) is not None) is corrected
-    assert procedure()._correction(lacking, lacking) is None
+        made.context.cfg = replace(CFG, max_form_error=share, form_error_ratio=ratio)
+        assert (made.additions._correction(rubbing, lacking) is not None) is corrected
+    assert procedure().additions._correction(lacking, lacking) is None
 
 
 def test_an_effect_beside_another_must_explain_what_a_correction_of_that_does_not(rubbing):
@@ -87,21 +87,21 @@ def test_an_effect_beside_another_must_explain_what_a_correction_of_that_does_no
     assert correction is not None
     damping = fit_candidate(rubbing, screen(rubbing, effect("joint_damping")))
     armature = fit_candidate(rubbing, screen(rubbing, effect("armature")))
-    assert not made._explains_more(rubbing, armature, correction)
+    assert not made.additions._explains_more(rubbing, armature, correction)
     # The same without a correction worth the name.
-    assert made._explains_more(rubbing, damping, with_interleaved_folds(rubbing).errors)
-    assert made._is_corrected(rubbing, correction)
-    assert not made._is_corrected(rubbing, with_interleaved_folds(rubbing).errors)
-    assert not made._is_corrected(rubbing, None)
+    assert made.additions._explains_more(rubbing, damping, with_interleaved_folds(rubbing).errors)
+    assert made.additions._is_corrected(rubbing, correction)
+    assert not made.additions._is_corrected(rubbing, with_interleaved_folds(rubbing).errors)
+    assert not made.additions._is_corrected(rubbing, None)
 
 
 def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, rubbing):
     made = procedure()
     left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
     force = replace(CFG.unknown_force, min_share=0.0)
-    made.cfg = replace(CFG, max_form_error=left + 0.05, form_error_ratio=9.0, unknown_force=force)
-    assert not made._is_form_error(rubbing, lacking)
-    made.form_corrected = True
-    assert made._is_form_error(rubbing, lacking)
-    made.cfg = replace(made.cfg, max_form_error=left - 0.05)
-    assert not made._is_form_error(rubbing, lacking)
+    made.context.cfg = replace(CFG, max_form_error=left + 0.05, form_error_ratio=9.0, unknown_force=force)
+    assert not made.context.is_form_error(rubbing, lacking)
+    made.record.form_corrected = True
+    assert made.context.is_form_error(rubbing, lacking)
+    made.context.cfg = replace(made.context.cfg, max_form_error=left - 0.05)
+    assert not made.context.is_form_error(rubbing, lacking)

@@ -34,8 +34,8 @@ def procedure(recording, nodes, folder=None):
     for last in nodes[1:]:
         # What a search leaves behind after each addition.
         name = last.model.effects[-1].effect.name
-        made.groups.append((name,))
-        made.hypotheses.append({name: last.model})
+        made.record.groups.append((name,))
+        made.record.hypotheses.append({name: last.model})
     return made
 
 
@@ -61,14 +61,14 @@ def test_a_model_without_an_effect_that_was_refitted_already_is_found_again(node
 def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(nodes, kept, tmp_path):
     recording, found = nodes
     made = procedure(recording, found, tmp_path if kept else None)
-    after = made.remove_superfluous(list(found))
+    after = made.revision.remove_superfluous(list(found))
     assert [a.effect.name for a in after[-1].model.effects] == ["joint_damping"]
     assert len(after) == len(found) + 1
-    assert made.groups == [("joint_damping",)]
+    assert made.record.groups == [("joint_damping",)]
 
 
 def test_an_only_effect_stays(nodes):
     recording, found = nodes
     made = procedure(recording, found[:2])
-    assert made.remove_superfluous(list(found[:2])) == found[:2]
-    assert made.groups == [("joint_friction",)]
+    assert made.revision.remove_superfluous(list(found[:2])) == found[:2]
+    assert made.record.groups == [("joint_friction",)]

@@ -103,7 +103,7 @@ def test_a_force_that_explains_much_of_the_discrepancy_decides_the_verdict(part,
     recording = ridden(friction=part * FRICTION, force=lambda place: size * bump(place))
     partly = nodes_of(recording, "joint_friction")
     made = Procedure(Model(Scene(rail())), recording, CFG)
-    made.findings = [Finding("joint_friction", (), "", (), 0.9, 0.9, 0.9, 0.0, 0.0, True, 0, ())]
+    made.record.findings = [Finding("joint_friction", (), "", (), 0.9, 0.9, 0.9, 0.0, 0.0, True, 0, ())]
     said = made.conclude(partly[0], partly, (), ())
     assert said.verdict == verdict
     assert said.unknown_force is not None

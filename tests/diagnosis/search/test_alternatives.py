@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis import alternatives as module
-from concent_warp.diagnosis import procedure as procedure_module
-from concent_warp.diagnosis.alternatives import KEPT, _from, plausibility, try_alternatives
+from concent_warp.diagnosis import procedure
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
+from concent_warp.diagnosis.search import alternatives as module
+from concent_warp.diagnosis.search.alternatives import _from, plausibility, try_alternatives
 from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
 from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.fit_candidate import fit_candidate
@@ -50,7 +50,7 @@ def names(one: FittedModel) -> list[str]:
 
 
 def accepted(made: Procedure) -> list[str]:
-    return [f.name for f in made.findings if f.accepted]
+    return [f.name for f in made.record.findings if f.accepted]
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +69,14 @@ def continued() -> Diagnosis:
 def resumed(greedy: tuple[Procedure, list[FittedModel]], alternatives: int) -> Procedure:
     """Return a procedure with what such a search has recorded."""
     made = searching(alternatives)
-    for name in (*KEPT, "noise", "noise_factors"):
-        setattr(made, name, getattr(greedy[0], name))
+    made.context.record, made.noise = greedy[0].record.copy(), greedy[0].noise
+    made.context.noise_factors = greedy[0].context.noise_factors
     return made
 
 
 def test_an_effect_that_stands_for_parts_of_others_comes_first_where_one_is_added_after_another(greedy):
     made, fitted = greedy
-    assert [r.finding.name for r in made.rivals[0]] == ["actuator_lag", "actuator_delay", "joint_damping"]
+    assert [r.finding.name for r in made.record.rivals[0]] == ["actuator_lag", "actuator_delay", "joint_damping"]
     assert [names(one)[-1:] for one in fitted] == [[], ["actuator_lag"], ["joint_damping"], ["actuator_delay"]]
     assert accepted(made) == ["actuator_lag", "joint_damping", "actuator_delay"]
 
@@ -103,10 +103,10 @@ def test_findings_are_those_of_the_answer_alone(continued):
 
 def test_an_alternative_that_leaves_more_changes_nothing(greedy, monkeypatch):
     made, fitted = resumed(greedy, 1), greedy[1]
-    before = {name: getattr(made, name) for name in KEPT}
-    monkeypatch.setattr(made, "add_effects", lambda begun, _: (begun, ()))  # it finds no second effect
-    assert try_alternatives(made, fitted) is fitted
-    assert {name: getattr(made, name) for name in KEPT} == before
+    before = made.record.copy()
+    monkeypatch.setattr(made.additions, "add_effects", lambda begun, _: (begun, ()))  # it finds no second effect
+    assert try_alternatives(made.additions, fitted) is fitted
+    assert made.record == before
 
 
 def test_beyond_the_noise_the_plausible_answer_counts_and_not_the_one_that_leaves_least(greedy, monkeypatch):
@@ -115,9 +115,9 @@ def test_beyond_the_noise_the_plausible_answer_counts_and_not_the_one_that_leave
         made, fitted = resumed(greedy, 1), greedy[1]
         other = replace(fitted[-1], errors=1.1 * fitted[-1].errors)
         monkeypatch.setattr(FittedModel, "ratio", property(lambda one, o=other, r=ratio: r if one is o else 1.0))
-        monkeypatch.setattr(made, "add_effects", lambda begun, _, other=other: ([*begun, other], ()))
+        monkeypatch.setattr(made.additions, "add_effects", lambda begun, _, other=other: ([*begun, other], ()))
         monkeypatch.setattr(module, "plausibility", lambda one, o=other, p=plausible: p if one is o else 0.0)
-        assert (try_alternatives(made, fitted)[-1] is other) is taken
+        assert (try_alternatives(made.additions, fitted)[-1] is other) is taken
 
 
 def test_as_many_rivals_are_tried_as_asked_for_and_none_of_the_group_of_the_first(greedy, monkeypatch):
@@ -129,30 +129,30 @@ def test_as_many_rivals_are_tried_as_asked_for_and_none_of_the_group_of_the_firs
         (1, ("actuator_lag", "actuator_delay"), ["joint_damping"]),
     ):
         made, begun = resumed(greedy, alternatives), []
-        made.provisional = 1
-        assert made.time_step is None
-        made.groups = [group, *made.groups[1:]]
+        made.record.provisional = 1
+        assert made.record.time_step is None
+        made.record.groups = [group, *made.record.groups[1:]]
 
         def add(fitted, _, begun=begun, made=made):
             begun.append(names(fitted[-1])[-1])
             # Each begins with its own effect, and with nothing of an earlier one.
             assert accepted(made) == begun[-1:]
-            assert made.groups == [(begun[-1],)]
-            assert list(made.rivals) == [0]
-            assert made.provisional is None
-            assert made.time_step is None
-            made.time_step = FinerTimeStep(0.01, 0.002, 1.0, 0.5, 0.4, 0.6)
+            assert made.record.groups == [(begun[-1],)]
+            assert list(made.record.rivals) == [0]
+            assert made.record.provisional is None
+            assert made.record.time_step is None
+            made.record.time_step = FinerTimeStep(0.01, 0.002, 1.0, 0.5, 0.4, 0.6)
             return fitted, ()
 
-        monkeypatch.setattr(made, "add_effects", add)
-        try_alternatives(made, greedy[1])
+        monkeypatch.setattr(made.additions, "add_effects", add)
+        try_alternatives(made.additions, greedy[1])
         assert begun == tried
-        assert made.groups[0] == group
-        assert (made.provisional, made.time_step) == (1, None)
+        assert made.record.groups[0] == group
+        assert (made.record.provisional, made.record.time_step) == (1, None)
 
 
 def test_a_single_effect_has_no_alternatives(monkeypatch):
-    monkeypatch.setattr(procedure_module, "try_alternatives", lambda *_: pytest.fail("one effect was added"))
+    monkeypatch.setattr(procedure, "try_alternatives", lambda *_: pytest.fail("one effect was added"))
     made = searching(1, max_additions=1)
     made.search(made.baseline())
     assert len(accepted(made)) == 1
@@ -164,23 +164,23 @@ def test_an_alternative_that_there_is_no_time_for_is_named_and_the_answer_stays(
     def late(*_):
         raise TimeUpError
 
-    monkeypatch.setattr(made, "add_effects", late)
-    assert try_alternatives(made, fitted) is fitted
-    assert made.budget.unsettled == ["Open: whether actuator_delay with another effect explains more."]
-    assert made.budget.cut == set()
+    monkeypatch.setattr(made.additions, "add_effects", late)
+    assert try_alternatives(made.additions, fitted) is fitted
+    assert made.context.budget.unsettled == ["Open: whether actuator_delay with another effect explains more."]
+    assert made.context.budget.cut == set()
     assert accepted(made) == accepted(greedy[0])
 
 
 def test_a_search_from_a_rival_begins_with_that_effect_alone(greedy):
     made, (first, *_) = resumed(greedy, 1), greedy[1]
-    made.cfg = replace(made.cfg, max_additions=1)
-    rival = next(r for r in made.rivals[0] if r.finding.name == "joint_damping")
-    _, begun = _from(made, first, rival)
+    made.context.cfg = replace(made.context.cfg, max_additions=1)
+    rival = next(r for r in made.record.rivals[0] if r.finding.name == "joint_damping")
+    _, begun = _from(made.additions, first, rival)
     assert names(begun) == accepted(made) == ["joint_damping"]
-    assert {f.step for f in made.findings} == {0}
-    assert (made.groups, list(made.hypotheses[0])) == ([("joint_damping",)], ["joint_damping"])
-    assert made.hypotheses[0]["joint_damping"] is begun.model
-    assert [w.tolist() for w in made.widening.values()] == [[1.0]]
+    assert {f.step for f in made.record.findings} == {0}
+    assert (made.record.groups, list(made.record.hypotheses[0])) == ([("joint_damping",)], ["joint_damping"])
+    assert made.record.hypotheses[0]["joint_damping"] is begun.model
+    assert [w.tolist() for w in made.record.widening.values()] == [[1.0]]
 
 
 @pytest.fixture(scope="module")
@@ -274,19 +274,22 @@ def settled(greedy: tuple[Procedure, list[FittedModel]], monkeypatch, answer: Fi
     """
     made = resumed(greedy, 1)
     last = greedy[1][2]
-    made.groups, made.hypotheses = made.groups[:2], made.hypotheses[:2]
-    made.findings = [f for f in made.findings if f.step < 2]
+    made.record.groups, made.record.hypotheses = made.record.groups[:2], made.record.hypotheses[:2]
+    made.record.findings = [f for f in made.record.findings if f.step < 2]
     assert accepted(made) == ["actuator_lag", "joint_damping"]
 
     def add(begun, _):
-        (damping,) = (f for f in greedy[0].findings if f.accepted and f.name == "joint_damping")
-        made.findings = [*made.findings, damping]
-        made.groups, made.hypotheses = [*made.groups, ("joint_damping",)], [*made.hypotheses, {}]
+        (damping,) = (f for f in greedy[0].record.findings if f.accepted and f.name == "joint_damping")
+        made.record.findings = [*made.record.findings, damping]
+        made.record.groups, made.record.hypotheses = (
+            [*made.record.groups, ("joint_damping",)],
+            [*made.record.hypotheses, {}],
+        )
         return [*begun, answer], ()
 
-    monkeypatch.setattr(made, "add_effects", add)
+    monkeypatch.setattr(made.additions, "add_effects", add)
     monkeypatch.setattr(module, "plausibility", lambda one: odds if one is answer else 0.0)
-    return made, try_alternatives(made, greedy[1][:3])[-1], last
+    return made, try_alternatives(made.additions, greedy[1][:3])[-1], last
 
 
 def test_the_more_plausible_of_answers_that_explain_as_much_counts(greedy, monkeypatch):
@@ -296,7 +299,7 @@ def test_the_more_plausible_of_answers_that_explain_as_much_counts(greedy, monke
         assert found is (answer if odds > 0 else last)
         assert accepted(made) == [chosen, "joint_damping"]
         # The other is so much less plausible that it is not named.
-        assert made.groups == [(chosen,), ("joint_damping",)]
+        assert made.record.groups == [(chosen,), ("joint_damping",)]
 
 
 def test_the_effect_of_an_answer_that_is_nearly_as_plausible_joins_the_group_of_the_one_it_replaces(
@@ -307,9 +310,12 @@ def test_the_effect_of_an_answer_that_is_nearly_as_plausible_joins_the_group_of_
         answer = replace(greedy[1][2])
         made, _, _ = settled(greedy, monkeypatch, answer, odds)
         assert accepted(made) == ["actuator_lag", "joint_damping"]
-        assert made.groups == [("actuator_lag", "actuator_delay") if named else ("actuator_lag",), ("joint_damping",)]
-        assert (made.hypotheses[0].get("actuator_delay") is answer.model) == named
-        assert "actuator_delay" not in greedy[0].hypotheses[0]
+        assert made.record.groups == [
+            ("actuator_lag", "actuator_delay") if named else ("actuator_lag",),
+            ("joint_damping",),
+        ]
+        assert (made.record.hypotheses[0].get("actuator_delay") is answer.model) == named
+        assert "actuator_delay" not in greedy[0].record.hypotheses[0]
 
 
 def test_a_more_plausible_answer_that_leaves_more_does_not_count(greedy, monkeypatch):
@@ -325,4 +331,4 @@ def test_an_answer_that_leaves_less_counts_whatever_its_plausibility(greedy, mon
     made, found, _ = settled(greedy, monkeypatch, answer, -100.0)
     assert found is answer
     assert accepted(made) == ["actuator_delay", "joint_damping"]
-    assert made.groups == [("actuator_delay",), ("joint_damping",)]
+    assert made.record.groups == [("actuator_delay",), ("joint_damping",)]

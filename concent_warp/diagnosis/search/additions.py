@@ -1,0 +1,154 @@
+"""Effects added to a fitted model until no more than noise, or errors in their formulas, is left.
+
+Beside each addition a shorter time step, nominal values within their tolerance and a flexible correction of the effects
+before it are tried: what one of them explains needs no further effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from concent_warp.diagnosis.result import Detectable
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
+from concent_warp.diagnosis.search.baseline import add_candidate
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, BASELINE_SPAN, SearchContext
+from concent_warp.diagnosis.search.evidence import leaves_more
+from concent_warp.diagnosis.search.find_addition import AdditionFinder
+from concent_warp.diagnosis.search.form_error import flexible_correction
+from concent_warp.diagnosis.search.time_step import finding as time_step_finding
+from concent_warp.diagnosis.search.time_step import finer_time_step, renew_defects
+from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
+from concent_warp.simulate.time_limit import TimeUpError
+
+
+class Additions:
+    """Adds effects to fitted models."""
+
+    def __init__(self, context: SearchContext, finder: AdditionFinder) -> None:
+        """Prepare to add effects.
+
+        Args:
+            context: What the parts of the search share.
+            finder: Finds each of them.
+        """
+        self.context, self.finder = context, finder
+
+    def add_effects(
+        self, fitted: list[FittedModel], detectable: tuple[Detectable, ...], *, effects_alone: bool = False
+    ) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
+        """Return the fitted models with one more for each effect that is added, and the detectable sizes of all.
+
+        Args:
+            fitted: The model as given and after earlier additions.
+            detectable: Smallest detectable sizes as far as they are known.
+            effects_alone: Whether time step and nominal values stay as they are: over short windows the initial states
+                hide what they change.
+        """
+        context, record, fitted, first = self.context, self.context.record, list(fitted), fitted[0]
+        cfg, runner, factors = context.cfg, context.runner, context.noise_factors
+        runner.share = max(runner.share, BASELINE_SPAN)
+        while True:
+            step = len(fitted) - 1
+            # What a shorter time step leaves has a structure, too: that of the errors of both steps.
+            explained = step or record.time_step is not None
+            if explained and not is_lacking(fitted[-1], factors, cfg):
+                break
+            if step and context.is_form_error(fitted[-1], first):
+                if record.provisional is None:
+                    if effects_alone:
+                        break
+                    record.provisional = step
+                elif step > record.provisional:
+                    break
+            finer = None if effects_alone else self._finer(fitted[-1])
+            if finer is not None and not is_lacking(finer, factors, cfg):
+                fitted = self._adopt(fitted, finer)
+                break
+            if not effects_alone and (found := self._with_nominal(fitted, finer, first)) is not None:
+                fitted = found
+                continue
+            if step >= cfg.max_additions:
+                return (fitted if finer is None else self._adopt(fitted, finer)), detectable
+            runner.share = max(runner.share, BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions)
+            recorded = len(record.findings), len(record.groups)
+            correction = None if effects_alone else self._correction(fitted[-1], first)
+            try:
+                adequate = not effects_alone and context.explains(fitted[-1], first, added=step > 0)
+                best, smallest = self.finder.find(fitted[-1], step, explained=adequate)
+            except TimeUpError:
+                context.budget.note(f"Open: whether {'another effect' if step else 'any effect'} is missing.", step)
+                break
+            detectable = detectable or smallest
+            equal = (1 + cfg.search.equal_error) * (np.inf if best is None else best.errors.sum())
+            if finer is not None and finer.errors.sum() <= equal:
+                record.forget(*recorded)
+                fitted = self._adopt(fitted, finer)
+                continue
+            if best is not None and correction is not None and not self._explains_more(fitted[-1], best, correction):
+                record.take_back(*recorded, "explains no more than a flexible correction of the effects before it")
+                best = None
+            if best is None:
+                record.form_corrected = self._is_corrected(fitted[-1], correction)
+                break
+            fitted.append(renew_defects(add_candidate(fitted[-1], best), cfg.time_step))
+        return fitted, detectable
+
+    def _correction(self, one: FittedModel, first: FittedModel) -> np.ndarray | None:
+        """Return the held-out errors of a model with a flexible correction of the effects that were added.
+
+        It is None where there are none, and where they leave more than errors in their formulas may be.
+        """
+        context, cfg = self.context, self.context.cfg
+        left, lacked = discrepancies(one, first)
+        added = [a.effect for a in one.model.effects[len(first.model.effects) :] if not a.effect.nominal]
+        if not added or left >= cfg.max_form_error * lacked or one.ratio > cfg.form_error_ratio:
+            return None
+        context.progress("correcting the formulas of the effects")
+        unsettled = "Open: whether what is left is an error in the formulas of the effects."
+        correct = partial(flexible_correction, one, added, cfg, context.results)
+        return context.budget.attempt(correct, None, unsettled)
+
+    def _explains_more(self, one: FittedModel, best: FittedCandidate, correction: np.ndarray) -> bool:
+        """Return whether a candidate explains what a flexible correction of the effects of a model does not."""
+        errors = with_interleaved_folds(add_candidate(one, best)).errors
+        return leaves_more(correction, errors, self.context.cfg.search)
+
+    def _is_corrected(self, one: FittedModel, correction: np.ndarray | None) -> bool:
+        """Return whether a flexible correction of the effects of a model leaves little more than noise."""
+        if correction is None:
+            return False
+        left = correction.sum() / max(float(with_interleaved_folds(one).errors.sum()), 1e-12)
+        return one.ratio * float(np.sqrt(left)) <= self.context.cfg.search.explained_ratio
+
+    def _finer(self, one: FittedModel) -> FittedModel | None:
+        """Return a fitted model with a shorter time step where that explains more and none has been adopted yet."""
+        context = self.context
+        if context.record.time_step is not None:
+            return None
+        context.progress("halving the time step")
+        unsettled = "Open: whether the model's time step is too long."
+        cfg = replace(context.cfg, min_gain=context.least_gain(one))
+        return context.budget.attempt(lambda: finer_time_step(one, cfg), None, unsettled)
+
+    def _with_nominal(
+        self, fitted: list[FittedModel], finer: FittedModel | None, first: FittedModel
+    ) -> list[FittedModel] | None:
+        """Return the fitted models, the last with nominal values and, where that explains as much, a shorter time step.
+
+        It is None where nominal values explain nothing more. Beside an effect they may be at their bounds where they
+        leave no more than an error in its formula, which they take up before another effect does.
+        """
+        enough = partial(self.context.is_form_error, first=first) if len(fitted) > 1 else None
+        if finer is not None and (both := self.context.nominal(finer, enough)) is not None:
+            return [*self._adopt(fitted, finer)[:-1], both]
+        plain = self.context.nominal(fitted[-1], enough)
+        return None if plain is None else [*fitted[:-1], plain]
+
+    def _adopt(self, fitted: list[FittedModel], finer: FittedModel) -> list[FittedModel]:
+        """Return the fitted models with the last one replaced by that with a shorter time step."""
+        self.context.record.time_step = time_step_finding(fitted[-1], finer, self.context.cfg.seed)
+        return [*fitted[:-1], finer]

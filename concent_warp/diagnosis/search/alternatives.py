@@ -1,0 +1,117 @@
+"""The first of several effects replaced by its rivals, and the search continued from each.
+
+Effects are added one at a time, and the first is chosen while the others are still missing: one that stands for parts
+of several then comes before each of them, and what is left leads to a second imitation. A search that keeps a few
+beginnings finds sets of effects that no exchange of a single one leads to (beam search).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from concent_warp.diagnosis.search.additions import Additions
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.evidence import leaves_more, surprise
+from concent_warp.diagnosis.search.reconsider import Rival, beside
+from concent_warp.diagnosis.search.record import SearchRecord
+
+
+def try_alternatives(additions: Additions, fitted: list[FittedModel]) -> list[FittedModel]:
+    """Return the fitted models of the search from another first effect, where that leads to a more plausible answer.
+
+    Answers count that explain as much as the best, or leave little more than noise: what one with more parameters
+    explains beyond that is weighed by their number. An answer that the data cannot distinguish from the best, and that
+    differs by one effect, adds that to the group of the one in whose place it stands.
+
+    Args:
+        additions: The search; its record is that of the returned models afterwards.
+        fitted: The model as given and after each addition, at least two.
+    """
+    context, first = additions.context, fitted[0]
+    cfg, budget, begun = context.cfg, context.budget, context.record
+    cut, unsettled = set(budget.cut), list(budget.unsettled)
+    answers = [(fitted, begun)]
+    equals = set(begun.groups[0])
+    others = [
+        r for r in begun.rivals.get(0, ()) if r.finding.name not in equals and r.finding.p <= cfg.significance_level
+    ]
+    for rival in others[: cfg.search.alternatives]:
+        context.record = begun.copy()
+        context.progress(f"trying {rival.finding.name} as the first effect")
+        open_question = f"Open: whether {rival.finding.name} with another effect explains more."
+        found = budget.attempt(lambda r=rival: _from(additions, first, r), None, open_question)
+        if found is not None and budget.cut == cut:
+            answers.append((found, context.record))
+            continue
+        # The first answer is none the less complete.
+        budget.cut, budget.unsettled = set(cut), list(unsettled)
+        budget.note(open_question)
+        unsettled = list(budget.unsettled)
+    least = min(answers, key=lambda answer: answer[0][-1].errors.sum())[0][-1]
+    equal = [
+        (found, recorded)
+        for found, recorded in answers
+        if not leaves_more(found[-1].errors, least.errors, cfg.search) or found[-1].ratio <= cfg.search.explained_ratio
+    ]
+    equal.sort(key=lambda answer: -plausibility(answer[0][-1]))
+    best, context.record = equal[0]
+    for other, of_other in equal[1:]:
+        if plausibility(other[-1]) > plausibility(best[-1]) - 2 * np.log(cfg.search.max_odds):
+            _add_to_group(context.record, of_other, other[-1])
+    return best
+
+
+def _add_to_group(record: SearchRecord, other: SearchRecord, last: FittedModel) -> None:
+    """Add the effect by which another answer differs from that of a record to the group of the one that it replaces.
+
+    Args:
+        record: What was recorded of the answer.
+        other: The same of the other one.
+        last: Last model of the other one.
+    """
+    steps, names = ({f.name: f.step for f in one.findings if f.accepted} for one in (record, other))
+    ours, theirs = sorted(steps.keys() - names.keys()), sorted(names.keys() - steps.keys())
+    if len(ours) == len(theirs) == 1 and theirs[0] not in record.groups[steps[ours[0]]]:
+        step = steps[ours[0]]
+        record.groups[step] = (*record.groups[step], theirs[0])
+        record.hypotheses[step] = {**record.hypotheses[step], theirs[0]: last.model}
+
+
+def _from(additions: Additions, first: FittedModel, rival: Rival) -> list[FittedModel]:
+    """Return the fitted models of the search that begins with a rival of the first effect."""
+    before, instead = additions.context.record, replace(rival.finding, accepted=True, reason="")
+    others = [
+        replace(f, accepted=False, reason="another one explains more beside the others") if f.accepted else f
+        for f in before.findings
+        if f.step == 0 and f.name != instead.name
+    ]
+    begun = beside(first, rival)
+    additions.context.record = SearchRecord(
+        findings=[instead, *others],
+        groups=[(instead.name,)],
+        hypotheses=[{instead.name: begun.model}],
+        widening={0: np.ones(len(instead.parameters))},
+        rivals={0: before.rivals[0]},
+        time_step=None if first.windows[0].defect is None else before.time_step,
+    )
+    return additions.add_effects([first, begun], ())[0]
+
+
+def plausibility(one: FittedModel) -> float:
+    """Return twice the log posterior of a fitted model's effects, up to a constant.
+
+    Schwarz's criterion with noise of unknown size, blocks of time as the observations (Annals of Statistics 6, 1978),
+    a Cauchy prior of the effects' sizes and a normal one of nominal values, and the effects' rarity.
+    """
+    prediction, count = one.prediction(), one.blocks.count
+    score = -count * float(np.log(max(one.errors.sum(), 1e-12)))
+    for added, part in zip(one.model.effects, prediction.split, strict=True):
+        parameters, values = prediction.parameters[part], one.fit.values[part]
+        if added.effect.nominal:
+            away = np.array([(v - p.null) / p.scale for v, p in zip(values, parameters, strict=True)])
+            score -= float((away**2).sum()) / one.cfg.least_squares.prior**2
+        else:
+            score -= surprise(added.effect, parameters, values.tolist(), count)
+    return score

@@ -1,0 +1,88 @@
+"""What the parts of a search for missing effects share.
+
+Settings, tasks, time and record of the search, and whether a fitted model explains the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, least_ratio
+from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.search.nominal_values import nominal_effects, with_nominal_values
+from concent_warp.diagnosis.search.record import SearchRecord
+from concent_warp.diagnosis.tasks import TaskRunner, run_tasks
+from concent_warp.diagnosis.time_budget import TimeBudget
+
+T = TypeVar("T")
+
+BASELINE_SPAN, ADDITIONS_SPAN = 0.1, 0.85
+"""Shares of a diagnosis that the baseline and the additions take, for the progress."""
+
+
+class SearchContext:
+    """What the parts of one search share. Its time starts when it is made."""
+
+    def __init__(self, cfg: DiagnoseCfg, runner: TaskRunner) -> None:
+        """Prepare a search."""
+        self.cfg, self.runner = cfg, runner
+        self.budget = TimeBudget(cfg.seconds)
+        self.noise_factors: Mapping[str, float] = {}
+        """By how much the noise of each channel may be larger than its estimate, 1 where it is stated [-]."""
+        self.record = SearchRecord()
+
+    def progress(self, text: str) -> None:
+        """Report what is being done."""
+        self.runner.progress(self.runner.share, text)
+
+    def results(self, task: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
+        """Return the results of a task for each tuple of arguments."""
+        return run_tasks(task, tasks, self.cfg.jobs)
+
+    def least_gain(self, one: FittedModel) -> float:
+        """Return the share of a model's held-out error that a shorter time step or nominal values must remove."""
+        near = one.ratio <= self.cfg.form_error_ratio
+        return self.cfg.min_gain if near else max(self.cfg.min_gain, self.cfg.search.far_min_gain)
+
+    def is_form_error(self, one: FittedModel, first: FittedModel) -> bool:
+        """Return whether a model with added effects leaves no more than errors in their formulas.
+
+        Little is then left beside the discrepancy of the first model, and little beside the noise.
+        """
+        left, lacked = discrepancies(one, first)
+        share = self.cfg.max_form_error if self.record.form_corrected else self.cfg.unknown_force.min_share
+        return left < share * lacked and one.ratio <= self.cfg.form_error_ratio
+
+    def explains(self, one: FittedModel, first: FittedModel, *, added: bool) -> bool:
+        """Return whether a fitted model explains the data: down to noise or, with added effects, errors in formulas.
+
+        An effect that leaves more than either is rather an imitation of what is missing, also where what it leaves is
+        little beside the noise.
+
+        Args:
+            one: The fitted model.
+            first: The model as given.
+            added: Whether it has effects that the first one lacks.
+        """
+        adequate = is_adequate(one, self.noise_factors, self.cfg)
+        if not added:
+            return adequate
+        little = least_ratio(one, self.noise_factors) <= self.cfg.search.explained_ratio
+        return (adequate and little) or self.is_form_error(one, first)
+
+    def nominal(self, one: FittedModel, enough: Callable[[FittedModel], bool] | None = None) -> FittedModel | None:
+        """Return a fitted model with nominal values within their tolerance, None where that explains nothing more.
+
+        Args:
+            one: The fitted model.
+            enough: Whether a model with values at their bounds leaves little enough.
+        """
+        if not self.cfg.nominal.enabled or nominal_effects(one.model):
+            return None
+        self.progress("fitting nominal values within their tolerance")
+        unsettled = "Open: whether nominal values are off within their tolerance."
+        return self.budget.attempt(
+            lambda: with_nominal_values(one, self.cfg.nominal, self.least_gain(one), enough), None, unsettled
+        )

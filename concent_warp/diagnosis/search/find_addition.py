@@ -1,0 +1,213 @@
+"""One addition of a search: the effect that explains most of what a fitted model leaves.
+
+Screen all candidate effects, fit the most promising ones and test their held-out gains against the null distribution
+of the best candidate's gain. Parts of elements are candidates only where no other one explains the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from concent_warp.diagnosis.result import Detectable, Finding
+from concent_warp.diagnosis.search.adequacy import least_ratio
+from concent_warp.diagnosis.search.baseline import add_candidate, refit_from_rivals
+from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.search.candidates import candidates, label
+from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, SearchContext
+from concent_warp.diagnosis.search.evidence import assess, detectable_size, profile_widening
+from concent_warp.diagnosis.search.fit_promising import CandidateFits
+from concent_warp.diagnosis.search.gradient_start import GradientStarts
+from concent_warp.diagnosis.search.grouping import group_indistinguishable
+from concent_warp.diagnosis.search.joint_fit import joint_parameters
+from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
+from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
+from concent_warp.diagnosis.search.reconsider import near_best
+from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
+from concent_warp.diagnosis.time_budget import in_words
+from concent_warp.effects.effect import Effect
+from concent_warp.fit.effects.observation import Window
+from concent_warp.model import Model
+from concent_warp.simulate.time_limit import TimeUpError
+
+CutWindows = Callable[[Model, float | None], Sequence[Window]]
+"""Cuts the recording into windows of a length [s] for a model; as long as the motion allows where it is None."""
+
+
+class AdditionFinder:
+    """Finds the effects that a search adds, one at a time."""
+
+    def __init__(
+        self,
+        context: SearchContext,
+        channels: set[str],
+        windows: CutWindows,
+        gradient: GradientStarts | None = None,
+    ) -> None:
+        """Prepare to find effects.
+
+        Args:
+            context: What the parts of the search share.
+            channels: Names of the measured channels.
+            windows: See `CutWindows`.
+            gradient: Starts fits by gradients, None where these are not asked for.
+        """
+        self.context, self.channels, self.windows, self.gradient = context, channels, windows, gradient
+
+    def find(
+        self, base: FittedModel, step: int, *, explained: bool = False
+    ) -> tuple[FittedCandidate | None, tuple[Detectable, ...]]:
+        """Return the effect to add to a fitted model, None where none is accepted, and the detectable sizes of all.
+
+        Args:
+            base: The fitted model.
+            step: Index of the addition.
+            explained: Whether the model explains the data already. An effect is then accepted only if the intervals
+                that the answer would state, see `joint_parameters`, exclude its null values too.
+
+        Raises:
+            TimeUpError: There was no time to fit a candidate.
+        """
+        context, cfg = self.context, self.context.cfg
+        effects, parts = self._candidates(base)
+        screened = self._screened(base, effects, step)
+        if not screened:  # the model has all that were asked for
+            return None, ()
+        if least_ratio(base, context.noise_factors) <= cfg.search.explained_ratio:
+            # What shows in the size of the residual no more than noise does must show the clearer in its structure.
+            cfg = replace(cfg, significance_level=cfg.quiet_significance_level, min_gain=cfg.quiet_min_gain)
+        level = cfg.significance_level
+        null, critical = self._chance(base, screened, level)
+        needed = max(critical, cfg.min_gain)
+        smallest = tuple(found for s in screened if (found := detectable_size(base, s, needed)) is not None)
+
+        def finding(c: FittedCandidate) -> Finding:
+            return assess(base, c, null, step, effects, cfg)
+
+        def short_windows() -> Sequence[Window]:
+            return self.windows(base.model, cfg.search.shooting_window)
+
+        least = self._least_promise(base)
+        fits = CandidateFits(base, cfg, context.runner)
+        fitted = fits.fit(screened, needed, short_windows, least)
+        if parts and self._leaves_more(base, fitted):
+            more, effects = self._screened_parts(base, parts, step), [*effects, *parts]
+            null, critical = self._chance(base, [*screened, *more], level)
+            fitted = fits.fit(more, max(critical, cfg.min_gain), short_windows, least)
+        for sentence, decides in fits.unsettled(lambda effect: label(effect, effects)):
+            context.budget.note(sentence, step if decides else None)
+        if not fitted and fits.left:
+            raise TimeUpError
+        findings = [finding(c) for c in fitted]
+        rivals = [c for c, f in zip(fitted, findings, strict=True) if f.accepted]
+        if rivals and max(c.share(base) for c in rivals) < cfg.search.doubtful_gain:
+            leading = sorted(rivals, key=lambda c: -c.share(base))[: cfg.search.rivals]
+            unsettled = "Open: whether other initial states let the model explain more without an effect."
+            base = context.budget.attempt(partial(refit_from_rivals, base, leading), base, unsettled)
+            findings = [finding(c) for c in fitted]
+        if explained:
+            findings = self._established(base, fitted, findings)
+        accepted = [(c, f) for c, f in zip(fitted, findings, strict=True) if f.accepted]
+        if not accepted:
+            context.record.findings += sorted(findings, key=lambda f: -f.gain)
+            return None, smallest
+        group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget)
+        context.record.rivals[step] = near_best(base, fitted, findings, cfg)
+        context.record.add(group, findings, profile_widening(base, group[0][0]))
+        return group[0][0], smallest
+
+    def _least_promise(self, base: FittedModel) -> float:
+        """Return the gain that an effect beside a provisional addition must promise, 0 where there is none.
+
+        It is a share of what `DiagnoseCfg.max_remainder` asks for; an effect that makes an earlier one superfluous
+        explains as much.
+        """
+        if self.context.record.provisional is None:
+            return 0.0
+        cfg = self.context.cfg
+        needed = (1 - cfg.max_remainder) * max(1 - 1 / base.ratio**2, 0.0)
+        return cfg.search.remainder_promise * needed
+
+    def _candidates(self, base: FittedModel) -> tuple[list[Effect], list[Effect]]:
+        """Return the effects that a fitted model may lack, and those considered only where none of these explains it.
+
+        The latter are parts of elements; those of an effect that was asked for by its name are among the former.
+        """
+        asked = self.context.cfg.effects
+        found = candidates(base.model, self.channels, asked)
+        later = [e for e in found if e.is_part and e.name not in asked]
+        return [e for e in found if e not in later], later
+
+    def _leaves_more(self, base: FittedModel, fitted: Sequence[FittedCandidate]) -> bool:
+        """Return whether the best of the fitted candidates, without any the model itself, leaves more than noise."""
+        best = max(fitted, key=lambda c: c.share(base), default=base)
+        return best.ratio > self.context.cfg.search.explained_ratio
+
+    def _chance(
+        self, base: FittedModel, screened: Sequence[ScreenedCandidate], level: float
+    ) -> tuple[np.ndarray, float]:
+        """Return the null distribution of the best candidate's gain, and its value at a significance level."""
+        cfg = self.context.cfg
+        null = max_gain_under_null(base, screened, cfg.null_samples, cfg.seed)
+        return null, float(np.quantile(null, 1 - level))
+
+    def _screened_parts(self, base: FittedModel, parts: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
+        """Return parts with their expected gains, none where there was no time: the other candidates stay."""
+        try:
+            return self._screened(base, parts, step, share=0.0)
+        except TimeUpError:
+            self.context.budget.note(f"Not screened: {in_words([label(e, parts) for e in parts])}.", step)
+            return []
+
+    def _established(
+        self, base: FittedModel, fitted: Sequence[FittedCandidate], findings: Sequence[Finding]
+    ) -> list[Finding]:
+        """Return findings, accepted ones with the intervals of the answer, refused if these include the null values.
+
+        Sensitivities to nominal values are those of the model that the candidates are added to.
+        """
+        found = list(findings)
+        if not any(f.accepted for f in findings):
+            return found
+        unsettled = "Left out of the intervals of candidates: errors of nominal values."
+        shared = self.context.budget.attempt(partial(nominal_sensitivities, base), None, unsettled)
+        for k, (c, f) in enumerate(zip(fitted, findings, strict=True)):
+            if not f.accepted:
+                continue
+            added = add_candidate(base, c)
+            widening = {len(added.model.effects) - 1: profile_widening(base, c)}
+            nominal = None if shared is None else nominal_errors(added, self.context.cfg, shared)
+            parameters = joint_parameters(added, widening, nominal)[-1]
+            found[k] = replace(f, parameters=parameters)
+            if not any(p.excludes_null for p in parameters):
+                found[k] = replace(found[k], accepted=False, reason="its parameters may be at their null values")
+        return found
+
+    def _screened(
+        self, base: FittedModel, effects: Sequence[Effect], step: int, share: float = 0.5
+    ) -> list[ScreenedCandidate]:
+        """Return candidates with their expected gains.
+
+        Args:
+            base: The fitted model.
+            effects: Candidates.
+            step: Index of the addition.
+            share: Share of the addition that this takes, for the progress.
+        """
+        context, cfg = self.context, self.context.cfg
+        span = share * ADDITIONS_SPAN / cfg.max_additions
+        at_measured = linear_at_measured_states(base, cfg.search)
+        tasks = [(base, e, cfg.search, at_measured) for e in effects]
+        found = context.runner.run_in_time(screen, tasks, "screening", span)
+        screened = [s for s in found if s is not None]
+        if len(screened) < len(effects):
+            missed = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is None]
+            context.budget.note(f"Not screened: {in_words(missed)}.", step)
+            if not screened:
+                raise TimeUpError
+        names = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is not None]
+        context.progress(ranking(base, screened, names, cfg.seed))
+        return self.gradient.apply(base, screened, context.runner) if self.gradient else screened

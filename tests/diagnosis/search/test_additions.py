@@ -1,0 +1,159 @@
+"""Effects, shorter time steps and nominal values added one after the other, with fits that are made up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.cfg import NominalCfg
+from concent_warp.diagnosis.search import additions, context
+from concent_warp.diagnosis.search.adequacy import is_lacking
+from tests.diagnosis.made_up import FINER, GIVEN, finding, node, procedure
+
+
+def test_noise_that_may_be_larger_than_its_estimate_ends_the_search(monkeypatch):
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    for ratios, factor, count in (
+        ((3.0, 1.53, 1.0), 1.5, 2),  # 1.02 x the largest noise
+        ((3.0, 1.55, 1.0), 1.5, 3),
+        ((3.0, 1.53, 1.0), 1.0, 3),
+        ((5.0, 1.26, 1.0), 1.01, 3),  # adequate beside it, but more than the noise may be
+        ((1.5, 1.0), 1.5, 2),
+    ):
+        made, nodes = procedure(), [node(r) for r in ratios]
+        made.context.noise_factors = {"angle": factor}
+        monkeypatch.setattr(made.additions.finder, "find", lambda _base, step, nodes=nodes, **_: (nodes[step + 1], ()))
+        assert made.additions.add_effects(nodes[:1], ())[0] == nodes[:count]
+        assert is_lacking(node(1.02 * factor), made.context.noise_factors, made.context.cfg) is False
+        assert is_lacking(node(1.03 * factor), made.context.noise_factors, made.context.cfg)
+
+
+@pytest.mark.parametrize(
+    ("corrected", "explains_more", "added", "form"),
+    [
+        (None, False, True, False),  # no formula to correct
+        (0.5, True, True, False),
+        (0.5, False, False, True),  # 1.3 x noise becomes 0.92
+        (0.8, False, False, False),  # 1.16
+    ],
+)
+def test_an_effect_beside_others_must_explain_more_than_a_correction_of_these(
+    monkeypatch, corrected, explains_more, added, form
+):
+    made, nodes = procedure(), [node(3.0), node(1.3, effects=1), node(1.0, effects=2)]
+
+    def find(_base, step, **_):
+        made.record.groups.append((f"effect {step}",))
+        made.record.hypotheses.append({})
+        made.record.findings.append(finding(f"effect {step}", 0.6, accepted=True, step=step))
+        return nodes[step + 1], ()
+
+    monkeypatch.setattr(additions, "finer_time_step", lambda *_: None)
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    monkeypatch.setattr(additions, "renew_defects", lambda one, _cfg: one)
+    monkeypatch.setattr(additions, "with_interleaved_folds", lambda one: one)
+    monkeypatch.setattr(made.additions.finder, "find", find)
+    errors = None if corrected is None else np.array([corrected / 2] * 2)
+    monkeypatch.setattr(made.additions, "_correction", lambda one, _first: None if one is nodes[0] else errors)
+    monkeypatch.setattr(made.additions, "_explains_more", lambda *_: explains_more)
+    assert made.additions.add_effects(nodes[:1], ())[0] == nodes[: 2 + added]
+    assert made.record.form_corrected is form
+    assert made.record.groups == [("effect 0",), ("effect 1",)][: 1 + added]
+    first, second = made.record.findings
+    assert first.accepted
+    assert second.accepted is added
+    assert second.reason == ("" if added else "explains no more than a flexible correction of the effects before it")
+
+
+def test_a_shorter_time_step_is_used_where_no_effect_explains_more(monkeypatch):
+    given, effect = node(3.0, 100.0), node(1.5, 40.0, effects=1)
+    for errors, ratio, asked, left in (
+        (35.0, 1.01, 0, [FINER]),  # it leaves nothing to explain
+        (35.0, 1.4, 2, [FINER, "effect"]),  # more than the effect: the search goes on with it
+        (40.7, 1.6, 2, [FINER, "effect"]),  # nearly as much as the effect
+        (41.0, 1.6, 1, [GIVEN, "effect"]),  # less than the effect
+    ):
+        made, finer, calls = procedure(max_additions=1), node(ratio, errors, timestep=FINER), []
+        rivals = {id(given): finer}
+
+        def find(base, step, calls=calls, made=made, **_):
+            calls.append(base)
+            made.record.groups.append(("effect",))
+            made.record.findings.append(finding("effect", 0.6, step=step))
+            return effect, ()
+
+        monkeypatch.setattr(made.additions.finder, "find", find)
+        monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg, rivals=rivals: rivals.get(id(one)))
+        monkeypatch.setattr(context, "with_nominal_values", lambda *_: None)
+        monkeypatch.setattr(additions, "time_step_finding", lambda *_: "found")
+        monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+        fitted, _ = made.additions.add_effects([given], ())
+        assert len(calls) == asked
+        assert [("effect" if one is effect else one.timestep) for one in fitted] == left
+        assert made.record.groups == [("effect",)] * (len(fitted) - 1)
+        assert len(made.record.findings) == len(fitted) - 1
+        assert made.record.time_step == ("found" if left[0] == FINER else None)
+
+
+def test_nominal_values_are_fitted_with_the_shorter_time_step_where_both_explain_more(monkeypatch):
+    given, finer = node(3.0, 100.0), node(2.0, 60.0, timestep=FINER)
+    both, plain = node(1.0, 30.0, timestep=FINER, nominal=2), node(1.01, 30.0, nominal=1)
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, _cfg: finer if one is given else None)
+    monkeypatch.setattr(additions, "time_step_finding", lambda base, one, seed: (base, one, seed))
+    for answers, left, changed in (
+        ({id(finer): both, id(given): plain}, both, True),
+        ({id(given): plain}, plain, False),
+        ({}, given, False),
+    ):
+        made = procedure(seed=5)
+        monkeypatch.setattr(context, "with_nominal_values", lambda one, *_, answers=answers: answers.get(id(one)))
+        monkeypatch.setattr(made.additions.finder, "find", lambda *_, **_k: (None, ()))
+        fitted, _ = made.additions.add_effects([given], ())
+        if answers:
+            assert fitted == [left]
+            assert made.record.time_step == ((given, finer, 5) if changed else None)
+        else:  # then the shorter time step alone is the rival of the effects, of which none was accepted
+            assert fitted == [finer]
+    disabled = procedure(nominal=NominalCfg(enabled=False))
+    monkeypatch.setattr(context, "with_nominal_values", lambda *_: pytest.fail("nominal values stay as given"))
+    assert disabled.additions._with_nominal([given], finer, given) is None
+
+
+def test_over_short_windows_no_further_effect_is_tried_on_an_error_of_form(monkeypatch):
+    monkeypatch.setattr(additions, "add_candidate", lambda _base, best: best)
+    made, coarse = procedure(), [node(5.0), node(1.26), node(1.0)]
+    monkeypatch.setattr(made.additions.finder, "find", lambda _base, step, **_: (coarse[step + 1], ()))
+    assert made.additions.add_effects(coarse[:1], (), effects_alone=True) == (coarse[:2], ())
+    assert made.record.provisional is None
+
+
+def test_nominal_values_may_be_at_their_bounds_beside_an_effect_with_an_error_of_form(monkeypatch):
+    given, after, asked = node(5.0), node(2.0, effects=1), []
+
+    def nominal(one, cfg, min_gain, enough):
+        # Far from the noise they must explain a fifth; as near as an error of form leaves, what an effect must.
+        assert (cfg, min_gain) == (made.context.cfg.nominal, 0.2 if one is given else 0.04)
+        asked.append(None if enough is None else [enough(node(r)) for r in (1.5, 1.8)])
+        return one
+
+    monkeypatch.setattr(context, "with_nominal_values", nominal)
+    made = procedure(min_gain=0.04)
+    made.additions._with_nominal([given], None, given)
+    made.additions._with_nominal([given, after], None, given)
+    # 5.2 % and 9.3 % of the discrepancy.
+    assert asked == [None, [True, False]]
+
+
+def test_far_from_the_noise_a_shorter_time_step_must_explain_a_fifth(monkeypatch):
+    asked = {}
+    monkeypatch.setattr(additions, "finer_time_step", lambda one, cfg: asked.setdefault(one.ratio, cfg.min_gain))
+    made = procedure(min_gain=0.04)
+    for ratio in (5.0, 2.01, 2.0, 1.5):
+        made.additions._finer(node(ratio))
+    assert asked == {5.0: 0.2, 2.01: 0.2, 2.0: 0.04, 1.5: 0.04}
+    made = procedure(min_gain=0.3)
+    made.additions._finer(node(6.0))
+    assert asked[6.0] == 0.3

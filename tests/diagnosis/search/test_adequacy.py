@@ -1,0 +1,49 @@
+"""Whether a fitted model leaves no more than noise, with fits that are made up."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
+from tests.diagnosis.made_up import node
+
+
+def test_large_residuals_that_a_model_explains_are_no_outliers():
+    one, first = node(1.0), node(3.0)
+    one.limit = 4.0
+    one.pieces[0].residual = np.array([1.0, -1.0, 2.0, 100.0])
+    first.pieces[0].residual = np.array([20.0, -1.0, 2.0, 100.0])
+    left, lacked = discrepancies(one, first)
+    outlier = 2 * 4.0 * (100.0 - 2.0)
+    assert left == pytest.approx((1 + 1 + 4 + outlier) / 4 - 1)
+    assert lacked == pytest.approx((400 + 1 + 4 + outlier) / 4 - 1)
+    first.pieces[0].residual, first.limit = np.array([3.0, 8.0]), 5.0
+    assert discrepancies(one, first)[1] == pytest.approx((9 + 2 * 5.0 * (8.0 - 2.5)) / 2 - 1)
+
+
+def test_one_channel_that_the_model_misses_is_not_outweighed_by_others():
+    one = node(0.5)
+    (window,), (piece,) = one.windows, one.pieces
+    window.readings = [SimpleNamespace(channel=c, rows=slice(k, k + 1)) for k, c in enumerate("abcd")]
+    for worst, adequate in ((1.49, True), (1.51, False)):
+        piece.residual = np.array([0.5, 0.5, 0.5, worst])
+        assert is_adequate(one, {}, DiagnoseCfg()) == adequate
+    assert is_adequate(one, {"d": 1.02}, DiagnoseCfg())
+    piece.residual = np.full(4, 1.26)
+    assert not is_adequate(one, {}, DiagnoseCfg())
+
+
+def test_the_unit_of_residuals_decides_neither_what_is_left_nor_what_is_lacking():
+    factors, cfg = {"angle": 1.2}, DiagnoseCfg()
+    for ratio in (1.22, 1.24, 1.45, 1.51):
+        plain, first = node(ratio), node(9.0)
+        scaled, first_scaled = node(ratio), node(9.0)
+        for one, scale in ((scaled, 4.0), (first_scaled, 2.0)):
+            one.pieces[0].residual, one.noise_scale = one.pieces[0].residual / scale, scale
+        assert discrepancies(scaled, first_scaled) == pytest.approx(discrepancies(plain, first))
+        assert is_adequate(scaled, factors, cfg) == is_adequate(plain, factors, cfg) == (ratio < 1.5)
+        assert is_lacking(scaled, factors, cfg) == is_lacking(plain, factors, cfg) == (ratio > 1.23)

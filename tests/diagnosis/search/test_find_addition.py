@@ -1,0 +1,301 @@
+"""One addition of a search, with candidates that are made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.search import find_addition
+from concent_warp.simulate.time_limit import TimeUpError
+from tests.diagnosis.made_up import CLEAR, OPEN, finding, node, procedure
+
+
+class MadeUp(SimpleNamespace):
+    """A fitted candidate."""
+
+    fit = "its fit"
+
+    def share(self, base: Any) -> float:
+        """Return its gain over a baseline."""
+        return self.gain - getattr(base, "less", 0.0)
+
+
+def candidate(name: str, *, is_part: bool = False) -> Any:
+    """Return a candidate, or a part of an element."""
+    return SimpleNamespace(name=name, is_part=is_part, target=(), elements=())
+
+
+def searched(monkeypatch, made, gains: dict[str, tuple[float, bool]], null: np.ndarray, ratio: float = 2.0, **given):
+    """Return what a search adds whose candidates have these gains, and notes of what is asked for."""
+    notes: dict[str, Any] = {"bases": []}
+    fitted = [
+        MadeUp(name=n, gain=g, model=SimpleNamespace(name=f"model {n}", effects=["own", f"added {n}"]))
+        for n, (g, _) in gains.items()
+    ]
+    monkeypatch.setattr(find_addition, "candidates", lambda *_: [candidate("effect")])
+    monkeypatch.setattr(made.additions.finder, "_screened", lambda *_: ["s1", "s2", "s3"])
+    monkeypatch.setattr(find_addition, "max_gain_under_null", lambda *args: notes.setdefault("null", args[2:]) and null)
+    monkeypatch.setattr(
+        find_addition,
+        "detectable_size",
+        lambda _b, s, needed: notes.update(needed=needed) or (s if s != "s2" else None),
+    )
+
+    def assess(base, c, _null, step, _effects, cfg):
+        notes["bases"].append(base)
+        notes["level"], notes["min_gain"] = cfg.significance_level, cfg.min_gain
+        return finding(c.name, c.share(base), accepted=gains[c.name][1], step=step)
+
+    class Fits:
+        left = ()
+
+        def __init__(self, *_):
+            pass
+
+        def unsettled(self, _name):
+            return []
+
+        def fit(self, _screened, needed, _windows, _promise):
+            notes["asked"] = needed
+            return fitted
+
+    def refit(base, rivals):
+        notes["rivals"] = [c.name for c in rivals]
+        return SimpleNamespace(**{**vars(base), "less": 0.05})
+
+    monkeypatch.setattr(find_addition, "assess", assess)
+    monkeypatch.setattr(find_addition, "CandidateFits", Fits)
+    monkeypatch.setattr(find_addition, "refit_from_rivals", refit)
+    monkeypatch.setattr(find_addition, "profile_widening", lambda _base, c: f"width of {c.name}")
+    monkeypatch.setattr(find_addition, "group_indistinguishable", lambda _base, accepted, *_: accepted[:2])
+    return made.additions.finder.find(node(ratio), 1, **given), notes
+
+
+def test_the_first_of_the_group_is_added_and_all_findings_are_kept(monkeypatch):
+    made = procedure()
+    gains = {"a": (0.5, True), "b": (0.7, True), "c": (0.6, False), "d": (0.65, True)}
+    (best, sizes), notes = searched(monkeypatch, made, gains, np.arange(101) / 1000)
+    assert best.name == "a"
+    assert sizes == ("s1", "s3")
+    assert notes["asked"] == pytest.approx(0.095)
+    assert notes["needed"] == pytest.approx(0.095)
+    assert notes["null"] == (400, 0)
+    assert "rivals" not in notes
+    assert made.record.groups == [("a", "b")]
+    assert made.record.widening == {1: "width of a"}
+    assert [{n: m.name for n, m in models.items()} for models in made.record.hypotheses] == [
+        {"a": "model a", "b": "model b"}
+    ]
+    assert list(made.record.rivals) == [1]
+    assert [(r.finding.name, r.added, r.fit) for r in made.record.rivals[1]] == [
+        (n, f"added {n}", "its fit") for n in "bdca"
+    ]
+    assert [(f.name, f.accepted, f.reason, f.step) for f in made.record.findings] == [
+        ("a", True, "", 1),
+        ("b", False, "another one explains more", 1),
+        ("d", False, "another one explains more", 1),
+        ("c", False, "another one explains more", 1),
+    ]
+
+
+def test_a_doubtful_gain_is_judged_against_a_baseline_that_is_refitted_from_its_rivals(monkeypatch):
+    made = procedure()
+    gains = {"a": (0.3, True), "b": (0.39, True), "c": (0.9, False), "d": (0.35, True), "e": (0.2, True)}
+    _, notes = searched(monkeypatch, made, gains, np.zeros(10))
+    assert notes["needed"] == 0.05
+    assert notes["rivals"] == ["b", "d", "a"]
+    assert [getattr(b, "less", 0.0) for b in notes["bases"]] == [0.0] * 5 + [0.05] * 5
+    clear = procedure()
+    _, notes = searched(monkeypatch, clear, {"a": (0.4, True)}, np.zeros(10))
+    assert "rivals" not in notes
+
+
+def test_where_nothing_is_accepted_findings_are_kept_by_gain(monkeypatch):
+    made = procedure()
+    (best, _), _ = searched(monkeypatch, made, {"a": (0.1, False), "b": (0.2, False)}, np.zeros(10))
+    assert best is None
+    assert [f.name for f in made.record.findings] == ["b", "a"]
+    assert (made.record.groups, made.record.rivals) == ([], {})
+
+
+def test_a_residual_that_is_little_more_than_noise_is_searched_at_a_stricter_level(monkeypatch):
+    for ratio, factor, level, gain in (
+        (1.0, 1.0, 0.005, 0.125),
+        (1.09, 1.0, 0.005, 0.125),
+        (1.11, 1.0, 0.05, 0.05),
+        (1.3, 1.2, 0.005, 0.125),  # 1.08 x the largest noise
+        (1.33, 1.2, 0.05, 0.05),
+    ):
+        made, null = procedure(), np.arange(1001) / 1000
+        made.context.noise_factors = {"angle": factor}
+        (best, sizes), notes = searched(monkeypatch, made, {"a": (0.9, True)}, null, ratio)
+        assert best.name == "a"
+        assert sizes == ("s1", "s3")
+        assert notes["asked"] == notes["needed"] == pytest.approx(1 - level)
+        assert notes["level"] == level
+        assert len(made.record.findings) == len(made.record.groups) == 1
+        # Where chance is less than that, an effect must still remove a share of the error.
+        other = procedure()
+        other.context.noise_factors = made.context.noise_factors
+        _, notes = searched(monkeypatch, other, {"a": (0.9, True)}, np.zeros(10), ratio)
+        assert (notes["needed"], notes["min_gain"]) == (gain, gain)
+    stricter = procedure(quiet_significance_level=0.001)
+    _, notes = searched(monkeypatch, stricter, {"a": (0.9, True)}, np.arange(1001) / 1000, 1.0)
+    assert notes["asked"] == pytest.approx(0.999)
+
+
+def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkeypatch):
+    made = procedure()
+    monkeypatch.setattr(find_addition, "linear_at_measured_states", lambda _base, _cfg: "shared")
+    monkeypatch.setattr(find_addition, "ranking", lambda _base, _screened, names, _seed: f"ranked {names}")
+    monkeypatch.setattr(find_addition, "label", lambda effect, _among: effect)
+    monkeypatch.setattr(
+        find_addition, "screen", lambda _base, effect, _cfg, at: effect.upper() if at == "shared" else ""
+    )
+    assert made.additions.finder._screened(node(2.0), ["a", "b"], 0) == ["A", "B"]
+    assert made.context.runner.share == pytest.approx(0.5 * 0.85 / 3)
+    assert made.seen[-1][1] == "ranked ['a', 'b']"
+    made.additions.finder.gradient = SimpleNamespace(apply=lambda _base, screened, _runner: screened[::-1])
+    assert made.additions.finder._screened(node(2.0), ["a", "b"], 0) == ["B", "A"]
+
+
+def test_where_the_data_are_explained_the_intervals_of_the_answer_decide_on_a_candidate(monkeypatch):
+    ends = {"a": [OPEN], "b": [OPEN, CLEAR], "c": [CLEAR]}
+    monkeypatch.setattr(find_addition, "add_candidate", lambda _base, c: c)
+    monkeypatch.setattr(find_addition, "nominal_errors", lambda c, _cfg, shared: f"nominal {c.name} {shared}")
+    simulated = []
+    monkeypatch.setattr(find_addition, "nominal_sensitivities", lambda base: simulated.append(base) or "at base")
+
+    def answer(c, widening, nominal):
+        assert (widening, nominal) == ({1: f"width of {c.name}"}, f"nominal {c.name} at base")
+        return [(CLEAR,), tuple(ends[c.name])]
+
+    monkeypatch.setattr(find_addition, "joint_parameters", answer)
+    gains = {"a": (0.9, True), "b": (0.7, True), "c": (0.6, False)}
+    for explained, added, seen in ((False, "a", ["a", "b"]), (True, "b", ["b"])):
+        made = procedure()
+        (best, _), _ = searched(monkeypatch, made, gains, np.zeros(10), explained=explained)
+        assert best.name == added
+        assert made.record.groups == [tuple(seen)]
+        first = next(f for f in made.record.findings if f.name == "a")
+        assert first.accepted is not explained
+        assert (first.reason == "its parameters may be at their null values") is explained
+        assert len(simulated) == explained
+
+
+class Parts:
+    """A search in which one candidate is a part, and notes of what it asks for."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fits: dict[str, tuple[float, float]]) -> None:
+        """Prepare a search whose candidates have a gain and a noise ratio."""
+        self.screened: list[list[str]] = []
+        self.fitted: list[tuple[list[str], float]] = []
+        self.null: list[list[str]] = []
+        self.among: list[list[str]] = []
+        self.time = True
+        notes, found = self, {}
+        for name, (gain, ratio) in fits.items():
+            found[name] = MadeUp(name=name, gain=gain, ratio=ratio, model=SimpleNamespace(effects=[name]))
+        effects = [candidate("whole"), candidate("part", is_part=True), candidate("other")]
+
+        class Fits:
+            left = ()
+
+            def __init__(self, *_):
+                self.fits = []
+
+            def unsettled(self, _name):
+                return []
+
+            def fit(self, screened, needed, _windows, _promise):
+                notes.fitted.append((screened, needed))
+                self.fits += [found[s] for s in screened if s in found]
+                return self.fits
+
+        def chance(_base, screened, *_):
+            self.null.append(screened)
+            return np.full(10, 0.01 * len(screened))
+
+        def assess(_base, c, null, step, among, _cfg):
+            self.among.append([e.name for e in among])
+            return replace(finding(c.name, c.gain, step=step), p=float(null[0]))
+
+        monkeypatch.setattr(find_addition, "candidates", lambda *_: effects)
+        monkeypatch.setattr(find_addition, "max_gain_under_null", chance)
+        monkeypatch.setattr(find_addition, "detectable_size", lambda _b, s, needed: f"{s} {needed}")
+        monkeypatch.setattr(find_addition, "CandidateFits", Fits)
+        monkeypatch.setattr(find_addition, "assess", assess)
+        monkeypatch.setattr(find_addition, "profile_widening", lambda _base, c: f"width of {c.name}")
+        monkeypatch.setattr(
+            find_addition,
+            "group_indistinguishable",
+            lambda _b, accepted, *_: [max(accepted, key=lambda pair: pair[1].gain)],
+        )
+
+    def find(self, made: Any, ratio: float = 2.0) -> tuple[str | None, tuple[str, ...]]:
+        """Return the name of what is added to a model of a noise ratio, and the detectable sizes."""
+
+        def screen(_base, effects, _step, **_):
+            if not self.time and effects[0].is_part:
+                raise TimeUpError
+            self.screened.append([e.name for e in effects])
+            return self.screened[-1]
+
+        made.additions.finder._screened = screen
+        best, sizes = made.additions.finder.find(node(ratio), 0)
+        return None if best is None else best.name, sizes
+
+
+@pytest.mark.parametrize(
+    ("whole", "other", "ratio", "needed"),
+    [
+        ((0.7, 1.1), (0.6, 1.5), 2.0, False),
+        ((0.7, 1.11), (0.6, 1.0), 2.0, True),  # the one that gains most counts
+        (None, None, 1.1, False),
+        (None, None, 1.11, True),
+    ],
+)
+def test_parts_are_candidates_where_no_other_one_explains_the_data(monkeypatch, whole, other, ratio, needed):
+    fits = {n: v for n, v in (("whole", whole), ("other", other), ("part", (0.9, 1.0))) if v is not None}
+    made, parts = procedure(), Parts(monkeypatch, fits)
+    added, sizes = parts.find(made, ratio)
+    assert added == ("part" if needed else "whole" if whole else None)
+    least = 0.125 if ratio <= 1.1 else 0.05
+    assert sizes == (f"whole {least}", f"other {least}")
+    first, rest = ["whole", "other"], [["part"]] if needed else []
+    assert parts.screened == [first, *rest]
+    # Chance has the best of all of them, for those that were fitted before as well.
+    assert parts.null == [first, *([[*first, "part"]] if needed else [])]
+    assert parts.fitted == [(screened, least) for screened in (first, *rest)]  # more than chance reaches
+    assert all(among == (["whole", "other", "part"] if needed else first) for among in parts.among)
+    assert {f.p for f in made.record.findings} == ({0.03} if needed else {0.02} if whole else set())
+    assert len(made.record.findings) == len(fits) - (not needed)
+
+
+def test_beside_a_provisional_addition_candidates_must_promise_what_it_left():
+    made = procedure()
+    assert (made.context.cfg.max_remainder, made.context.cfg.search.remainder_promise) == (0.15, 0.75)
+    assert made.additions.finder._least_promise(node(2.0)) == 0
+    made.record.provisional = 1
+    # 1 - 1 / 2^2 of the squared residual is more than noise.
+    assert made.additions.finder._least_promise(node(2.0)) == pytest.approx(0.75 * 0.85 * 0.75)
+    assert made.additions.finder._least_promise(node(0.9)) == 0
+
+
+def test_parts_of_an_effect_that_was_asked_for_are_candidates_from_the_start(monkeypatch):
+    for asked, first in ((("part",), ["whole", "part", "other"]), (("whole",), ["whole", "other"])):
+        made, parts = procedure(effects=asked), Parts(monkeypatch, {"whole": (0.7, 1.0)})
+        assert parts.find(made)[0] == "whole"
+        assert parts.screened == [first]
+
+
+def test_without_time_for_parts_the_other_candidates_stay(monkeypatch):
+    made, parts = procedure(), Parts(monkeypatch, {"whole": (0.7, 1.5)})
+    parts.time = False
+    assert parts.find(made)[0] == "whole"
+    assert made.context.budget.unsettled == ["Not screened: part."]
+    assert made.context.budget.cut == {0}
