@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from concent_warp.diagnosis.search.candidates import candidates
+from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.fit.effects.least_squares import LeastSquaresCfg, Solver, projected
 from concent_warp.fit.effects.observe import observe

@@ -19,9 +19,9 @@ import tyro
 
 from benchmarks.diagnose.hidden_effects_data import cases, make
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
+from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
-from concent_warp.diagnosis.search.candidates import candidates
 from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Recording
 

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.diagnose.fit_everything import Blame, blamed
-from concent_warp.diagnosis.search.candidates import candidates
+from concent_warp.diagnosis.candidates.candidates import candidates
 from concent_warp.fit.effects.observation import Window
 from concent_warp.fit.effects.observe import observe
 from concent_warp.fit.effects.prediction import Prediction, SensorReader

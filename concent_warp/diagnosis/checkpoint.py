@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from concent_warp.array_file import write_arrays
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.profile_likelihood import ProfilePoint
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.profile_likelihood import ProfilePoint
 from concent_warp.diagnosis.tasks import Progress, TaskRunner
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import effect_class

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 
 from concent_warp.comparison.residuals import instrument_noise
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.check_data import check_data, noise_remarks
 from concent_warp.diagnosis.experiment.suggest import SuggestedExperiment, suggest_experiment
@@ -23,11 +26,8 @@ from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
 from concent_warp.diagnosis.search.alternatives import try_alternatives
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
-from concent_warp.diagnosis.search.gradient_start import GradientStarts
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
 from concent_warp.diagnosis.search.unknown_force import unknown_force

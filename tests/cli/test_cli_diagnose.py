@@ -136,7 +136,7 @@ def test_a_report_shows_the_diagnosis_before_and_after(swing, tmp_path):
 
 
 def test_an_interrupted_diagnosis_says_how_to_go_on_and_does(swing, tmp_path, capsys, monkeypatch):
-    from concent_warp.diagnosis.search.fit_promising import CandidateFits
+    from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
 
     finish = CandidateFits.fit
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import tasks as task_module
+from concent_warp.diagnosis.candidates.candidate import ScreenedCandidate
 from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
 from concent_warp.diagnosis.checkpoint import _load, _save
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.search import context
-from concent_warp.diagnosis.search.candidate import ScreenedCandidate
 from concent_warp.effects.registry import effect_class
 from concent_warp.errors import ConcentError
 from tests.diagnosis.same_results import assert_same

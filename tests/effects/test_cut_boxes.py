@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from small_worlds import BLOCK, move, world
 
-from concent_warp.diagnosis.search.candidates import candidates, label
+from concent_warp.diagnosis.candidates.candidates import candidates, label
 from concent_warp.effects.library.cut_box import EDGE_PARTS, FACE_PARTS, PAIR_PARTS, PARTS, CutBox, largest, names
 from concent_warp.effects.library.geometry import ContactGeometryOffset
 from concent_warp.effects.registry import effect_class

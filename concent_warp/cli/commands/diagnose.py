@@ -18,11 +18,11 @@ from concent_warp.cli.given_recording import given_recording
 from concent_warp.cli.options import EngineOption, NoiseOption, OptionalOutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.comparison.compare import compare_replays
+from concent_warp.diagnosis.candidates.candidates import candidates
+from concent_warp.diagnosis.candidates.screening import FIRST_RANKING
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import EXPERIMENT_FILE, diagnose
 from concent_warp.diagnosis.result import Diagnosis, Finding
-from concent_warp.diagnosis.search.candidates import candidates
-from concent_warp.diagnosis.search.screening import FIRST_RANKING
 from concent_warp.errors import ModelError
 from concent_warp.files import all_or_none
 from concent_warp.model import Model

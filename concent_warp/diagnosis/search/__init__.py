@@ -1,1 +1,1 @@
-"""The search for missing effects: candidates, screening, evidence."""
+"""The search for missing effects: additions, their revision, and what else could explain the data."""

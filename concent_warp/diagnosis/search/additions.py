@@ -11,12 +11,12 @@ from functools import partial
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.evidence import leaves_more
 from concent_warp.diagnosis.result import Detectable
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
-from concent_warp.diagnosis.search.baseline import add_candidate
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, BASELINE_SPAN, SearchContext
-from concent_warp.diagnosis.search.evidence import leaves_more
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding

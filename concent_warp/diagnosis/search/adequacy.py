@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.fit.effects.robust import huber, robust_noise_ratio
 
 

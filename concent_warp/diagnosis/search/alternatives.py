@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.evidence import leaves_more, surprise
 from concent_warp.diagnosis.search.additions import Additions
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.evidence import leaves_more, surprise
 from concent_warp.diagnosis.search.reconsider import Rival, beside
 from concent_warp.diagnosis.search.record import SearchRecord
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, least_ratio
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.nominal_values import nominal_effects, with_nominal_values
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.tasks import TaskRunner, run_tasks

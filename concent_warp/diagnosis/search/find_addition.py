@@ -12,21 +12,21 @@ from functools import partial
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, refit_from_rivals
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.candidates import candidates, label
+from concent_warp.diagnosis.candidates.evidence import assess, detectable_size, profile_widening
+from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
+from concent_warp.diagnosis.candidates.gradient_start import GradientStarts
+from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
+from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null
+from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import least_ratio
-from concent_warp.diagnosis.search.baseline import add_candidate, refit_from_rivals
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import candidates, label
 from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, SearchContext
-from concent_warp.diagnosis.search.evidence import assess, detectable_size, profile_widening
-from concent_warp.diagnosis.search.fit_promising import CandidateFits
-from concent_warp.diagnosis.search.gradient_start import GradientStarts
-from concent_warp.diagnosis.search.grouping import group_indistinguishable
 from concent_warp.diagnosis.search.joint_fit import joint_parameters
 from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
-from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
 from concent_warp.diagnosis.search.reconsider import near_best
-from concent_warp.diagnosis.search.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.time_budget import in_words
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.observation import Window

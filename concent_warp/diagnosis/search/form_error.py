@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.unknown_force import Results, combined, forces, held_out, with_interleaved_folds
 from concent_warp.effects.effect import Effect, Variable
 from concent_warp.effects.force_model import ForceModel

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import fitted_model
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.baseline import fitted_model
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.fit.effects.cross_validation import block_sums, bootstrap_interval
 from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, clustered_std, formula_errors
 

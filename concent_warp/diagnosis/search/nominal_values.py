@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import fitted_model
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg
-from concent_warp.diagnosis.search.baseline import fitted_model
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.effects.registry import NOMINAL
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums

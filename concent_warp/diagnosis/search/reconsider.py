@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fitted_model, refit_without_effect
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.candidates import has_effect
+from concent_warp.diagnosis.candidates.evidence import assess, indistinguishable
+from concent_warp.diagnosis.candidates.fit_candidate import fitted_candidate
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.baseline import add_candidate, fitted_model, refit_without_effect
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.search.candidates import has_effect
-from concent_warp.diagnosis.search.evidence import assess, indistinguishable
-from concent_warp.diagnosis.search.fit_candidate import fitted_candidate
 from concent_warp.effects.effect import AddedEffect, Effect
 from concent_warp.fit.effects.least_squares import Fit
 

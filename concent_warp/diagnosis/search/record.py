@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.result import Finding, FinerTimeStep
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
 from concent_warp.diagnosis.search.reconsider import Rival
 from concent_warp.fit.effects.intervals import FittedParameter
 from concent_warp.model import Model

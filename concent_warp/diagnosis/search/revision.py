@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from concent_warp.diagnosis.search.baseline import refit_without_effect, without_effect
-from concent_warp.diagnosis.search.candidate import FittedModel
+from concent_warp.diagnosis.candidates.baseline import refit_without_effect, without_effect
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.joint_fit import (
     joint_finding,

@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import fitted_model
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.screening import robust_sum
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.result import FinerTimeStep
-from concent_warp.diagnosis.search.baseline import fitted_model
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.screening import robust_sum
 from concent_warp.estimation.noise_ratio import noise_ratio
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.observation import TimeStepDefect, Window

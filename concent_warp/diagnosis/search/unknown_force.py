@@ -18,12 +18,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null, null_p_value
+from concent_warp.diagnosis.candidates.screening import screen, with_residuals
 from concent_warp.diagnosis.cfg import DiagnoseCfg, UnknownForceCfg
 from concent_warp.diagnosis.result import UnknownForceFound
 from concent_warp.diagnosis.search.adequacy import discrepancies
-from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.null_distribution import max_gain_under_null, null_p_value
-from concent_warp.diagnosis.search.screening import screen, with_residuals
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.select import SINGLE, dof_of, element_name, free_bodies, typical_torque
 from concent_warp.effects.unknown_force import UnknownBodyForce, UnknownForce, UnknownJointForce, Way

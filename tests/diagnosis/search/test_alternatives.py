@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from concent_warp.diagnosis import procedure
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, NominalCfg, SearchCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Diagnosis, Finding, FinerTimeStep
 from concent_warp.diagnosis.search import alternatives as module
 from concent_warp.diagnosis.search.alternatives import _from, plausibility, try_alternatives
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.reconsider import Rival, beside
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.effect import Effect
 from concent_warp.effects.library.joints import JointDamping
 from concent_warp.effects.library.nominal import NominalGain

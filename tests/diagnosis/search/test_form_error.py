@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.form_error import flexible_correction
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.unknown_force import with_interleaved_folds
 from concent_warp.diagnosis.tasks import run_tasks
 from concent_warp.effects.effect import Effect

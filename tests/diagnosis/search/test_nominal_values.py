@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import concent_warp as cw
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.nominal_values import (
     _independent,
     _nominal_effects_of,
@@ -21,7 +22,6 @@ from concent_warp.diagnosis.search.nominal_values import (
     nominal_sensitivities,
     with_nominal_values,
 )
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import HeldOut, block_sums, cut_blocks
 from concent_warp.fit.effects.least_squares import Solver

@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline, refit_without_effect, without_effect
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate, polish_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.checkpoint import CheckpointedRunner
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline, refit_without_effect, without_effect
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.tasks import ignore_progress
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks

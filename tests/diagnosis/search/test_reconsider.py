@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import fit_baseline, refit_without_effect
+from concent_warp.diagnosis.candidates.candidate import FittedModel
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search import reconsider as module
-from concent_warp.diagnosis.search.baseline import fit_baseline, refit_without_effect
-from concent_warp.diagnosis.search.candidate import FittedModel
 from concent_warp.diagnosis.search.reconsider import Rival, near_best, reconsider
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.observe import observe

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg, TimeStepCfg
 from concent_warp.diagnosis.search import time_step as module
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.time_step import at_given_step, finding, finer_time_step, renew_defects
 from concent_warp.effects.registry import effect_class
 from concent_warp.estimation.noise_ratio import noise_ratio

@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.candidates import candidates
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.candidates import candidates
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.search.unknown_force import _best_force, forces, unknown_force
 from concent_warp.effects.registry import effect_class
 from concent_warp.effects.unknown_force import UnknownJointForce

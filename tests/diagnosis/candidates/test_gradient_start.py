@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate, polish_candidate
+from concent_warp.diagnosis.candidates.gradient_start import GradientStarts, _factor_of, _scaled
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate, polish_candidate
-from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.library.contact import ContactCompliance, SlidingFriction
 from concent_warp.effects.library.objects import Inertia, Mass

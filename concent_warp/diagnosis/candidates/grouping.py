@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.evidence import indistinguishable
+from concent_warp.diagnosis.candidates.fit_candidate import polish_candidate
+from concent_warp.diagnosis.candidates.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.search.evidence import indistinguishable
-from concent_warp.diagnosis.search.fit_candidate import polish_candidate
-from concent_warp.diagnosis.search.profile_likelihood import refine_by_profile
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import TimeBudget
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
 from concent_warp.fit.effects.robust import huber_weight
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates import baseline, evidence, fit_candidate, gradient_start, profile_likelihood
+from concent_warp.diagnosis.candidates.baseline import fit_baseline, refit_from_rivals
+from concent_warp.diagnosis.candidates.fit_candidate import polish_candidate, restart_candidate
+from concent_warp.diagnosis.candidates.gradient_start import start_from_factor
+from concent_warp.diagnosis.candidates.profile_likelihood import _next_distances, _profile
 from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
-from concent_warp.diagnosis.search import baseline, evidence, fit_candidate, gradient_start, profile_likelihood
-from concent_warp.diagnosis.search.baseline import fit_baseline, refit_from_rivals
-from concent_warp.diagnosis.search.fit_candidate import polish_candidate, restart_candidate
-from concent_warp.diagnosis.search.gradient_start import start_from_factor
-from concent_warp.diagnosis.search.profile_likelihood import _next_distances, _profile
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Parameter
 from concent_warp.fit.effects.cfg import EffectSolverCfg

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.baseline import held_out_errors, without_bounded
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.baseline import held_out_errors, without_bounded
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.least_squares import Fit, Solver
 from concent_warp.fit.effects.observation import Window

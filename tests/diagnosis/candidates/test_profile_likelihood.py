@@ -3,10 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.fit_candidate import candidate_solver, fit_candidate, fitted_candidate
-from concent_warp.diagnosis.search.profile_likelihood import (
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver, fit_candidate, fitted_candidate
+from concent_warp.diagnosis.candidates.profile_likelihood import (
     _next_distances,
     _parabola,
     _roughness,
@@ -14,7 +13,8 @@ from concent_warp.diagnosis.search.profile_likelihood import (
     profile_point,
     refine_by_profile,
 )
-from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.candidates.screening import screen
+from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Parameter
 from concent_warp.effects.registry import effect_class

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.fit_candidate import candidate_solver
-from concent_warp.diagnosis.search.screening import projected_residuals, robust_sum
+from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver
+from concent_warp.diagnosis.candidates.screening import projected_residuals, robust_sum
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.effect import Effect
 from concent_warp.errors import ConcentError

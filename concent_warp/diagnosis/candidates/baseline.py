@@ -8,7 +8,7 @@ from operator import is_
 
 import numpy as np
 
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, nominal_parameters
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, nominal_parameters
 from concent_warp.fit.effects.cfg import EffectSolverCfg
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, block_sums
 from concent_warp.fit.effects.intervals import FittedParameter

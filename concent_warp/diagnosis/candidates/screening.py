@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedModel, ScreenedCandidate
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.candidate import FittedModel, ScreenedCandidate
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import bootstrap_interval
 from concent_warp.fit.effects.least_squares import Linear, Solver

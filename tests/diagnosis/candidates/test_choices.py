@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates import fit_promising, gradient_start, grouping, profile_likelihood
+from concent_warp.diagnosis.candidates.fit_candidate import _better, polish_candidate
+from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
+from concent_warp.diagnosis.candidates.gradient_start import GradientStarts, _factor_of, _scaled
+from concent_warp.diagnosis.candidates.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
 from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
-from concent_warp.diagnosis.search import fit_promising, gradient_start, grouping, profile_likelihood
-from concent_warp.diagnosis.search.fit_candidate import _better, polish_candidate
-from concent_warp.diagnosis.search.fit_promising import CandidateFits
-from concent_warp.diagnosis.search.gradient_start import GradientStarts, _factor_of, _scaled
-from concent_warp.diagnosis.search.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
 from concent_warp.diagnosis.tasks import TaskRunner, ignore_progress, run_tasks
 from concent_warp.errors import ModelError
 from concent_warp.fit.effects.cfg import EffectSolverCfg

@@ -132,7 +132,7 @@ class FittedCandidate:
     """Robust RMS residual over the noise that is left [-]."""
     std: np.ndarray | None = None
     """Standard deviations of the parameters in units of their scale, shape (P,), where a profile likelihood gives them,
-    see `concent_warp.diagnosis.search.profile_likelihood`."""
+    see `concent_warp.diagnosis.candidates.profile_likelihood`."""
     cost_roughness: float = 0.0
     """Rise of the cost beyond its quadratic form, which local minima of the initial states cause; see there."""
     polished: bool = False

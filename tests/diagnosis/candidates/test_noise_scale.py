@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.search import time_step
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_adequate, is_lacking
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedModel
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
 from concent_warp.diagnosis.search.nominal_values import nominal_errors
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.library.joints import JointDamping
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from tests.scenes.swinging import TIMESTEP, drawing, swung, windows_of

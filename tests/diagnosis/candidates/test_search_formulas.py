@@ -10,12 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg, UnknownForceCfg
-from concent_warp.diagnosis.search import evidence, screening
-from concent_warp.diagnosis.search import unknown_force as module
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import has_effect, label
-from concent_warp.diagnosis.search.evidence import (
+from concent_warp.diagnosis.candidates import evidence, screening
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.candidates import has_effect, label
+from concent_warp.diagnosis.candidates.evidence import (
     _log_errors,
     _plausibility,
     detectable_size,
@@ -24,8 +22,10 @@ from concent_warp.diagnosis.search.evidence import (
     removed_by_channel,
     surprise,
 )
-from concent_warp.diagnosis.search.null_distribution import max_gain_under_null, null_p_value
-from concent_warp.diagnosis.search.screening import _linear_gain, _scan, projected_residuals, robust_sum
+from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null, null_p_value
+from concent_warp.diagnosis.candidates.screening import _linear_gain, _scan, projected_residuals, robust_sum
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg, UnknownForceCfg
+from concent_warp.diagnosis.search import unknown_force as module
 from concent_warp.diagnosis.search.unknown_force import (
     _best_force,
     _body_forces,

@@ -4,24 +4,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
-from concent_warp.diagnosis.procedure import Procedure
-from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search import evidence
-from concent_warp.diagnosis.search.baseline import add_candidate, fit_baseline
-from concent_warp.diagnosis.search.evidence import fitted_parameters, indistinguishable
-from concent_warp.diagnosis.search.fit_candidate import (
+from concent_warp.diagnosis.candidates import evidence
+from concent_warp.diagnosis.candidates.baseline import add_candidate, fit_baseline
+from concent_warp.diagnosis.candidates.evidence import fitted_parameters, indistinguishable
+from concent_warp.diagnosis.candidates.fit_candidate import (
     fit_candidate,
     fitted_candidate,
     polish_candidate,
     restart_candidate,
     search_candidate_value,
 )
-from concent_warp.diagnosis.search.fit_promising import CandidateFits
-from concent_warp.diagnosis.search.grouping import group_indistinguishable
+from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
+from concent_warp.diagnosis.candidates.grouping import group_indistinguishable
+from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_null
+from concent_warp.diagnosis.candidates.screening import FIRST_RANKING, linear_at_measured_states, ranking, screen
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.procedure import Procedure
+from concent_warp.diagnosis.result import Finding
 from concent_warp.diagnosis.search.joint_fit import refit_jointly
-from concent_warp.diagnosis.search.null_distribution import max_gain_under_null
-from concent_warp.diagnosis.search.screening import FIRST_RANKING, linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cfg import EffectSolverCfg

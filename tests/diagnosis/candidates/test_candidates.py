@@ -1,6 +1,6 @@
 import pytest
 
-from concent_warp.diagnosis.search.candidates import candidates, has_effect, label
+from concent_warp.diagnosis.candidates.candidates import candidates, has_effect, label
 from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ModelError
 from concent_warp.model import Model

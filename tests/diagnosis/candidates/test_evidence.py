@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
-from concent_warp.diagnosis.result import Finding
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.search.evidence import (
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.evidence import (
     assess,
     detectable_size,
     fitted_parameters,
     indistinguishable,
     removed_by_channel,
 )
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
-from concent_warp.diagnosis.search.screening import screen
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.screening import screen
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.result import Finding
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.intervals import covariance, formula_errors

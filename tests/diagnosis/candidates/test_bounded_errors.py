@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.search.baseline import fit_baseline, held_out_errors, refit_without_effect
+from concent_warp.diagnosis.candidates.baseline import fit_baseline, held_out_errors, refit_without_effect
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.joints import JointDamping, JointFriction
 from concent_warp.fit.effects.cross_validation import Blocks, HeldOut, Sums, cut_blocks

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver, fit_candidate, fitted_candidate
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.search.fit_candidate import candidate_solver, fit_candidate, fitted_candidate
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.observation import Window, first_part

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.candidates import label
+from concent_warp.diagnosis.candidates.null_distribution import null_p_value
 from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
 from concent_warp.diagnosis.result import Detectable, Finding
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.candidates import label
-from concent_warp.diagnosis.search.null_distribution import null_p_value
 from concent_warp.effects.effect import Effect, Parameter
 from concent_warp.fit.effects.cross_validation import bootstrap_interval, sign_flip_p
 from concent_warp.fit.effects.intervals import NORMAL_QUANTILE, FittedParameter, covariance, formula_errors

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.candidates.baseline import fit_baseline
+from concent_warp.diagnosis.candidates.fit_candidate import fit_candidate
+from concent_warp.diagnosis.candidates.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
+from concent_warp.diagnosis.candidates.screening import screen
 from concent_warp.diagnosis.cfg import SearchCfg
-from concent_warp.diagnosis.search.baseline import fit_baseline
-from concent_warp.diagnosis.search.fit_candidate import fit_candidate
-from concent_warp.diagnosis.search.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
-from concent_warp.diagnosis.search.screening import screen
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.cross_validation import cut_blocks
 from concent_warp.fit.effects.observation import ObservationCfg, TimeStepDefect, first_part

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel
+from concent_warp.diagnosis.candidates.fit_candidate import candidate_solver, fitted_candidate
 from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel
-from concent_warp.diagnosis.search.fit_candidate import candidate_solver, fitted_candidate
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.fit.effects.intervals import covariance
 

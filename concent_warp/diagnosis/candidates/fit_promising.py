@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.diagnosis.cfg import DiagnoseCfg
-from concent_warp.diagnosis.search.candidate import FittedCandidate, FittedModel, ScreenedCandidate
-from concent_warp.diagnosis.search.fit_candidate import (
+from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedModel, ScreenedCandidate
+from concent_warp.diagnosis.candidates.fit_candidate import (
     fit_candidate,
     multiple_shooting_candidate,
     polish_candidate,
     restart_candidate,
     search_candidate_value,
 )
-from concent_warp.diagnosis.search.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
+from concent_warp.diagnosis.candidates.growing_windows import baseline_of_first_parts, continue_fit, fit_first_parts
+from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.tasks import TaskRunner
 from concent_warp.diagnosis.time_budget import in_words
 from concent_warp.effects.effect import Effect

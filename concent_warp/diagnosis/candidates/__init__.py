@@ -1,0 +1,1 @@
+"""Candidates of one addition: screened, fitted beside a baseline, and weighed."""
