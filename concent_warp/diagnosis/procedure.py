@@ -26,7 +26,13 @@ from concent_warp.diagnosis.result import Detectable, Diagnosis, Verdict
 from concent_warp.diagnosis.search.additions import Additions
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
 from concent_warp.diagnosis.search.alternatives import try_alternatives
-from concent_warp.diagnosis.search.context import SearchContext
+from concent_warp.diagnosis.search.context import (
+    ADDITIONS_DONE,
+    BASELINE_DONE,
+    REVISION_DONE,
+    VALUES_DONE,
+    SearchContext,
+)
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.record import SearchRecord
 from concent_warp.diagnosis.search.revision import Revision
@@ -85,12 +91,15 @@ class Procedure:
         issues = [*check_data(self.recording, cfg.data), *noise_remarks(self.model.compile(), noises)]
         runner.progress(0.0, "cutting windows")
         given = self.baseline()
+        runner.enter(BASELINE_DONE, ADDITIONS_DONE)
         with context.budget.until(SEARCH_SHARE):
             fitted, detectable = self.search(given)
         revision = self.revision
+        runner.enter(ADDITIONS_DONE, REVISION_DONE)
         fitted = revision.final_values(revision.restore_given(revision.simplified(fitted), given))
+        found = self.conclude(given, fitted, detectable, issues)
         runner.progress(1.0, "done")
-        return self.conclude(given, fitted, detectable, issues)
+        return found
 
     def search(self, given: FittedModel) -> tuple[list[FittedModel], tuple[Detectable, ...]]:
         """Return the model as given and after each addition, and the detectable sizes of all effects."""
@@ -210,6 +219,8 @@ class Procedure:
             # What an effect explains with values that may be its null values needs no force of unknown form.
             tested = record.with_unestablished or fitted
             nodes = [given, *(tested[1:] or tested)]
+            context.runner.enter(VALUES_DONE, 1.0)
+            context.progress("testing forces of no known form")
             unknown = budget.attempt(
                 lambda: unknown_force(nodes, cfg, context.results),
                 None,

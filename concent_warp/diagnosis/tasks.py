@@ -13,8 +13,8 @@ T = TypeVar("T")
 Progress = Callable[[float, str], None]
 """Called with the share done, 0..1, and what is being done."""
 
-LAST_SHARE = 0.97
-"""Share that no tasks exceed, however many there are: all is done at the end only."""
+PART = 0.4
+"""Share of what is left of a phase that some tasks in it take, where it is not known how many follow [-]. Empirical."""
 
 
 def ignore_progress(share: float, text: str) -> None:
@@ -28,11 +28,20 @@ class TaskRunner:
     def __init__(self, jobs: int = 1, progress: Progress = ignore_progress) -> None:
         """Prepare to run `jobs` processes at a time, -1 for one per CPU."""
         self.jobs, self.progress = jobs, progress
-        self.share = 0.0
-        """Share of the whole diagnosis that is done, 0..1."""
+        self.share, self.end = 0.0, 1.0
+        """Shares of the whole diagnosis that are done now and at the end of the present phase, 0..1."""
+
+    def enter(self, begin: float, end: float) -> None:
+        """Begin a phase.
+
+        Args:
+            begin: Share of the whole diagnosis that is done, 0..1; less than before where more is to do than it seemed.
+            end: Share that is done at its end.
+        """
+        self.share, self.end = begin, end
 
     def run(
-        self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], text: str, span: float = 0.0
+        self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], text: str, part: float = PART
     ) -> list[T]:
         """Return the results of a task for each tuple of arguments, in their order.
 
@@ -40,27 +49,27 @@ class TaskRunner:
             task: A module-level function.
             arguments: One tuple a task.
             text: What is being done, for the progress.
-            span: Share of the whole diagnosis that these tasks take.
+            part: Share of what is left of the phase that these tasks take, 0..1.
 
         Raises:
             TimeUpError: There was no time for one of them.
         """
-        results = self.run_in_time(task, arguments, text, span)
+        results = self.run_in_time(task, arguments, text, part)
         finished = [result for result in results if result is not None]
         if len(finished) < len(results):
             raise TimeUpError("a task was not finished in the time given")
         return finished
 
     def run_in_time(
-        self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], text: str, span: float = 0.0
+        self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]], text: str, part: float = PART
     ) -> list[T | None]:
         """Return the results as `run` does, None for those that there was no time for."""
         results: list[T | None] = []
+        span = part * (self.end - self.share)
         for i, result in enumerate(self.results(task, arguments)):
             results.append(result)
-            share = self.share + span * (i + 1) / max(len(arguments), 1)
-            self.progress(min(share, LAST_SHARE), f"{text}, {i + 1} of {len(arguments)}")
-        self.share = min(self.share + span, LAST_SHARE)
+            self.progress(self.share + span * (i + 1) / len(arguments), f"{text}, {i + 1} of {len(arguments)}")
+        self.share += span if arguments else 0.0
         return results
 
     def results(self, task: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterable[T | None]:

@@ -169,12 +169,3 @@ def test_many_names_are_counted():
 
 def test_shares_of_the_time_leave_some_for_the_end():
     assert 0 < time_budget.SEARCH_SHARE < time_budget.TOGETHER_SHARE < 1
-
-
-def test_more_tasks_than_expected_are_never_the_whole():
-    seen: list[float] = []
-    runner = TaskRunner(1, lambda share, _: seen.append(share))
-    for _ in range(3):
-        runner.run(abs, [(1,), (2,)], "tasks", 0.4)
-    assert seen == pytest.approx([0.2, 0.4, 0.6, 0.8, 0.97, 0.97])
-    assert runner.share == pytest.approx(0.97)

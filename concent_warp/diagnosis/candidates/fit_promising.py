@@ -27,9 +27,6 @@ from concent_warp.effects.effect import Effect
 from concent_warp.fit.effects.observation import Window
 from concent_warp.simulate.time_limit import TimeUpError
 
-BATCH_SPAN = 0.15
-"""Share of a diagnosis that the first fits of an addition take, for the progress."""
-
 
 class CandidateFits:
     """The fits of candidates to one baseline."""
@@ -164,11 +161,10 @@ class CandidateFits:
         """
         base, search, left = self.base, self.search, list(promising)
         fitted: list[ScreenedCandidate] = []
-        span = 0.0 if self.fitted else BATCH_SPAN / search.batch_size
         while left:
             batch, left = left[: search.batch_size], left[search.batch_size :]
             tasks = [(base, s) for s in batch]
-            for s, c in zip(batch, self.runner.run_in_time(fit_candidate, tasks, "fitting", span), strict=True):
+            for s, c in zip(batch, self.runner.run_in_time(fit_candidate, tasks, "fitting"), strict=True):
                 if c is None:
                     self.left.append(s)
                 else:

@@ -16,7 +16,7 @@ from concent_warp.diagnosis.candidates.candidate import FittedCandidate, FittedM
 from concent_warp.diagnosis.candidates.evidence import leaves_more
 from concent_warp.diagnosis.result import Detectable
 from concent_warp.diagnosis.search.adequacy import discrepancies, is_lacking
-from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, BASELINE_SPAN, SearchContext
+from concent_warp.diagnosis.search.context import SearchContext
 from concent_warp.diagnosis.search.find_addition import AdditionFinder
 from concent_warp.diagnosis.search.form_error import flexible_correction
 from concent_warp.diagnosis.search.time_step import finding as time_step_finding
@@ -49,8 +49,7 @@ class Additions:
                 hide what they change.
         """
         context, record, fitted, first = self.context, self.context.record, list(fitted), fitted[0]
-        cfg, runner, factors = context.cfg, context.runner, context.noise_factors
-        runner.share = max(runner.share, BASELINE_SPAN)
+        cfg, factors = context.cfg, context.noise_factors
         while True:
             step = len(fitted) - 1
             # What a shorter time step leaves has a structure, too: that of the errors of both steps.
@@ -73,7 +72,6 @@ class Additions:
                 continue
             if step >= cfg.max_additions:
                 return (fitted if finer is None else self._adopt(fitted, finer)), detectable
-            runner.share = max(runner.share, BASELINE_SPAN + ADDITIONS_SPAN * step / cfg.max_additions)
             recorded = len(record.findings), len(record.groups)
             correction = None if effects_alone else self._correction(fitted[-1], first)
             try:

@@ -18,8 +18,12 @@ from concent_warp.diagnosis.time_budget import TimeBudget
 
 T = TypeVar("T")
 
-BASELINE_SPAN, ADDITIONS_SPAN = 0.1, 0.85
-"""Shares of a diagnosis that the baseline and the additions take, for the progress."""
+BASELINE_DONE, ADDITIONS_DONE, REVISION_DONE, VALUES_DONE = 0.1, 0.8, 0.86, 0.95
+"""Shares of a diagnosis that are done after baseline, additions, their revision and the final values. Empirical."""
+ADDITION_PART = 0.75
+"""Share of what is left that an addition takes if it is the last, and what is left then if it is not [-]. Empirical."""
+SCREENED_PART, FITTED_PART = 0.4, 0.8
+"""Shares of an addition that are done once candidates are screened, and fitted [-]. Empirical."""
 
 
 class SearchContext:
@@ -36,6 +40,15 @@ class SearchContext:
     def progress(self, text: str) -> None:
         """Report what is being done."""
         self.runner.progress(self.runner.share, text)
+
+    def enter_addition(self, step: int, begin: float, end: float) -> None:
+        """Begin a phase of an addition, from one share of it to another, 0..1.
+
+        That further additions follow is not known before: the share of the diagnosis falls where one does.
+        """
+        left = (1 - BASELINE_DONE) * ADDITION_PART**step
+        span = ADDITION_PART * left
+        self.runner.enter(1 - left + begin * span, 1 - left + end * span)
 
     def results(self, task: Callable[..., T], tasks: Sequence[tuple[Any, ...]]) -> Iterable[T]:
         """Return the results of a task for each tuple of arguments."""

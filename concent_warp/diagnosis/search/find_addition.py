@@ -23,7 +23,7 @@ from concent_warp.diagnosis.candidates.null_distribution import max_gain_under_n
 from concent_warp.diagnosis.candidates.screening import linear_at_measured_states, ranking, screen
 from concent_warp.diagnosis.result import Detectable, Finding
 from concent_warp.diagnosis.search.adequacy import least_ratio
-from concent_warp.diagnosis.search.context import ADDITIONS_SPAN, SearchContext
+from concent_warp.diagnosis.search.context import FITTED_PART, SCREENED_PART, SearchContext
 from concent_warp.diagnosis.search.joint_fit import joint_parameters
 from concent_warp.diagnosis.search.nominal_values import nominal_errors, nominal_sensitivities
 from concent_warp.diagnosis.search.reconsider import near_best
@@ -73,6 +73,7 @@ class AdditionFinder:
         """
         context, cfg = self.context, self.context.cfg
         effects, parts = self._candidates(base)
+        context.enter_addition(step, 0.0, SCREENED_PART)
         screened = self._screened(base, effects, step)
         if not screened:  # the model has all that were asked for
             return None, ()
@@ -90,6 +91,7 @@ class AdditionFinder:
         def short_windows() -> Sequence[Window]:
             return self.windows(base.model, cfg.search.shooting_window)
 
+        context.enter_addition(step, SCREENED_PART, FITTED_PART)
         least = self._least_promise(base)
         fits = CandidateFits(base, cfg, context.runner)
         fitted = fits.fit(screened, needed, short_windows, least)
@@ -114,6 +116,7 @@ class AdditionFinder:
         if not accepted:
             context.record.findings += sorted(findings, key=lambda f: -f.gain)
             return None, smallest
+        context.enter_addition(step, FITTED_PART, 1.0)
         group = group_indistinguishable(base, accepted, finding, context.runner, cfg, context.budget)
         context.record.rivals[step] = near_best(base, fitted, findings, cfg)
         context.record.add(group, findings, profile_widening(base, group[0][0]))
@@ -157,7 +160,7 @@ class AdditionFinder:
     def _screened_parts(self, base: FittedModel, parts: Sequence[Effect], step: int) -> list[ScreenedCandidate]:
         """Return parts with their expected gains, none where there was no time: the other candidates stay."""
         try:
-            return self._screened(base, parts, step, share=0.0)
+            return self._screened(base, parts, step, part=0.0)
         except TimeUpError:
             self.context.budget.note(f"Not screened: {in_words([label(e, parts) for e in parts])}.", step)
             return []
@@ -187,7 +190,7 @@ class AdditionFinder:
         return found
 
     def _screened(
-        self, base: FittedModel, effects: Sequence[Effect], step: int, share: float = 0.5
+        self, base: FittedModel, effects: Sequence[Effect], step: int, part: float = 1.0
     ) -> list[ScreenedCandidate]:
         """Return candidates with their expected gains.
 
@@ -195,13 +198,12 @@ class AdditionFinder:
             base: The fitted model.
             effects: Candidates.
             step: Index of the addition.
-            share: Share of the addition that this takes, for the progress.
+            part: Share of the present phase that this takes, for the progress.
         """
         context, cfg = self.context, self.context.cfg
-        span = share * ADDITIONS_SPAN / cfg.max_additions
         at_measured = linear_at_measured_states(base, cfg.search)
         tasks = [(base, e, cfg.search, at_measured) for e in effects]
-        found = context.runner.run_in_time(screen, tasks, "screening", span)
+        found = context.runner.run_in_time(screen, tasks, "screening", part)
         screened = [s for s in found if s is not None]
         if len(screened) < len(effects):
             missed = [label(e, effects) for e, s in zip(effects, found, strict=True) if s is None]

@@ -14,7 +14,7 @@ import numpy as np
 
 from concent_warp.diagnosis.candidates.baseline import refit_without_effect, without_effect
 from concent_warp.diagnosis.candidates.candidate import FittedModel
-from concent_warp.diagnosis.search.context import SearchContext
+from concent_warp.diagnosis.search.context import REVISION_DONE, VALUES_DONE, SearchContext
 from concent_warp.diagnosis.search.joint_fit import (
     joint_finding,
     joint_parameters,
@@ -173,6 +173,7 @@ class Revision:
         if not accepted and not nominal_effects(fitted[-1].model):
             record.nominal_values = ()
             return fitted, reduced, []
+        context.runner.enter(REVISION_DONE, VALUES_DONE)
         context.progress("fitting all effects together")
         attempt = context.budget.attempt
         unsettled = "Not refitted: all effects together."

@@ -106,7 +106,7 @@ def test_candidates_are_fitted_by_promise_in_batches_until_one_explains_the_data
     search = fits_of([], batch_size=3)
     search._fit_in_batches(sorted(order, key=lambda s: -s.expected_gain))
     assert [d[1] for d in tasks.done] == ["a", "b", "c", "d", "e"]
-    assert search.runner.share == pytest.approx(2 * 0.15 / 3)
+    assert search.runner.share == pytest.approx(1 - 0.6**2)
     tasks.done.clear()
     fits["c"] = replace(fits["c"], gain=0.7)
     again = fits_of([], batch_size=3)
@@ -653,12 +653,14 @@ def test_candidates_with_a_factor_are_started_from_it_and_factors_follow_the_mod
 def test_tasks_report_their_share_in_order():
     seen: list[tuple[float, str]] = []
     runner = TaskRunner(1, lambda share, text: seen.append((share, text)))
-    runner.share = 0.2
+    runner.enter(0.2, 0.6)
     assert runner.run(lambda a, b: a + b, [(1, 2), (3, 4)], "adding", 0.5) == [3, 7]
-    assert seen == [(pytest.approx(0.45), "adding, 1 of 2"), (pytest.approx(0.7), "adding, 2 of 2")]
-    assert runner.share == pytest.approx(0.7)
+    assert seen == [(pytest.approx(0.3), "adding, 1 of 2"), (pytest.approx(0.4), "adding, 2 of 2")]
+    assert runner.share == pytest.approx(0.4)
     assert runner.run(lambda: 1, [], "nothing") == []
-    assert runner.share == pytest.approx(0.7)
+    assert runner.share == pytest.approx(0.4)
+    runner.run(abs, [(1,)], "by default a part of what is left")
+    assert runner.share == pytest.approx(0.48)
     assert (TaskRunner().jobs, TaskRunner().progress) == (1, ignore_progress)
     ignore_progress(0.5, "half")
     done: list[int] = []

@@ -157,3 +157,16 @@ def test_far_from_the_noise_a_shorter_time_step_must_explain_a_fifth(monkeypatch
     made = procedure(min_gain=0.3)
     made.additions._finer(node(6.0))
     assert asked[6.0] == 0.3
+
+
+def test_an_addition_takes_three_quarters_of_what_is_left_and_begins_earlier_than_the_one_before_ended():
+    made = procedure()
+    shares = []
+    for step in range(3):
+        made.context.enter_addition(step, 0.0, 1.0)
+        shares += [made.context.runner.share, made.context.runner.end]
+    left = (0.9, 0.9 * 0.75, 0.9 * 0.75**2)
+    assert shares == pytest.approx([s for each in left for s in (1 - each, 1 - each / 4)])
+    made.context.enter_addition(1, 0.25, 0.7)
+    assert made.context.runner.share == pytest.approx(1 - left[1] + 0.25 * 0.75 * left[1])
+    assert made.context.runner.end == pytest.approx(1 - left[1] + 0.7 * 0.75 * left[1])

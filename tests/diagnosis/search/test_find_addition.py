@@ -156,8 +156,9 @@ def test_candidates_are_screened_and_started_by_gradients_where_asked_for(monkey
     monkeypatch.setattr(
         find_addition, "screen", lambda _base, effect, _cfg, at: effect.upper() if at == "shared" else ""
     )
+    made.context.enter_addition(0, 0.0, 0.25)
     assert made.additions.finder._screened(node(2.0), ["a", "b"], 0) == ["A", "B"]
-    assert made.context.runner.share == pytest.approx(0.5 * 0.85 / 3)
+    assert made.context.runner.share == pytest.approx(0.1 + 0.25 * 0.75 * 0.9)
     assert made.seen[-1][1] == "ranked ['a', 'b']"
     made.additions.finder.gradient = SimpleNamespace(apply=lambda _base, screened, _runner: screened[::-1])
     assert made.additions.finder._screened(node(2.0), ["a", "b"], 0) == ["B", "A"]
