@@ -18,11 +18,6 @@ FIRST_RANKING = "first ranking"
 """How the text of the progress begins that has it."""
 RANKED = 4
 """Candidates in it."""
-FIRST_SCANNED = 0.5
-"""Share of the squared residual in the windows in which scanned values are tried first [-]."""
-WORSE = 1.5
-"""Squared residual that a scanned value leaves there, over the least of those before, above which none beyond it is
-tried [-]. Empirical."""
 
 
 def screen(
@@ -60,10 +55,10 @@ def screen(
         plain = [replace(piece, jacobian=piece.jacobian[:, : solver.p.owned]) for piece in there]
         before = base.held_out(plain).own()
         gain = max(gain, _linear_gain(base, there, plain, before))
-    scanned_gain, start = _scan(solver, base, values, base.fit.offsets)
+    scanned_gain, start = _scan(solver, base, values, base.fit.offsets, cfg)
     measured = False
     if far:
-        other_gain, other = _scan(solver, base, values, zero)
+        other_gain, other = _scan(solver, base, values, zero, cfg)
         if other_gain > scanned_gain:
             scanned_gain, start, measured = other_gain, other, True
     return ScreenedCandidate(effect, gain, scanned_gain, start, pieces, measured)
@@ -151,7 +146,7 @@ def _linear_gain(base: FittedModel, pieces: Sequence[Linear], plain: Sequence[Li
 
 
 def _scan(
-    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray]
+    solver: Solver, base: FittedModel, values: np.ndarray, offsets: Sequence[np.ndarray], cfg: SearchCfg
 ) -> tuple[float, np.ndarray]:
     """Return the gain of the best scanned value of any parameter, and the parameters (P,) from which to fit.
 
@@ -164,11 +159,12 @@ def _scan(
         base: The fitted baseline.
         values: Parameters at their null values, shape (P,).
         offsets: Errors of the initial states in units of their standard deviation, one (2 nv,) a window.
+        cfg: Settings.
     """
     best, start = 0.0, np.where(np.isfinite(values), values, solver.high)
     before = np.array([robust_sum(base, [piece.residual]) for piece in base.pieces])
     order = np.argsort(before)[::-1]
-    count = int(np.searchsorted(np.cumsum(before[order]), FIRST_SCANNED * before.sum())) + 1
+    count = int(np.searchsorted(np.cumsum(before[order]), cfg.first_scanned_share * before.sum())) + 1
     first, rest = order[:count].tolist(), order[count:].tolist()
     first_before, total = float(before[first].sum()), max(float(before.sum()), 1e-12)
     for k, outward in _outward(solver, values):
@@ -178,7 +174,7 @@ def _scan(
             moved[k] = value
             left = robust_sum(base, projected_residuals(solver, base, moved, offsets, first))
             least = min(least, left)
-            if left > max(WORSE * least, first_before):
+            if left > max(cfg.max_scanned_rise * least, first_before):
                 break
             if left >= first_before:
                 continue

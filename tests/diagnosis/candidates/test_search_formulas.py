@@ -173,7 +173,7 @@ def scanning(monkeypatch, parameters, share):
     monkeypatch.setattr(screening, "robust_sum", lambda _base, rs: sum(float(r @ r) for r in rs))
     monkeypatch.setattr(screening, "projected_residuals", residuals)
     gain, start = _scan(
-        solver, replace(base, pieces=reduced), np.array([0.5, *(p.null for p in parameters[1:])]), OFFSETS
+        solver, replace(base, pieces=reduced), np.array([0.5, *(p.null for p in parameters[1:])]), OFFSETS, SearchCfg()
     )
     return gain, start.tolist(), tried, before
 
