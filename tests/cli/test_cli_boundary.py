@@ -153,7 +153,7 @@ def test_termination_leaves_no_files_of_parallel_processes(tmp_path):
     assert process.stdout.readline() == "running\n"
 
     def shared():
-        return [path for folder in (Path("/dev/shm"), tmp_path) for path in folder.glob(f"*{process.pid}*")]
+        return [path for folder in (Path("/dev/shm"), tmp_path) for path in folder.glob(f"*[-_]{process.pid}[-_]*")]
 
     assert any("joblib" in path.name for path in shared())
     process.send_signal(signal.SIGTERM)
