@@ -57,14 +57,14 @@ class SearchCfg:
     min_expected_gain: float = 0.5
     """Expected gain over the needed one, above which a screened candidate is fitted [-]: linear extrapolation is
     taken to be right to a factor of 2."""
+    min_scanned_gain: float = 0.25
+    """The same where a scanned value gains something: the best one may lie between two, and what has a threshold is far
+    from linear. Empirical."""
     first_scanned_share: Share = 0.5
     """Share of the squared residual in the windows in which scanned values are tried first [-]."""
     max_scanned_rise: Annotated[float, Bounds(1)] = 1.5
     """Squared residual that a scanned value leaves there, over the least of those before, above which none beyond it is
     tried [-]. Empirical."""
-    min_scanned_gain: float = 0.25
-    """The same where a scanned value gains something: the best one may lie between two, and what has a threshold is far
-    from linear. Empirical."""
     remainder_promise: Share = 0.75
     """Share of the gain that `DiagnoseCfg.max_remainder` asks for which a screened candidate must promise to be fitted
     [-]: little is left there, and residuals are nearly in proportion to an effect's size."""

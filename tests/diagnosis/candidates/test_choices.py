@@ -1,74 +1,28 @@
-"""Which candidates the search fits, fits again, groups and removes, with fits that are made up."""
+"""Which candidates the search fits and fits again, with fits that are made up."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from concent_warp.diagnosis.candidates import fit_promising, gradient_start, grouping, profile_likelihood
+from concent_warp.diagnosis.candidates import fit_promising
 from concent_warp.diagnosis.candidates.fit_candidate import _better, polish_candidate
 from concent_warp.diagnosis.candidates.fit_promising import CandidateFits
-from concent_warp.diagnosis.candidates.gradient_start import GradientStarts, _factor_of, _scaled
-from concent_warp.diagnosis.candidates.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
-from concent_warp.diagnosis.cfg import DiagnoseCfg, ProfileLikelihoodCfg, SearchCfg
-from concent_warp.diagnosis.tasks import TaskRunner, ignore_progress, run_tasks
-from concent_warp.errors import ModelError
-from concent_warp.fit.effects.cfg import EffectSolverCfg
+from concent_warp.diagnosis.cfg import DiagnoseCfg, SearchCfg
+from concent_warp.diagnosis.tasks import TaskRunner
+from tests.diagnosis.candidates.made_up_fit import base_of, made
 
 ANY: Any = None
-
-
-@dataclass(frozen=True)
-class MadeUp:
-    """A fit with a gain, a cost and a noise ratio."""
-
-    name: str
-    gain: float
-    cost: float = 100.0
-    ratio: float = 1.2
-    polished: bool = False
-    std: Any = None
-    confusions: tuple[str, ...] = ()
-    errors: np.ndarray = field(default_factory=lambda: np.array([1.0]), compare=False)
-    value: float = 0.0
-    source: Any = None
-    """The effect, where it must be one object."""
-
-    @property
-    def effect(self) -> Any:
-        """The effect, by its name."""
-        return self.source or SimpleNamespace(name=self.name, confusions=self.confusions)
-
-    @property
-    def fit(self) -> Any:
-        """The cost as that of a fit."""
-        return SimpleNamespace(cost=self.cost, of=self.name, values=np.array([self.value]))
-
-    def share(self, base: Any) -> float:
-        """Return the gain."""
-        del base
-        return self.gain
-
-
-def made(*values: Any, **more: Any) -> Any:
-    """Return a fit that is made up."""
-    return MadeUp(*values, **more)
 
 
 def screened(name: str, expected: float, of: tuple[str, ...] = ()) -> Any:
     """Return a screened candidate, by default of an effect by itself; else of one on the elements `of`."""
     effect = SimpleNamespace(name=name if not of else "part", elements=of)
     return SimpleNamespace(name=name, expected_gain=expected, effect=effect, scanned_gain=0.0)
-
-
-def base_of(windows: int = 2, length: float = 1.0, ratio: float = 2.0) -> Any:
-    """Return a baseline with windows of a length [s] and a noise ratio."""
-    cut = [SimpleNamespace(start=0.5, end=0.5 + length, smooth=False)] * windows
-    return SimpleNamespace(windows=cut, cfg=EffectSolverCfg(), ratio=ratio)
 
 
 class Tasks:
@@ -488,186 +442,3 @@ def test_the_better_of_two_fits_has_the_lower_cost():
     assert _better(one, replace(one, name="same")) is one
     done = replace(one, polished=True)
     assert polish_candidate(ANY, done) is done
-
-
-@dataclass(frozen=True)
-class Judged:
-    """The evidence of a made-up fit."""
-
-    name: str
-    accepted: bool
-    reason: str
-
-
-@pytest.mark.parametrize(
-    ("windows", "wider", "better"), [(16, True, True), (17, True, False), (16, False, False), (16, True, False)]
-)
-def test_the_first_of_a_group_is_polished_and_gets_a_profile_as_do_its_near_equals(monkeypatch, windows, wider, better):
-    done, cfg = [], DiagnoseCfg(jobs=1)
-    fits = [made(n, 0.5) for n in "abcde"]
-    pairs: Any = [(c, Judged(c.name, True, "")) for c in fits]
-
-    def judge(c: Any) -> Any:
-        return Judged(c.name, False, "no")
-
-    def indistinguishable(_base, accepted, _search, slack=1.0):
-        done.append(("group", slack, len(accepted)))
-        return list(accepted) if slack > 1 and wider else list(accepted)[:2]
-
-    def refine(_base, c, _runner, _cfg):
-        done.append(("profile", c.name))
-        return replace(c, gain=c.gain + 0.1, std="known")
-
-    def polish(_base, c, _search, *, thorough):
-        done.append(("polish", c.name, thorough))
-        return replace(c, cost=c.cost - 1.0, std=None) if better else c
-
-    monkeypatch.setattr(grouping, "indistinguishable", indistinguishable)
-    monkeypatch.setattr(grouping, "refine_by_profile", refine)
-    monkeypatch.setattr(grouping, "polish_candidate", polish)
-    group: Any = grouping.group_indistinguishable(
-        base_of(windows),
-        pairs,
-        judge,
-        TaskRunner(),
-        cfg,
-    )
-    profiled = wider and windows == 16
-    near = [("profile", n) for n in "abc"] if profiled else []
-    size = 5 if wider else 2
-    again = [] if profiled and not better else [("profile", "a")]
-    assert done == [
-        ("group", 1.25, 5), ("group", 1.0, 5), *near, ("group", 1.0, size), ("polish", "a", True), *again,
-    ]  # fmt: skip
-    assert [(f.name, f.accepted, f.reason) for _, f in group] == [("a", True, ""), ("b", True, "")]
-    assert group[0][0].gain == pytest.approx(0.7 if profiled and better else 0.6)
-
-
-def point(distance: float, cost: float, rise: float = 0.0, parameter: int = 0) -> Any:
-    """Return a point of a profile."""
-    return SimpleNamespace(parameter=parameter, distance=distance, cost=cost, expected_rise=rise)
-
-
-def test_the_farthest_points_and_the_roughness_of_a_profile_are_those_of_its_parameter():
-    points = [point(2.0, 1), point(-6.0, 2), point(6.0, 3), point(9.0, 4, parameter=1), point(-2.0, 5)]
-    assert _farthest(points, 0, 1.0) is points[2]
-    assert _farthest(points, 0, -1.0) is points[1]
-    assert _farthest(points, 1, -1.0) is None
-    cfg, c = ProfileLikelihoodCfg(), made("c", 0.5, 10.0)
-    near = [point(2.0, 17.0, 2.0), point(-2.0, 13.0, 2.0), point(6.0, 99.0, 1.0), point(2.0, 99.0, 1.0, parameter=1)]
-    assert _roughness(c, near, 0, cfg) == pytest.approx(3.0)
-    assert _roughness(c, near[:1], 0, cfg) == pytest.approx(5.0)
-    assert _roughness(c, [point(2.0, 11.0, 2.0)], 0, cfg) == 0.0
-    assert _roughness(c, near[2:3], 0, cfg) == 0.0
-
-
-def test_a_distance_is_doubled_as_long_as_the_cost_falls(monkeypatch):
-    for costs, end, count in (([9, 8, 8.5, 7], 4.0 * 2, 3), ([9, 8, 7, 6, 5, 4], 2.0 * 16, 4), ([11], 2.0, 1)):
-        left, asked = iter(costs), []
-
-        def evaluate(_base, _c, parameter, distance, _cfg, left=left, asked=asked):
-            asked.append(distance)
-            return point(distance, next(left), parameter=parameter)
-
-        monkeypatch.setattr(profile_likelihood, "profile_point", evaluate)
-        found = _line_search(ANY, ANY, point(2.0, 10.0), ProfileLikelihoodCfg())
-        assert found.distance == end
-        assert asked == [2.0 * 2**k for k in range(1, count + 1)]
-
-
-def test_a_profile_restarts_from_lower_costs_a_few_times(monkeypatch):
-    cfg, seen = ProfileLikelihoodCfg(), []
-    for falls, restarts in (([0.5], 0), ([2.0, 0.0], 1), ([2.0] * 9, 3)):
-        left, done = iter(falls), []
-
-        def profile(_base, c, _runner, _cfg, least, left=left, done=done):
-            done.append(least)
-            return [point(2.0, c.cost - (0.0 if np.isinf(least) else next(left)))]
-
-        monkeypatch.setattr(profile_likelihood, "_profile", profile)
-        monkeypatch.setattr(profile_likelihood, "_line_search", lambda _b, _c, best, _cfg: best)
-        monkeypatch.setattr(profile_likelihood, "_restarted", lambda _b, c, best: replace(c, cost=best.cost))
-        monkeypatch.setattr(profile_likelihood, "_with_spread", lambda _b, c, points, _cfg: (c, len(points)))
-        found: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner(), cfg)
-        assert found[0].cost == 100.0 - 2.0 * restarts
-        assert len(done) == restarts + 1
-        assert np.isinf(done[-1]) == (restarts == 3)
-        seen.append(found[1])
-    assert seen == [1, 1, 1]
-    monkeypatch.setattr(profile_likelihood, "_profile", lambda *_: [])
-    none: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner())
-    assert none[1] == 0
-
-
-def effect(name: str, *target: str) -> Any:
-    """Return an effect by its name."""
-    return SimpleNamespace(name=name, target=target)
-
-
-FACTORS: Any = SimpleNamespace(friction=2.0, stiffness=4.0, mass={"box": 3.0})
-
-
-def test_factors_act_on_friction_stiffness_and_mass():
-    names = (
-        ("sliding_friction", "box"),
-        ("contact_compliance", "box"),
-        ("mass", "box"),
-        ("mass", "lid"),
-        ("size", "box"),
-    )
-    assert [_factor_of(effect(*n), FACTORS) for n in names] == [2.0, 4.0, 3.0, 1.0, 1.0]
-    values = np.array([0.02, 1.0])
-    assert _scaled(effect("contact_compliance"), values, 4.0).tolist() == [0.01, 1.0]
-    assert _scaled(effect("mass"), values, 3.0).tolist() == [0.06, 1.0]
-    assert values.tolist() == [0.02, 1.0]
-
-
-def test_candidates_with_a_factor_are_started_from_it_and_factors_follow_the_model(monkeypatch):
-    asked = []
-
-    def factors(model, _recording, _cfg):
-        asked.append(model)
-        if "wild" in model.effects:
-            raise ModelError("Newton cannot simulate it.")
-        return FACTORS
-
-    monkeypatch.setattr(gradient_start, "factors", factors)
-    monkeypatch.setattr(gradient_start, "start_from_factor", lambda _b, s, f: (s.effect.name, f))
-
-    def model(*effects: str) -> Any:
-        return SimpleNamespace(effects=effects)
-
-    starts: Any = GradientStarts(model(), ANY)
-    candidates: Any = [SimpleNamespace(effect=effect(n, "box")) for n in ("size", "mass", "sliding_friction")]
-    found = starts.apply(SimpleNamespace(model=model()), candidates, TaskRunner())
-    assert found == [candidates[0], ("mass", 3.0), ("sliding_friction", 2.0)]
-    assert len(asked) == 1
-    for _ in range(2):
-        starts.apply(SimpleNamespace(model=model("more")), candidates, TaskRunner())
-    assert [m.effects for m in asked] == [(), ("more",)]
-    assert starts.apply(SimpleNamespace(model=model("wild")), candidates, TaskRunner()) == candidates
-    with pytest.raises(ModelError, match=r"Newton cannot simulate it; or diagnose without --gradient\."):
-        GradientStarts(model("wild"), ANY)
-
-
-def test_tasks_report_their_share_in_order():
-    seen: list[tuple[float, str]] = []
-    runner = TaskRunner(1, lambda share, text: seen.append((share, text)))
-    runner.enter(0.2, 0.6)
-    assert runner.run(lambda a, b: a + b, [(1, 2), (3, 4)], "adding", 0.5) == [3, 7]
-    assert seen == [(pytest.approx(0.3), "adding, 1 of 2"), (pytest.approx(0.4), "adding, 2 of 2")]
-    assert runner.share == pytest.approx(0.4)
-    assert runner.run(lambda: 1, [], "nothing") == []
-    assert runner.share == pytest.approx(0.4)
-    runner.run(abs, [(1,)], "by default a part of what is left")
-    assert runner.share == pytest.approx(0.48)
-    assert (TaskRunner().jobs, TaskRunner().progress) == (1, ignore_progress)
-    ignore_progress(0.5, "half")
-    done: list[int] = []
-    lazy = run_tasks(done.append, [(k,) for k in range(3)], 1)
-    assert done == []
-    assert len(list(lazy)) == 3
-    assert done == [0, 1, 2]
-    alone = run_tasks(done.append, [(9,)], 8)
-    list(alone)
-    assert done[-1] == 9

@@ -46,62 +46,62 @@ def with_effect(base: FittedModel, name: str) -> FittedModel:
 
 
 @pytest.fixture(scope="module")
-def rubbing(lacking) -> FittedModel:
+def with_friction(lacking) -> FittedModel:
     """Return the model with dry friction in the place of the damping: the wrong formula of the right variable."""
     return with_effect(lacking, "joint_friction")
 
 
-def test_a_flexible_correction_takes_away_what_a_wrong_formula_leaves(rubbing):
-    errors = with_interleaved_folds(rubbing).errors
-    corrected = flexible_correction(rubbing, [effect("joint_friction")], CFG, results)
+def test_a_flexible_correction_takes_away_what_a_wrong_formula_leaves(with_friction):
+    errors = with_interleaved_folds(with_friction).errors
+    corrected = flexible_correction(with_friction, [effect("joint_friction")], CFG, results)
     assert corrected is not None
     assert corrected.shape == errors.shape
     assert corrected.sum() < 0.7 * errors.sum()
     # About the noise: as the damping itself leaves.
-    assert rubbing.ratio > 1.3
-    assert rubbing.ratio * np.sqrt(corrected.sum() / errors.sum()) < 1.1
+    assert with_friction.ratio > 1.3
+    assert with_friction.ratio * np.sqrt(corrected.sum() / errors.sum()) < 1.1
 
 
-def test_an_effect_of_other_variables_has_no_correction(rubbing):
+def test_an_effect_of_other_variables_has_no_correction(with_friction):
     assert effect("armature").variables == ()
-    assert flexible_correction(rubbing, [effect("armature")], CFG, results) is None
-    assert flexible_correction(rubbing, [], CFG, results) is None
+    assert flexible_correction(with_friction, [effect("armature")], CFG, results) is None
+    assert flexible_correction(with_friction, [], CFG, results) is None
 
 
 def procedure() -> Procedure:
     return Procedure(drawing(RECORDING), RECORDING, CFG)
 
 
-def test_only_what_may_be_an_error_of_a_formula_is_corrected(lacking, rubbing):
-    left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
+def test_only_what_may_be_an_error_of_a_formula_is_corrected(lacking, with_friction):
+    left = (with_friction.ratio**2 - 1) / (lacking.ratio**2 - 1)
     for share, ratio, corrected in ((left + 0.05, 9.0, True), (left - 0.05, 9.0, False), (left + 0.05, 1.1, False)):
         made = procedure()
         made.context.cfg = replace(CFG, max_form_error=share, form_error_ratio=ratio)
-        assert (made.additions._correction(rubbing, lacking) is not None) is corrected
+        assert (made.additions._correction(with_friction, lacking) is not None) is corrected
     assert procedure().additions._correction(lacking, lacking) is None
 
 
-def test_an_effect_beside_another_must_explain_what_a_correction_of_that_does_not(rubbing):
+def test_an_effect_beside_another_must_explain_what_a_correction_of_that_does_not(with_friction):
     made = procedure()
-    correction = flexible_correction(rubbing, [effect("joint_friction")], CFG, results)
+    correction = flexible_correction(with_friction, [effect("joint_friction")], CFG, results)
     assert correction is not None
-    damping = fit_candidate(rubbing, screen(rubbing, effect("joint_damping")))
-    armature = fit_candidate(rubbing, screen(rubbing, effect("armature")))
-    assert not made.additions._explains_more(rubbing, armature, correction)
+    damping = fit_candidate(with_friction, screen(with_friction, effect("joint_damping")))
+    armature = fit_candidate(with_friction, screen(with_friction, effect("armature")))
+    assert not made.additions._explains_more(with_friction, armature, correction)
     # The same without a correction worth the name.
-    assert made.additions._explains_more(rubbing, damping, with_interleaved_folds(rubbing).errors)
-    assert made.additions._is_corrected(rubbing, correction)
-    assert not made.additions._is_corrected(rubbing, with_interleaved_folds(rubbing).errors)
-    assert not made.additions._is_corrected(rubbing, None)
+    assert made.additions._explains_more(with_friction, damping, with_interleaved_folds(with_friction).errors)
+    assert made.additions._is_corrected(with_friction, correction)
+    assert not made.additions._is_corrected(with_friction, with_interleaved_folds(with_friction).errors)
+    assert not made.additions._is_corrected(with_friction, None)
 
 
-def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, rubbing):
+def test_a_remainder_that_a_correction_takes_away_is_an_error_of_form(lacking, with_friction):
     made = procedure()
-    left = (rubbing.ratio**2 - 1) / (lacking.ratio**2 - 1)
+    left = (with_friction.ratio**2 - 1) / (lacking.ratio**2 - 1)
     force = replace(CFG.unknown_force, min_share=0.0)
     made.context.cfg = replace(CFG, max_form_error=left + 0.05, form_error_ratio=9.0, unknown_force=force)
-    assert not made.context.is_form_error(rubbing, lacking)
+    assert not made.context.is_form_error(with_friction, lacking)
     made.record.form_corrected = True
-    assert made.context.is_form_error(rubbing, lacking)
+    assert made.context.is_form_error(with_friction, lacking)
     made.context.cfg = replace(made.context.cfg, max_form_error=left - 0.05)
-    assert not made.context.is_form_error(rubbing, lacking)
+    assert not made.context.is_form_error(with_friction, lacking)

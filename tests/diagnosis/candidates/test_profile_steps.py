@@ -1,0 +1,74 @@
+"""Steps of a profile likelihood, with costs that are made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.candidates import profile_likelihood
+from concent_warp.diagnosis.candidates.profile_likelihood import _farthest, _line_search, _roughness, refine_by_profile
+from concent_warp.diagnosis.cfg import ProfileLikelihoodCfg
+from concent_warp.diagnosis.tasks import TaskRunner
+from tests.diagnosis.candidates.made_up_fit import made
+
+ANY: Any = None
+
+
+def point(distance: float, cost: float, rise: float = 0.0, parameter: int = 0) -> Any:
+    """Return a point of a profile."""
+    return SimpleNamespace(parameter=parameter, distance=distance, cost=cost, expected_rise=rise)
+
+
+def test_the_farthest_points_and_the_roughness_of_a_profile_are_those_of_its_parameter():
+    points = [point(2.0, 1), point(-6.0, 2), point(6.0, 3), point(9.0, 4, parameter=1), point(-2.0, 5)]
+    assert _farthest(points, 0, 1.0) is points[2]
+    assert _farthest(points, 0, -1.0) is points[1]
+    assert _farthest(points, 1, -1.0) is None
+    cfg, c = ProfileLikelihoodCfg(), made("c", 0.5, 10.0)
+    near = [point(2.0, 17.0, 2.0), point(-2.0, 13.0, 2.0), point(6.0, 99.0, 1.0), point(2.0, 99.0, 1.0, parameter=1)]
+    assert _roughness(c, near, 0, cfg) == pytest.approx(3.0)
+    assert _roughness(c, near[:1], 0, cfg) == pytest.approx(5.0)
+    assert _roughness(c, [point(2.0, 11.0, 2.0)], 0, cfg) == 0.0
+    assert _roughness(c, near[2:3], 0, cfg) == 0.0
+
+
+def test_a_distance_is_doubled_as_long_as_the_cost_falls(monkeypatch):
+    for costs, end, count in (([9, 8, 8.5, 7], 4.0 * 2, 3), ([9, 8, 7, 6, 5, 4], 2.0 * 16, 4), ([11], 2.0, 1)):
+        left, asked = iter(costs), []
+
+        def evaluate(_base, _c, parameter, distance, _cfg, left=left, asked=asked):
+            asked.append(distance)
+            return point(distance, next(left), parameter=parameter)
+
+        monkeypatch.setattr(profile_likelihood, "profile_point", evaluate)
+        found = _line_search(ANY, ANY, point(2.0, 10.0), ProfileLikelihoodCfg())
+        assert found.distance == end
+        assert asked == [2.0 * 2**k for k in range(1, count + 1)]
+
+
+def test_a_profile_restarts_from_lower_costs_a_few_times(monkeypatch):
+    cfg, seen = ProfileLikelihoodCfg(), []
+    for falls, restarts in (([0.5], 0), ([2.0, 0.0], 1), ([2.0] * 9, 3)):
+        left, done = iter(falls), []
+
+        def profile(_base, c, _runner, _cfg, least, left=left, done=done):
+            done.append(least)
+            return [point(2.0, c.cost - (0.0 if np.isinf(least) else next(left)))]
+
+        monkeypatch.setattr(profile_likelihood, "_profile", profile)
+        monkeypatch.setattr(profile_likelihood, "_line_search", lambda _b, _c, best, _cfg: best)
+        monkeypatch.setattr(profile_likelihood, "_restarted", lambda _b, c, best: replace(c, cost=best.cost))
+        monkeypatch.setattr(profile_likelihood, "_with_spread", lambda _b, c, points, _cfg: (c, len(points)))
+        found: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner(), cfg)
+        assert found[0].cost == 100.0 - 2.0 * restarts
+        assert len(done) == restarts + 1
+        assert np.isinf(done[-1]) == (restarts == 3)
+        seen.append(found[1])
+    assert seen == [1, 1, 1]
+    monkeypatch.setattr(profile_likelihood, "_profile", lambda *_: [])
+    none: Any = refine_by_profile(ANY, made("c", 0.5), TaskRunner())
+    assert none[1] == 0
