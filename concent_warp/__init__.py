@@ -56,6 +56,7 @@ _HOMES = {
     "simulate.engine": ("Rollout",),
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.observation_cfg": ("SensorErrorsCfg",),
     "train.policy.evaluate": ("Evaluation",),
     "train.policy.load": ("Policy", "load_policy"),
     "train.train": ("train",),
@@ -112,6 +113,7 @@ if TYPE_CHECKING:
     from concent_warp.simulate.engine import Rollout
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.observation_cfg import SensorErrorsCfg
     from concent_warp.train.policy.evaluate import Evaluation
     from concent_warp.train.policy.load import Policy, load_policy
     from concent_warp.train.train import train

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,6 +24,8 @@ from concent_warp.events.decode import decode
 from concent_warp.files import write_text
 from concent_warp.run_folder import TRAIN_SETTINGS, plain
 from concent_warp.train.check_cfg import check_cfg
+from concent_warp.train.observation_cfg import ObservationCfg, SensorErrorsCfg
+from concent_warp.train.reset_cfg import ResetCfg
 
 Range = tuple[float, float]
 ALL = "all"
@@ -38,7 +40,7 @@ SETTINGS = TRAIN_SETTINGS
 class ActionCfg:
     """Mapping from an action to commands: each number in -1..1 is a share of the largest step."""
 
-    turn: Positive = 0.02
+    turn: Positive = 0.006
     """Largest step of a hinge joint's command [rad]."""
     slide: Positive = 0.004
     """Largest step of a slide joint's command [m]."""
@@ -52,16 +54,6 @@ class ActionCfg:
     """Actuators that open and close the gripper with one number; names that the scene lacks are ignored."""
     tool_site: str = "tcp"
     """Site between the fingertips: the end-effector."""
-
-
-@dataclass(frozen=True)
-class ObservationCfg:
-    """Observation of the policy (paper, table of appendix C)."""
-
-    slots: Annotated[int, Bounds(1, 10_000)] = 8
-    """Contact slots; of a stage with more demonstrated pairs, those with the widest spread are kept."""
-    noise: float = 0.0
-    """Standard deviation of Gaussian noise on object positions [m]."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +132,7 @@ class CollisionCfg:
     """Penetration of such a sphere that ends the episode [m]."""
     slack: float = 0.0005
     """Reduction of the radii of these spheres [m]: the penetration that contacts of the physics have as well."""
-    depth: float = 50.0
+    depth: float = 1000.0
     """Penalty of a penetration [1/m], summed over the spheres. If it is too small, the policy learns to pass through
     what the physics leaves out."""
     band: float = 0.01
@@ -152,86 +144,6 @@ class CollisionCfg:
     """Random surface points of which farthest point sampling selects `points`."""
     threads: Annotated[int, Bounds(1, 1024)] = 128
     """GPU threads per world."""
-
-
-@dataclass(frozen=True)
-class PostureSolverCfg:
-    """Inverse kinematics of one state by damped least squares from the demonstrated posture."""
-
-    iterations: Count = 20
-    """Largest number of iterations."""
-    damping: float = 1e-4
-    """Damping added to the diagonal of J J^T, with lengths in m and angles in rad."""
-    position: float = 2e-4
-    """Accepted position error [m], well below `ResetCfg.slip`."""
-    angle: float = 2e-3
-    """Accepted orientation error [rad]."""
-
-
-@dataclass(frozen=True)
-class NewtonSolverCfg:
-    """Inverse kinematics of all states at once by Newton's Levenberg-Marquardt solver."""
-
-    iterations: Count = 40
-    """Number of iterations."""
-    seeds: Annotated[int, Bounds(1, 10_000)] = 4
-    """Initial postures per state, of which the best solution is kept."""
-    noise: float = 0.1
-    """Standard deviation of the further initial postures around the demonstrated one [rad or m]."""
-    limit_weight: float = 10.0
-    """Weight of the joint limits against position [1/m] and orientation [1/rad]."""
-    position: float = 3e-4
-    """Accepted position error [m]; larger than that of `PostureSolverCfg`, as the solver works in single precision."""
-    angle: float = 3e-3
-    """Accepted orientation error [rad]."""
-
-
-@dataclass(frozen=True)
-class ResetCfg:
-    """Initial states along the demonstration that keep the contact chain (paper, appendix D)."""
-
-    states: Count = 2048
-    """States sampled before training; each episode starts from one of them."""
-    demonstrated: Share = 0.2
-    """Share of states as demonstrated, without displacement."""
-    position: float = 0.012
-    """Half width of the horizontal displacement [m]."""
-    lift: float = 0.015
-    """Largest upward displacement of a grasped object [m]."""
-    turn: float = 0.15
-    """Half width of the rotation about the vertical [rad]."""
-    grasp_turn: float = 0.15
-    """Half width of the rotation of a grasped object in the hand about the axis between the fingers [rad]: the rotation
-    that contact with an edge causes."""
-    joints: float = 0.05
-    """Half width of the displacement of the arm's joints where no object is grasped [rad or m]."""
-    free: Share = 0.3
-    """In chains of stages, share of initial states of the whole task: the robot as at the start of the demonstration,
-    the objects anywhere. The others are shared equally among the stages."""
-    place: tuple[float, float] = (0.05, 0.03)
-    """In chains, half widths of the squares around the demonstrated positions of objects 1 and 2 [m]."""
-    heading: tuple[float, float] = (0.5, 0.3)
-    """In chains, half widths of the rotations of objects 1 and 2 about the vertical [rad]."""
-    approach: float = 3.0
-    """In chains, factor minus 1 by which the displacement of the hand is larger at the start of the approach to object
-    1 than at its end."""
-    before: Duration = 0.3
-    """Time before the preceding stage from which states are sampled [s]."""
-    settling_time: Annotated[float, Bounds(0, 3600)] = 0.1
-    """Time for which a state is simulated with constant commands before it is accepted [s]."""
-    slip: float = 0.003
-    """Largest accepted motion of a grasped object in the hand during that time [m]."""
-    overlap: float = 0.0015
-    """Penetration of spheres of different objects above which a displaced state is discarded [m]."""
-    passes: Count = 20
-    """Largest number of passes, of `states` candidates each, after which sampling fails."""
-    solver: Literal["auto", "newton", "posture"] = "auto"
-    """Inverse kinematics: "newton" solves all states at once, "posture" one by one; "auto" takes "newton" on a GPU (its
-    kernels take a minute to compile on a CPU)."""
-    posture_solver: PostureSolverCfg = field(default_factory=PostureSolverCfg)
-    """Inverse kinematics of single poses."""
-    newton_solver: NewtonSolverCfg = field(default_factory=NewtonSolverCfg)
-    """Inverse kinematics of batches of poses."""
 
 
 @dataclass(frozen=True)
@@ -250,15 +162,15 @@ class ChainCfg:
 class RandomisationCfg:
     """Domain randomisation; values are sampled once for each world."""
 
-    friction: PositiveInterval = (1.0, 1.0)
+    friction: PositiveInterval = (0.5, 2.0)
     """Factor on the sliding friction of all geoms except the robot's."""
-    grip: PositiveInterval = (1.0, 1.0)
+    grip: PositiveInterval = (0.8, 1.25)
     """Factor on the sliding friction of the robot's geoms; a grasp has the larger friction of object and finger."""
-    stiffness: PositiveInterval = (1.0, 1.0)
+    stiffness: PositiveInterval = (0.9, 1.1)
     """Factor on the stiffness of the position control."""
     damping: PositiveInterval = (1.0, 1.0)
     """Factor on the damping of the joints."""
-    mass: PositiveInterval = (1.0, 1.0)
+    mass: PositiveInterval = (0.9, 1.1)
     """Factor on mass and inertia of the objects."""
     joint_friction: Interval = (0.0, 0.0)
     """Dry friction of the joint with the strongest drive [N m or N]; of others in proportion to their torque limits."""
@@ -266,11 +178,31 @@ class RandomisationCfg:
     """Delay of the arm's commands [s]."""
     lag: Interval = (0.0, 0.0)
     """Time constant of a first-order lag of the arm's set points [s]."""
-    perturbation: tuple[float, float] = (0.0, 0.0)
+    perturbation: tuple[float, float] = (3.0, 0.08)
     """Random force perturbations: standard deviations of a force [N] and a torque [N m] per axis that act on object 1
-    for one action while the stage grasps it; none in evaluations. `TrainCfg.with_perturbations` has values."""
+    for one action while the stage grasps it; none in evaluations."""
     perturbation_share: Share = 0.2
     """Share of actions with random force perturbations."""
+    extremes: bool = False
+    """Whether a value is one of the ends of its range, in place of any value within it."""
+
+
+@dataclass(frozen=True)
+class EdgeCfg:
+    """Small spheres along the edges of the objects, which the spheres of a contact geometry round off.
+
+    They are added to the physics near the spheres of the contact events, at the nominal edges moved as the fit moved
+    the spheres beside them.
+    """
+
+    count: Annotated[int, Bounds(0, 100_000)] = 400
+    """Spheres along all edges of all objects, of which those near touched spheres are taken; 0 for none."""
+    radius: Positive = 0.0015
+    """Their radius [m]."""
+    reach: Positive = 0.01
+    """Largest distance of their centres from that of a touched sphere [m]."""
+    gap: Positive = 0.003
+    """Smallest distance from a small sphere that the contact geometry has there already [m]."""
 
 
 @dataclass(frozen=True)
@@ -298,9 +230,9 @@ class EnvironmentCfg:
     """MuJoCo-Warp or C MuJoCo; "auto" takes MuJoCo-Warp on a GPU and C MuJoCo on a CPU."""
     decimation: Annotated[int, Bounds(1, 100_000)] = 10
     """Time steps of the model per action."""
-    stride: Annotated[int, Bounds(1, 100_000)] = 1
-    """Time steps of the model per simulation step: coarser physics in less time. Contacts need steps of at most half
-    their time constant."""
+    stride: Annotated[int, Bounds(1, 100_000)] | None = None
+    """Time steps of the model per simulation step: coarser physics in less time. By default as many as leave a
+    simulation step at half the time constant of the stiffest contact, which contacts need at least."""
     cone: Literal["auto", "elliptic", "pyramidal"] = "auto"
     """Friction cones; "auto" keeps the model's. Pyramidal cones are faster; their friction is weaker between the axes
     than along them, and grasped objects slip more."""
@@ -340,17 +272,14 @@ class EnvironmentCfg:
     """Reward."""
     virtual: CollisionCfg = field(default_factory=CollisionCfg)
     """Virtual collisions."""
+    edges: EdgeCfg = field(default_factory=EdgeCfg)
+    """Small spheres along edges."""
     reset: ResetCfg = field(default_factory=ResetCfg)
     """Reset states."""
     chain: ChainCfg = field(default_factory=ChainCfg)
     """Stages in turn."""
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
     """Domain randomisation."""
-
-    @property
-    def simulation_steps(self) -> int:
-        """Simulation steps per action."""
-        return self.decimation // self.stride
 
     @property
     def seconds(self) -> float:
@@ -416,6 +345,38 @@ class PpoCfg:
 
 
 @dataclass(frozen=True)
+class StressCfg:
+    """The stress test: episodes in the model's best physics, with friction and masses at the ends of their ranges.
+
+    All spheres and sharp edges are in the physics, cones are elliptic, contacts stiff and steps short.
+    """
+
+    every: Annotated[int, Bounds(0, 1_000_000)] = 50
+    """Iterations between tests during training, of which the best policy is kept; 0 for none. A training that ends
+    before the first keeps its last policy."""
+    episodes: Count = 256
+    """Episodes of a test."""
+    time_constant: Positive = 0.004
+    """Time constant of contacts [s]; softer ones let a policy slide over edges that catch in Reality."""
+    refine: Count = 5
+    """Simulation steps per time step of the model; contacts need steps of at most half their time constant."""
+    friction: PositiveInterval = (0.6, 1.7)
+    """Factors on the sliding friction of the objects, of which a world has one."""
+    grip: PositiveInterval = (0.8, 1.25)
+    """Factors on the sliding friction of the robot's geoms."""
+    stiffness: PositiveInterval = (0.85, 1.15)
+    """Factors on the stiffness of the position control."""
+    mass: PositiveInterval = (0.85, 1.15)
+    """Factors on mass and inertia of the objects."""
+    perturbation: tuple[float, float] = (0.0, 0.0)
+    """Random force perturbations, as in training: standard deviations of force [N] and torque [N m]."""
+    sensors: SensorErrorsCfg = field(default_factory=SensorErrorsCfg)
+    """Errors of the instruments."""
+    edges: EdgeCfg = field(default_factory=EdgeCfg)
+    """Small spheres along edges."""
+
+
+@dataclass(frozen=True)
 class TrainCfg:
     """Settings of a training.
 
@@ -436,31 +397,11 @@ class TrainCfg:
     """The environment."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
     """Settings of PPO."""
+    stress: StressCfg = field(default_factory=StressCfg)
+    """The stress test, by which the policy is chosen."""
 
     def __post_init__(self) -> None:
         check_cfg(self)
-
-    def with_perturbations(self) -> TrainCfg:
-        """Return the settings with random force perturbations on the grasped object in training.
-
-        The perturbations have standard deviations of 3 N and 0.08 N m. Joint steps are at most 6 mrad, friction factors
-        1 to 2.5, grasps rotated by up to 0.3 rad, and the penalty of virtual collisions is 1000 per metre. The values
-        are for insertions of a block of 80 g (docs/benchmarks/train_table1.md).
-
-        Example:
-            >>> import concent_warp as cw
-            >>> cw.TrainCfg().with_perturbations().environment.randomisation.perturbation
-            (3.0, 0.08)
-        """
-        e = self.environment
-        e = replace(
-            e,
-            action=replace(e.action, turn=0.006),
-            virtual=replace(e.virtual, depth=1000.0),
-            reset=replace(e.reset, grasp_turn=0.3),
-            randomisation=replace(e.randomisation, friction=(1.0, 2.5), perturbation=(3.0, 0.08)),
-        )
-        return replace(self, environment=e)
 
     def save(self, path: Path) -> None:
         """Write a TOML file atomically; None values are left out."""

@@ -18,7 +18,7 @@ def check_cfg(cfg: Any) -> None:
     e, p = cfg.environment, cfg.ppo
     if not p.hidden:
         raise TrainError("ppo.hidden is empty", expected="at least one layer")
-    if e.decimation % e.stride:
+    if e.stride is not None and e.decimation % e.stride:
         raise TrainError(
             "an action is not a whole number of simulation steps",
             expected=f"a divisor of the decimation, {e.decimation}",

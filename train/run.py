@@ -16,11 +16,13 @@ from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import plain
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import SETTINGS, TrainCfg
+from concent_warp.train.cfg import SETTINGS, EnvironmentCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
-from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Report, Trainer
+from concent_warp.train.learning.ppo import CHECKPOINT, Examination, Iteration, Report, Trainer
+from concent_warp.train.policy.episodes import PolicyFunction
+from concent_warp.train.policy.stress import StressTest
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.task import Task
 
@@ -106,9 +108,15 @@ class TrainingRun:
             TrainCfg.load(folder / SETTINGS),
         )
 
-    def task(self) -> Task:
-        """Return the task."""
-        return Task.build(self.model, self.recording[0], self.cfg.environment, self.events)
+    def task(self, environment: EnvironmentCfg | None = None) -> Task:
+        """Return the task, by default with the settings of the training's environment."""
+        return Task.build(self.model, self.recording[0], environment or self.cfg.environment, self.events)
+
+    def stress_test(
+        self, *, device: str | None = None, episodes: int | None = None, seed: int | None = None
+    ) -> StressTest:
+        """Return the stress test of this training's policies; see `StressTest`."""
+        return StressTest(self.cfg, self.task, device=device, episodes=episodes, seed=seed)
 
     def evaluation_states(self, task: Task, count: int, seed: int) -> ResetStates:
         """Return initial states for an evaluation, sampled with another seed than those of training.
@@ -164,8 +172,17 @@ def train_run(
                 cfg = replace(cfg, nconmax=buffers[0], njmax=buffers[1])
             return make_environment(task, cfg, states, device=device, seed=seed)
 
+        def examination() -> Examination:
+            test = run.stress_test(device=device)
+
+            def examine(policy: PolicyFunction) -> tuple[int, int]:
+                found = test(policy).success
+                return int(found.sum()), len(found)
+
+            return examine
+
         environment = make()
-        trainer = Trainer(environment, run.cfg, folder, process, make)
+        trainer = Trainer(environment, run.cfg, folder, process, make, examination)
         environment.reset()
         del environment  # the trainer's alone, which frees it where it needs another one
         if resume and folder is not None:

@@ -12,7 +12,7 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.learning.distributed import DistributedProcess
-from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, chosen_weights
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -92,4 +92,4 @@ def train(
             begin_with=None if begin_with is None else begin_with.weights,
             begun=None if claimed is None else begin,
         )
-    return Policy(run, trainer.weights(), folder or Path())
+    return Policy(run, chosen_weights(trainer.weights()), folder or Path())

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -22,10 +22,11 @@ from concent_warp.cli.terminal import quiet_warp
 from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
-from concent_warp.fit.geometry.evolution import EvolutionCfg
 from concent_warp.model import Model
 from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
 from concent_warp.reality.record import RealityCfg, record
+from concent_warp.reality.variation import VariationCfg
+from concent_warp.reality.world import WorldCfg
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
@@ -35,8 +36,8 @@ from concent_warp.scene.spheres.build import ContactGeometryCfg
 HIDDEN = "actuator_delay=0.1"
 """What is hidden in Reality of some cases: commands that act a tenth of a second late. Demonstrations still
 succeed under it, policies that do not know of it fail more often."""
-FIT = FitCfg(evolution=EvolutionCfg(population=40), plateau_generations=20, min_gain=1e-3)
-"""Settings of the fits that the page on Table 1 was made from: more candidates and generations than by default."""
+WORLD_OF_TRIALS = WorldCfg(timestep=5e-4, integrator="Euler")
+"""Reality as policies are tried in it: shorter steps and another integrator than the model's."""
 MODEL, DEMONSTRATION, WORLD = "model.toml", "demonstration.h5", "hidden.txt"
 
 
@@ -81,17 +82,19 @@ class Args:
     hidden: str = HIDDEN
     """Effect that is hidden, with its magnitude."""
     spheres: int = 512
-    fit: FitCfg = FIT
+    edges: int = 0
+    """Further, smaller spheres along edges."""
+    fit: FitCfg = field(default_factory=FitCfg)
 
 
 def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
     """Return a demonstration of Reality, with these effects hidden in it."""
-    cfg = RealityCfg()
+    cfg = RealityCfg(world=WORLD_OF_TRIALS)
     effects = ()
     if hidden:
         world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, parse_effects(hidden))
         effects = tuple(one.effect for one in world.hidden())
-    return record(cfg, [1000 * seed], effects=effects)[0]
+    return record(cfg, [1000 * seed], effects=effects, variation=VariationCfg())[0]
 
 
 def make(case: Case, seed: int, args: Args) -> None:
@@ -104,7 +107,8 @@ def make(case: Case, seed: int, args: Args) -> None:
     recording = demonstrate(seed, (hidden,) if hidden else ())
     scene = Scene(recording.scene)
     placement = "surface" if case.geometry == "surface" else "inset"
-    model = Model(scene, ContactGeometryCfg(count=args.spheres, placement=placement, seed=seed).build(scene))
+    spheres = ContactGeometryCfg(count=args.spheres, edges=args.edges, placement=placement, seed=seed)
+    model = Model(scene, spheres.build(scene))
     if case.added:
         # What acts on the arm shows as well with the shapes as drawn, which are much quicker than spheres.
         drawn, kind = Model(scene), effect_class(args.hidden.split("=")[0])

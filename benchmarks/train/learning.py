@@ -65,7 +65,7 @@ class Args:
     stage: Literal["insert", "all"] = "insert"
     """Insertion alone, or all stages chained."""
     episodes: int = 1000
-    """Episodes of the evaluation in simulation."""
+    """Episodes of the evaluation in simulation, and of the stress test."""
     limit: float | None = None
     """Time after which no training is begun and those that run are stopped, to be gone on with [s]."""
     pack: Path | None = None
@@ -120,6 +120,7 @@ def train_one(args: Args, name: str, seed: int) -> None:
     }
     del trainer
     result["simulation"] = simulated(run, checkpoint, args, device)
+    result["stress"] = stressed(run, checkpoint, args, device)
     write_pretrained(Policy.load(checkpoint), folder / POLICY, overwrite=True)
     write_text(folder / RESULT, json.dumps(result, indent=1))
     print(f"{folder.name}: {result['simulation']['rate']:.2%} after {result['seconds']:.0f} s", flush=True)
@@ -179,6 +180,16 @@ def simulated(run: TrainingRun, checkpoint: Path, args: Args, device: str) -> di
     environment = make_environment(task, cfg, states, device=device)
     policy = replace(Policy.load(checkpoint), run=run)
     found = run_episodes(environment, policy.act_in(environment), states).to_json()
+    return {name: found[name] for name in ("episodes", "successes", "rate", "interval")}
+
+
+def stressed(run: TrainingRun, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
+    """Return what the policy does in the stress test, from other states than those by which it was chosen."""
+    from concent_warp.train.policy.load import Policy
+
+    test = run.stress_test(device=device, episodes=args.episodes, seed=run.cfg.seed)
+    policy = replace(Policy.load(checkpoint), run=run)
+    found = test(policy.act_in(test.environment)).to_json()
     return {name: found[name] for name in ("episodes", "successes", "rate", "interval")}
 
 

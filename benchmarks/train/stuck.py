@@ -23,6 +23,7 @@ import tyro
 
 from benchmarks.pages import machine, machine_line, read_data, table, write_data, write_page
 from benchmarks.train.learning import changed
+from benchmarks.train.table1 import IDEAL
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import ConcentError
@@ -72,7 +73,7 @@ def measure(folder: Path, args: Args) -> dict[str, Any]:
         environment = make_environment(task, cfg, starts, device="cpu")
         return outcomes(environment, policy(environment))[0]
 
-    real = reality_environment(task, trained, states)
+    real = reality_environment(task, trained, states, IDEAL)
     success, failed = outcomes(real, policy(real))
     stuck = ~success & ~failed
     ended = {name: getattr(real.physics, name).numpy().copy() for name in ("qpos", "ctrl")}

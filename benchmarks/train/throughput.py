@@ -44,7 +44,7 @@ from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.warp_engine import preferred_device
 from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.environment.worlds import buffer_sizes, make_environment
+from concent_warp.train.environment.worlds import buffer_sizes, make_environment, simulation_steps
 from concent_warp.train.learning.ppo import Trainer
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.run import TrainingRun
@@ -204,8 +204,8 @@ class Bench:
             parts = profile(environment, actions, args.steps)
             used = memory_used(args.device) - before
             tape = record_states(environment, actions, args.steps)
-            bare, solver = bare_on_states(environment, tape, cfg.simulation_steps)
-            held = bare_rounds(environment, cfg.simulation_steps, args.steps, 2)
+            bare, solver = bare_on_states(environment, tape, simulation_steps(environment.task.compiled, cfg))
+            held = bare_rounds(environment, simulation_steps(environment.task.compiled, cfg), args.steps, 2)
         return {
             **facts(task, cfg),
             **dict(zip(("nconmax", "njmax"), warp_physics(environment).buffers or (), strict=True)),
@@ -280,7 +280,7 @@ def facts(task: Task, cfg: EnvironmentCfg) -> Row:
         "spheres": int(task.collidable.sum()),
         "worlds": cfg.worlds,
         "decimation": cfg.decimation,
-        "stride": cfg.stride,
+        "stride": cfg.decimation // simulation_steps(task.compiled, cfg),
     }
 
 

@@ -9,25 +9,36 @@ from typing import Annotated, Literal
 from concent_warp.checks import Bounds, Count, PositiveShare, Signed, Worlds, check_seed, check_settings
 from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
+from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.render.shadow_cfg import ShadowCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
+from concent_warp.train.observation_cfg import SensorErrorsCfg
 
 WorldName = Literal["simulation", "reality"]
+TrialName = Literal["simulation", "stress", "reality"]
+"""Worlds of an evaluation: "stress" is the stress test."""
 Format = Literal["lerobot", "robomimic"]
 
 
 @dataclass(frozen=True)
 class RealityWorldCfg:
-    """Reality, the world in which a policy is evaluated."""
+    """Reality, the world in which a policy is evaluated.
+
+    By default nobody knows its friction, masses and gains, and the policy sees encoder readings and tracked poses.
+    """
 
     hide: tuple[str, ...] = ()
     """Hidden effects, each as name=value in the unit of its main parameter, such as joint_friction=1.2; an unknown name
     lists the known ones."""
     shapes: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
     """Sizes of block and hole."""
-    reality: WorldCfg = field(default_factory=WorldCfg)
-    """Physics: time step, chamfers, contact stiffness."""
+    reality: WorldCfg = field(default_factory=lambda: WorldCfg(timestep=5e-4, integrator="Euler"))
+    """Physics: time step and integrator, other than the model's, chamfers, contact stiffness."""
+    variation: VariationCfg = field(default_factory=VariationCfg)
+    """Friction, masses and gains, sampled for each world."""
+    sensors: SensorErrorsCfg = field(default_factory=SensorErrorsCfg)
+    """Errors of the instruments that the policy observes through."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +142,7 @@ class RenderCfg:
     """Settings of the lights."""
 
 
-def check_evaluation(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: int = 0) -> None:
+def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0) -> None:
     """Check the settings of an evaluation.
 
     Raises:
@@ -143,7 +154,7 @@ def check_evaluation(cfg: EvaluateCfg, world: WorldName, episodes: int, seed: in
         raise TrainError("the number of episodes is out of bounds", expected="at least 1", found=episodes)
     if not 0 <= cfg.videos <= episodes:
         raise TrainError("the number of videos is out of bounds", expected=f"0 to {episodes}", found=cfg.videos)
-    if parse_effects(cfg.hide) and world == "simulation":
+    if parse_effects(cfg.hide) and world != "reality":
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
-    if cfg.videos and world == "simulation":
+    if cfg.videos and world != "reality":
         raise TrainError("videos are of Reality", fix="add --world reality")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from concent_warp.checks import check_device
-from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check_evaluation
+from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
 from concent_warp.deploy.reality_world import reality_environment, reality_world
 from concent_warp.files import all_or_none
 from concent_warp.reality.hidden.in_task import TaskWorld
@@ -28,7 +28,7 @@ def evaluate(
     policy: Policy,
     cfg: EvaluateCfg | None = None,
     *,
-    world: WorldName = "reality",
+    world: TrialName = "reality",
     episodes: int = 200,
     seed: int = 0,
     device: str | None = None,
@@ -41,8 +41,9 @@ def evaluate(
     Args:
         policy: The policy.
         cfg: Settings: Reality with its hidden effects, the scales of the robot's commands, videos.
-        world: "simulation", the model that the policy was trained in, or "reality": exact convex shapes, elliptic
-            friction cones, shorter time steps, and the effects of `EvaluateCfg.hide`.
+        world: "simulation", the model that the policy was trained in; "stress", the same model under the worse
+            conditions of `StressCfg`; or "reality": exact convex shapes, friction, masses and gains that nobody knows,
+            shorter time steps, and the effects of `EvaluateCfg.hide`.
         episodes: Number of initial states; one episode starts from each.
         seed: Seed of the initial states.
         device: Warp's name of the device for the simulation; the first CUDA device by default, the CPU
@@ -69,13 +70,17 @@ def evaluate(
     videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
     run = policy.run
+    if world == "stress":
+        test = run.stress_test(device=device, episodes=episodes, seed=seed)
+        torch.manual_seed(seed)
+        return test(policy.act_in(test.environment), progress)
     task = run.task()
     states = run.evaluation_states(task, episodes, seed)
     settings = replace(run.cfg.environment, worlds=min(episodes, run.cfg.environment.worlds))
     while True:
         torch.manual_seed(seed)
         if world == "reality":
-            environment = reality_environment(task, settings, states, cfg)
+            environment = reality_environment(task, settings, states, cfg, seed=seed)
         else:
             environment = make_environment(task, settings, states, device=device)
         states_seen = EpisodeStates(len(videos))

@@ -8,6 +8,7 @@ import numpy as np
 
 from concent_warp.deploy.cfg import RealityWorldCfg
 from concent_warp.errors import TrainError
+from concent_warp.reality.fingers import pad_geoms
 from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
 from concent_warp.train.cfg import EnvironmentCfg
 from concent_warp.train.environment.environment import Environment
@@ -28,7 +29,7 @@ def reality_world(task: Task, cfg: EnvironmentCfg, world: RealityWorldCfg) -> Ta
 
 
 def reality_environment(
-    task: Task, cfg: EnvironmentCfg, states: ResetStates, world: RealityWorldCfg | None = None
+    task: Task, cfg: EnvironmentCfg, states: ResetStates, world: RealityWorldCfg | None = None, *, seed: int = 0
 ) -> Environment:
     """Return an environment whose physics is Reality's; success is the block at rest in the hole.
 
@@ -36,7 +37,8 @@ def reality_environment(
         task: Task of the policy.
         cfg: Settings of the training environment.
         states: Initial states of the episodes.
-        world: Hidden effects, sizes and physics of Reality.
+        world: Hidden effects, sizes, physics and instruments of Reality.
+        seed: Seed of what varies between the worlds.
 
     Raises:
         TrainError: Reality has other bodies than the model.
@@ -51,5 +53,8 @@ def reality_environment(
         task = replace(task, target_position=np.array([0.0, 0.0, world.shapes.floor + world.shapes.block_size / 2]))
     steps = round(cfg.decimation * task.replay.timestep / world.reality.timestep)
     actors = [[Actor(one.effect.force, one.effect.command) for one in real.hidden()] for _ in range(cfg.worlds)]
-    physics = MujocoPhysics(model, cfg.worlds, steps, actors=actors)
-    return Environment(task, replace(cfg, collision="full"), physics, states)
+    names = [task.compiled.body(i).name for i in task.objects]
+    pads = pad_geoms(model, cfg.action.gripper_actuators)
+    fields = world.variation.sample(model, names, pads, cfg.worlds, np.random.default_rng([seed, 3]))
+    physics = MujocoPhysics(model, cfg.worlds, steps, actors=actors, fields=fields)
+    return Environment(task, replace(cfg, collision="full"), physics, states, world.sensors)

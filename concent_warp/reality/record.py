@@ -14,14 +14,17 @@ from concent_warp.checks import Bounds, check_seed, check_settings
 from concent_warp.reality.expert.inverse_kinematics import solve_path
 from concent_warp.reality.expert.plan import ExpertCfg, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
+from concent_warp.reality.fingers import pad_geoms
 from concent_warp.reality.run import WorldLog, simulate, simulate_to_rest
 from concent_warp.reality.sensors.camera import CAMERA, record_depth_images
 from concent_warp.reality.sensors.footage import FootageCfg, footage
 from concent_warp.reality.sensors.sensing import SensingCfg, measure, reading_steps
+from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
+from concent_warp.simulate.fields import apply_fields
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,14 @@ def record(
     seeds: list[int],
     *,
     effects: tuple[HiddenEffect, ...] = (),
+    variation: VariationCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, list[Truth]]:
     """Return a recording with one demonstration per seed in the same scene, and the truth of each.
 
     The box has the configured pose in every demonstration; the block's pose and the expert's offsets are sampled from
-    the seed. `progress` is called with the share done, 0..1.
+    the seed. With `variation`, so are friction, masses and gains; by default they are the nominal scene's. `progress`
+    is called with the share done, 0..1.
 
     Raises:
         ConcentError: A seed or a setting is out of bounds.
@@ -91,6 +96,7 @@ def record(
             f"demo_{k}",
             np.random.default_rng(seed),
             effects,
+            variation,
             None if progress is None else lambda share, k=k: progress((k + share) / len(seeds)),
         )
         demonstrations.append(demonstration)
@@ -104,6 +110,7 @@ def _perform(
     name: str,
     rng: np.random.Generator,
     effects: tuple[HiddenEffect, ...],
+    variation: VariationCfg | None,
     progress: Callable[[float], None] | None,
 ) -> tuple[Demonstration, Truth]:
     """Run one demonstration."""
@@ -114,6 +121,11 @@ def _perform(
     world = cfg.world.build(scene, effects)
     model = world.compile()
     data = mujoco.MjData(model)
+    if variation is not None:
+        # A generator of its own, so that all else is the same with and without variation.
+        pads = pad_geoms(model, task.robot.gripper_actuators)
+        fields = variation.sample(model, scene.objects(), pads, 1, rng.spawn(1)[0])
+        apply_fields(model, {name: values[0] for name, values in fields.items()}, data)
     data.qpos[:] = home(model)
     block_joint = model.joint("block_joint").qposadr[0]
     data.qpos[block_joint : block_joint + 2] = block

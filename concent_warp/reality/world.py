@@ -8,12 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
 
 from concent_warp.checks import Positive, TimeStep
 from concent_warp.scene.scene import Scene
+
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,8 @@ class WorldCfg:
 
     timestep: TimeStep = 0.001
     """Step [s]."""
+    integrator: Literal["implicitfast", "implicit", "Euler", "RK4"] = "implicitfast"
+    """Integrator, named as in MJCF."""
     chamfer: float = 0.0015
     """Chamfer of the edges of free box-shaped objects [m]."""
     solref: tuple[Positive, Positive] = (0.003, 1.0)
@@ -46,7 +56,7 @@ class WorldCfg:
         """Return Reality for a nominal scene with hidden effects, ready to be compiled."""
         spec = scene.spec()
         spec.option.timestep = self.timestep
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.integrator = INTEGRATORS[self.integrator]
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 10.0
         spec.option.iterations = 100

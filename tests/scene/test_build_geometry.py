@@ -10,6 +10,8 @@ from concent_warp.scene.shapes.solid import Box
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.build import ContactGeometryCfg, _apportion
 from concent_warp.scene.spheres.disturb import disturb, offset_normal, toward_axis
+from concent_warp.scene.spheres.inset import inset
+from concent_warp.scene.spheres.sampling import farthest_point_sampling
 
 SCENE = Scene(
     """<mujoco><worldbody>
@@ -117,6 +119,74 @@ def test_counts_by_name_and_equal_split_hold():
     assert len(ContactGeometryCfg(count=20).build(SCENE, ["block"])) == 20
 
 
+@pytest.fixture(scope="module")
+def edged():
+    return ContactGeometryCfg(edges=120).build(SCENE)
+
+
+def test_without_edges_spheres_are_inset_surface_points_far_apart(geometry):
+    cfg, names = ContactGeometryCfg(edges=0), ("block", "box")
+    assert cfg.radius != "auto"
+    found = cfg.build(SCENE)
+    for field in ("body", "position", "radius", "mass", "friction"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(geometry, field))
+    for name, seed in zip(names, np.random.SeedSequence(cfg.seed).spawn(2), strict=True):
+        surface = Surface.of_body(SCENE, name)
+        points, _ = surface.sample(cfg.candidates, np.random.default_rng(seed))
+        centres, radius = inset(surface, points, cfg.radius)
+        roomy = radius > cfg.min_radius_share * cfg.radius
+        mine = found.of(name)
+        chosen = farthest_point_sampling(centres[roomy], len(mine))
+        np.testing.assert_array_equal(found.position[mine], centres[roomy][chosen])
+        np.testing.assert_array_equal(found.radius[mine], radius[roomy][chosen])
+
+
+def test_edge_spheres_come_on_top_and_are_shared_by_area(geometry, edged):
+    added = {}
+    for name in geometry.bodies:
+        before, after = geometry.of(name), edged.of(name)
+        added[name] = len(after) - len(before)
+        np.testing.assert_array_equal(edged.position[after][: len(before)], geometry.position[before])
+        np.testing.assert_array_equal(edged.radius[after][: len(before)], geometry.radius[before])
+    assert sum(added.values()) == pytest.approx(120, abs=1)
+    assert added["block"] / 120 == pytest.approx(9600 / (9600 + 26880), abs=0.01)
+
+
+def test_edge_spheres_lie_within_the_object_along_its_edges(geometry, edged):
+    small, half = 0.0015, 0.02
+    for name in geometry.bodies:
+        extra = edged.of(name)[len(geometry.of(name)) :]
+        depth = -Surface.of_body(SCENE, name).signed_distance(edged.position[extra])
+        assert (depth >= edged.radius[extra] * (1 - 1e-9)).all()
+        np.testing.assert_allclose(edged.radius[extra], small, rtol=1e-9)
+    block = edged.of("block")
+    away = half - np.abs(edged.position[block])  # from the faces
+    extra = away[len(geometry.of("block")) :]
+    # Within the least distance from two faces, or hardly more: nearest to an edge.
+    np.testing.assert_allclose(np.sort(extra, axis=1)[:, 0], small, rtol=0.02)
+    assert np.sort(extra, axis=1)[:, 1].max() < 1.3 * small
+    # They reach farther into the edges than others, and are on all twelve.
+    gap = np.linalg.norm(np.sort(away, axis=1)[:, :2], axis=1) - edged.radius[block]
+    others = slice(0, len(geometry.of("block")))
+    assert gap[len(geometry.of("block")) :].max() < gap[others].min()
+    sides = np.where(extra < 2 * small, np.sign(edged.position[block][len(geometry.of("block")) :]), 0)
+    along = {tuple(side) for side in sides if (side != 0).sum() == 2}
+    assert len(along) == 12
+
+
+def test_edge_spheres_have_their_radius_and_are_not_of_spheres_on_the_surface():
+    geometry = ContactGeometryCfg(count=60, edges=20, edge_radius=0.002).build(SCENE, ["block"])
+    assert len(geometry) == 80
+    np.testing.assert_allclose(geometry.radius[60:], 0.002)
+    row = SCENE.model.body("block")
+    assert geometry.mass.sum() == pytest.approx(float(row.mass[0]))
+    np.testing.assert_allclose(geometry.mass @ (geometry.position - row.ipos), 0, atol=1e-9)
+    assert set(geometry.friction) == {0.6}
+    assert len(ContactGeometryCfg(count=60, edges=20, placement="surface").build(SCENE, ["block"])) == 60
+    # Spheres that reach farther into edges and corners themselves leave nothing out.
+    assert len(ContactGeometryCfg(count=60, edges=20, radius=0.0008).build(SCENE, ["block"])) == 60
+
+
 def test_auto_radius_makes_neighbours_touch():
     geometry = ContactGeometryCfg(count=100, radius="auto", placement="surface").build(SCENE, ["block"])
     position = geometry.position
@@ -136,6 +206,8 @@ def test_given_surface_replaces_the_geoms():
     [
         ({"radius": -1.0}, "radius is out of bounds; expected above 0"),
         ({"radius": float("nan")}, "radius is not a number"),
+        ({"edges": -1}, "edges is out of bounds; expected at least 0"),
+        ({"edge_radius": 0.0}, "edge_radius is out of bounds; expected above 0"),
         ({"count": 0}, "count is out of bounds; expected at least 1"),
         ({"friction": -0.1}, "friction is out of bounds; expected at least 0"),
     ],

@@ -13,16 +13,19 @@ from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import Trainer
+from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.run import TrainingRun, train_run
 
+SENSED = replace(SETTINGS, observation=ObservationCfg(), reset=replace(SETTINGS.reset, states=8))
+"""Worlds that the policy observes through sensors."""
 PPO = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)
 
 
 def make_run() -> TrainingRun:
     model = make_model()
     demonstration = make_demonstration(model)
-    environment = replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8))
+    environment = replace(SENSED, worlds=4)
     recording = Recording(model.scene.xml, (demonstration,))
     return TrainingRun(model, recording, make_events(model, demonstration), TrainCfg(environment=environment, ppo=PPO))
 
@@ -37,7 +40,7 @@ def updated(process: DistributedProcess) -> dict[str, torch.Tensor]:
     All steps are one batch and none is sampled, so that the result does not depend on which rank has which worlds.
     """
     count, steps = 4, 6
-    environment = replace(SETTINGS, worlds=count // process.world_size, reset=replace(SETTINGS.reset, states=8))
+    environment = replace(SENSED, worlds=count // process.world_size)
     ppo = PpoCfg(steps=steps, hidden=(16,), epochs=3, batches=1, entropy=0.0)
     task = make_task(environment)
     worlds = make_environment(task, environment, sample_reset_states(task, environment.reset, 0), device="cpu")
@@ -49,13 +52,14 @@ def updated(process: DistributedProcess) -> dict[str, torch.Tensor]:
     sampled = {
         name: torch.randn(steps, count, width, generator=given)[:, mine]
         for name, width in (
-            ("observation", observation["policy"].shape[1]), ("action", worlds.num_actions), ("returns", 1), ("gain", 1)
+            ("policy", observation["policy"].shape[1]), ("truth", observation["truth"].shape[1]),
+            ("action", worlds.num_actions), ("returns", 1), ("gain", 1),
         )
     }  # fmt: skip
     none = torch.zeros(worlds.num_envs)
     with torch.inference_mode():
-        for seen, action in zip(sampled["observation"], sampled["action"].tanh(), strict=True):
-            observation["policy"] = seen.clone()
+        for *seen, action in zip(sampled["policy"], sampled["truth"], sampled["action"].tanh(), strict=True):
+            observation["policy"], observation["truth"] = (part.clone() for part in seen)
             algorithm.act(observation)
             algorithm.transition.actions = action.clone()
             algorithm.transition.actions_log_prob = algorithm.actor.get_output_log_prob(action)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import torch
+from small_insertion import EXACT_STATE, NOTHING_VARIES
 
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.sequence import ContactEvent, ContactEventSequence, ContactPair, Entity, Stage
@@ -24,7 +25,6 @@ from concent_warp.train.cfg import (
     CollisionCfg,
     EngineeredCfg,
     EnvironmentCfg,
-    RandomisationCfg,
     RewardCfg,
 )
 from concent_warp.train.environment.environment import Environment
@@ -103,7 +103,8 @@ SETTINGS = EnvironmentCfg(
     ),
     virtual=CollisionCfg(margin=0.05, severe=0.005, slack=0.001, depth=20.0, band=0.3, points=0),
     chain=ChainCfg(tolerance=0.25, hold=2, rest=0.12),
-    randomisation=RandomisationCfg(),
+    observation=EXACT_STATE,
+    randomisation=NOTHING_VARIES,
 )  # fmt: skip
 
 

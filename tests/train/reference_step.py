@@ -43,6 +43,8 @@ class EpisodeState:
     length: int = 0
     total: float = 0.0
     """Sum of the rewards."""
+    shown: tuple[np.ndarray, ...] = ()
+    """The latest observations, the present one first."""
 
 
 @dataclass
@@ -129,6 +131,12 @@ class Reference:
             goal = d.xpos[b] + turn_b @ table.point_b[stage, k]
             yield int(k), contact, goal, turn_b @ table.normal[stage, k]
 
+    def observe(self, state: WorldState, episode: EpisodeState) -> np.ndarray:
+        """Return what the policy observes at a state; before its first observation an episode has always had it."""
+        present, count = self.observation(state, episode.stage), self.cfg.observation.history
+        episode.shown = (present, *(episode.shown or (present,) * count))[:count]
+        return np.concatenate(episode.shown)
+
     def observation(self, state: WorldState, stage: int) -> np.ndarray:
         """Return the observation of a state."""
         d, robot = self.kinematics(state), self.task.robot
@@ -136,6 +144,8 @@ class Reference:
         slide = [k for k in range(len(robot.joint)) if k not in hinge]
         angles = state.qpos[robot.qpos[hinge]]
         parts = [np.sin(angles), np.cos(angles), state.qpos[robot.qpos[slide]], state.qvel[robot.dof]]
+        if self.cfg.observation.leads:
+            parts.append((state.ctrl[robot.actuator] - state.qpos[robot.qpos]) / robot.lead)
         if len(robot.gripper):
             driven = [self.m.jnt_qposadr[self.m.actuator_trnid[i, 0]] for i in robot.gripper]
             parts += [[state.qpos[driven].mean()], [state.ctrl[robot.gripper].mean()]]

@@ -11,7 +11,9 @@ from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EnvironmentCfg, ResetCfg
+from concent_warp.train.cfg import ALL, ActionCfg, CollisionCfg, EdgeCfg, EnvironmentCfg, RandomisationCfg
+from concent_warp.train.observation_cfg import ObservationCfg, SensorErrorsCfg
+from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.task.task import Task
 
 HOLE = 0.12
@@ -78,6 +80,13 @@ WAYPOINTS = (
     (0.4, HOLE, 0, LOW + 0.003, SHUT),
 )
 
+EXACT_STATE = ObservationCfg(sensors=SensorErrorsCfg(exact=True))
+"""Observation of the true state."""
+NOTHING_VARIES = RandomisationCfg(
+    friction=(1.0, 1.0), grip=(1.0, 1.0), stiffness=(1.0, 1.0), mass=(1.0, 1.0), perturbation=(0.0, 0.0)
+)
+"""The model's own physics in all worlds, without random force perturbations."""
+
 SETTINGS = EnvironmentCfg(
     worlds=32,
     engine="mujoco",
@@ -88,6 +97,10 @@ SETTINGS = EnvironmentCfg(
     # Few and large spheres follow the hole's edges loosely: most of what they penetrate by is no collision, and true
     # surfaces get farther into one another than a tight fit allows.
     virtual=CollisionCfg(depth=10.0, points=0),
+    observation=EXACT_STATE,
+    randomisation=NOTHING_VARIES,
+    stride=1,
+    edges=EdgeCfg(count=0),
 )
 
 

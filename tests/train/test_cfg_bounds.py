@@ -12,11 +12,12 @@ from concent_warp.train.environment.worlds import check_worlds, make_environment
 
 NUMBERS = sorted(
     {name for name, value, _ in _settings(TrainCfg(target=0.5)) if type(value) in (int, float)}
-    | {"environment.nconmax"}
+    | {"environment.nconmax", "environment.stride"}
 )
 COUNTS = (
     "checkpoint", "environment.worlds", "environment.decimation", "environment.stride", "environment.nconmax",
     "environment.njmax", "environment.solver_iterations", "environment.ls_iterations", "environment.observation.slots",
+    "environment.observation.history", "environment.reset.stuck.states", "stress.episodes", "stress.refine",
     "environment.virtual.candidates", "environment.virtual.threads",
     "environment.reset.states", "environment.reset.passes", "environment.reset.posture_solver.iterations",
     "environment.reset.newton_solver.iterations", "environment.reset.newton_solver.seeds", "environment.chain.hold",
@@ -27,13 +28,16 @@ POSITIVE = (
     "environment.episode", "environment.success", "environment.dropped", "environment.lost", "environment.max_position",
     "environment.max_velocity", "environment.buffer_factor", "environment.action.turn", "environment.action.slide",
     "environment.action.gripper", "environment.action.turn_lead", "environment.action.slide_lead",
-    "environment.chain.tolerance", "ppo.learning_rate", "ppo.std", "ppo.max_mean", "ppo.max_observation", "ppo.clip",
+    "environment.chain.tolerance", "environment.reset.stuck.within",
+    "environment.edges.radius", "environment.edges.reach",
+    "ppo.learning_rate", "ppo.std", "ppo.max_mean", "ppo.max_observation", "ppo.clip",
     "ppo.divergence", "ppo.gradient",
 )  # fmt: skip
 """Settings above 0."""
 SHARES = (
     "target", "environment.randomisation.perturbation_share", "environment.reset.demonstrated",
-    "environment.reset.free", "ppo.discount", "ppo.lam",
+    "environment.reset.free", "environment.reset.stuck.share", "environment.observation.sensors.constant_share",
+    "environment.observation.sensors.dropout", "ppo.discount", "ppo.lam",
 )  # fmt: skip
 """Settings from 0 to 1."""
 SIGNED = ("environment.reward.engineered.hole", "environment.reward.engineered.seat")

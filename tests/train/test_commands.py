@@ -6,12 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+from small_insertion import NOTHING_VARIES, SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect, Parameter
 from concent_warp.effects.library.drives import ActuatorDelay, ActuatorLag, DriveEffect
 from concent_warp.errors import TrainError
-from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
 from concent_warp.train.environment.world_effects import sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics, make_environment
@@ -107,7 +106,7 @@ def test_each_world_moves_by_its_own_delay_and_lag(delayed_task, engine):
 
 
 def test_saved_state_has_what_was_commanded(delayed_task, states):
-    cfg = replace(SETTINGS, worlds=3, randomisation=RandomisationCfg(delay=(0.05, 0.1), lag=(0.0, 0.05)))
+    cfg = replace(SETTINGS, worlds=3, randomisation=replace(NOTHING_VARIES, delay=(0.05, 0.1), lag=(0.0, 0.05)))
     environment = make_environment(delayed_task, cfg, states, device="cpu")
     act = torch.ones(3, environment.num_actions)
     environment.start_from([0, 1, 2])
@@ -125,7 +124,7 @@ def test_saved_state_has_what_was_commanded(delayed_task, states):
 
 
 def test_sampled_delay_is_of_the_arm_alone(task):
-    cfg = replace(SETTINGS, worlds=4, randomisation=RandomisationCfg(delay=(0.05, 0.05)), decimation=2)
+    cfg = replace(SETTINGS, worlds=4, randomisation=replace(NOTHING_VARIES, delay=(0.05, 0.05)), decimation=2)
     physics = _make_physics(task, cfg, device="cpu")
     physics.qpos[:] = torch.as_tensor(task.replay.qpos[0])
     physics.ctrl[:] = torch.as_tensor(task.replay.ctrl[0], dtype=torch.float32)

@@ -7,13 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from small_insertion import SETTINGS, make_demonstration, make_events, make_model
+from small_insertion import NOTHING_VARIES, SETTINGS, make_demonstration, make_events, make_model
 
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.library.joints import JointDamping, Stribeck
 from concent_warp.effects.library.measurement import Latency
 from concent_warp.effects.library.objects import Mass, Size
-from concent_warp.train.cfg import RandomisationCfg
 from concent_warp.train.environment.randomisation import sample_model_fields
 from concent_warp.train.environment.world_effects import _sample_parameters, sample_world_effects
 from concent_warp.train.environment.worlds import _make_physics
@@ -143,7 +142,7 @@ def test_what_is_compiled_in_is_kept_and_said_so():
 
 
 def test_factors_are_on_top_of_effects(varied):
-    cfg = RandomisationCfg(damping=(2.0, 2.0000001))
+    cfg = replace(NOTHING_VARIES, damping=(2.0, 2.0000001))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         fields = sample_world_effects(varied, WORLDS, 0, sample=True).fields

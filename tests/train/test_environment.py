@@ -13,7 +13,7 @@ from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.physics import WarpPhysics, _compiled_or_plain
 from concent_warp.train.environment.randomisation import sample_model_fields
-from concent_warp.train.environment.worlds import _make_physics, make_environment
+from concent_warp.train.environment.worlds import _make_physics, make_environment, simulation_steps
 
 
 def still(environment: Environment) -> torch.Tensor:
@@ -285,6 +285,23 @@ def test_longer_steps_and_pyramids_keep_the_control_period_and_follow_the_same_c
     # Drives answer a little otherwise in longer steps.
     torch.testing.assert_close(found[0], found[1], atol=1e-3, rtol=0)
     assert not torch.equal(found[0], found[1])
+
+
+def test_steps_are_by_default_as_long_as_the_stiffest_contact_allows():
+    xml = """<mujoco><option timestep="{step}"/><worldbody>
+    <body><freejoint/><geom size="0.1" solref="{constant} 1"/><geom size="0.2" solref="0.04 1"/>
+    <geom size="0.3" solref="0.001 1" contype="0" conaffinity="0"/><geom size="0.4" solref="-1e4 -100"/></body>
+    </worldbody></mujoco>"""
+
+    def steps(step: float, constant: float, stride: int | None = None) -> int:
+        m = mujoco.MjModel.from_xml_string(xml.format(step=step, constant=constant))
+        return simulation_steps(m, replace(SETTINGS, decimation=12, stride=stride))
+
+    assert [steps(0.001, constant) for constant in (0.001, 0.002, 0.004, 0.0079, 0.008, 0.011, 0.02, 0.04)] == [
+        12, 12, 6, 4, 3, 3, 2, 1,
+    ]  # fmt: skip
+    assert steps(0.005, 0.02) == 6
+    assert steps(0.001, 0.02, stride=3) == 4
 
 
 def test_operations_that_no_compiler_fuses_are_carried_out_one_by_one():

@@ -1,18 +1,25 @@
 """Effects hidden in the world in which a policy is tried."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from small_insertion import EXACT_STATE, SETTINGS
 
 from concent_warp.cli import main
+from concent_warp.deploy.cfg import RealityWorldCfg
+from concent_warp.deploy.reality_world import reality_environment
 from concent_warp.errors import ConcentError
-from concent_warp.reality.hidden.in_task import APPLICABLE, TaskWorld, pad_geoms, parse_effects
+from concent_warp.reality.fingers import pad_geoms
+from concent_warp.reality.hidden.in_task import APPLICABLE, TaskWorld, parse_effects
 from concent_warp.reality.rigs.grasp import SCENE
+from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.scene.scene import Scene
 from concent_warp.train.environment.physics import Actor, MujocoPhysics
+from concent_warp.train.observation_cfg import ObservationCfg
 
 MAGNITUDES = {
     "stribeck_friction": 5.0,
@@ -118,3 +125,33 @@ def test_unknown_effects_are_refused_before_anything_runs(capsys):
 def test_pads_are_the_geoms_of_all_fingers():
     assert pad_geoms(SCENE.model, ["gripper"]) == ("left_pad", "right_pad")
     assert pad_geoms(SCENE.model, ["nothing"]) == ()
+
+
+def test_friction_of_reality_differs_between_worlds_and_seeds_unless_it_is_switched_off(task, states):
+    block, known = task.compiled.body("block").geomadr[0], RealityWorldCfg(variation=VariationCfg(enabled=False))
+
+    def frictions(seed: int, world: RealityWorldCfg | None = None) -> list[float]:
+        environment = reality_environment(task, replace(SETTINGS, worlds=4), states, world, seed=seed)
+        physics = environment.physics
+        assert isinstance(physics, MujocoPhysics)
+        assert physics.model.opt.timestep == pytest.approx(5e-4)
+        assert environment.control_step == pytest.approx(physics._decimation * 5e-4) == pytest.approx(0.05)
+        return [float(m.geom_friction[block, 0]) for m in physics._models]
+
+    first = frictions(0)
+    low, high = VariationCfg().friction
+    assert len(set(first)) == 4
+    assert all(low <= value <= high for value in first)
+    assert frictions(0) == first
+    assert not set(frictions(1)) & set(first)
+    assert len(set(frictions(0, known))) == 1
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_policy_observes_reality_through_its_own_sensors(task, states, exact):
+    """The settings of the training's sensors do not matter."""
+    trained = EXACT_STATE if not exact else ObservationCfg()
+    world = RealityWorldCfg(sensors=EXACT_STATE.sensors) if exact else RealityWorldCfg()
+    environment = reality_environment(task, replace(SETTINGS, worlds=2, observation=trained), states, world)
+    assert (environment.estimate is None) == exact
+    assert ("truth" in environment.get_observations().keys()) != exact  # noqa: SIM118

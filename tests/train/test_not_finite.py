@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_insertion import SETTINGS
+from small_insertion import NOTHING_VARIES, SETTINGS
 
 from concent_warp.errors import TrainError
-from concent_warp.train.cfg import PpoCfg, RandomisationCfg, TrainCfg
+from concent_warp.train.cfg import PpoCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, Trainer
+from concent_warp.train.observation_cfg import ObservationCfg
 
 WORLD, WORLDS = 2, 6
 NAN = float("nan")
@@ -22,9 +23,10 @@ engines = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 def made(task, states, engine: str) -> Environment:
     torch.manual_seed(0)
-    # Commands that act late are kept for a while, and must be forgotten with the rest of a world.
-    late = RandomisationCfg(delay=(0.01, 0.02))
+    # Late commands and tracked poses are kept for a while, and must be forgotten with the rest of a world.
+    late = replace(NOTHING_VARIES, delay=(0.01, 0.02))
     cfg = replace(SETTINGS, worlds=WORLDS, engine=engine, decimation=2, episode=0.4, randomisation=late)
+    cfg = replace(cfg, observation=ObservationCfg())
     return make_environment(task, cfg, states, device="cpu")
 
 

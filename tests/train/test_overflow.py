@@ -16,6 +16,7 @@ from concent_warp.train.environment import worlds as worlds_module
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import read_curve
 from concent_warp.train.learning.ppo import CHECKPOINT, load_checkpoint
+from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
 
@@ -29,6 +30,7 @@ def made(contacts: int, constraints: int, iterations: int = 4) -> TrainingRun:
         worlds=WORLDS,
         engine="warp",
         decimation=2,
+        observation=ObservationCfg(),
         reset=replace(SETTINGS.reset, states=8),
         nconmax=contacts,
         njmax=constraints,

@@ -97,11 +97,3 @@ def test_resumed_environment_samples_the_same_perturbations(task, states):
         found.append((acted(environment), environment.observation.clone()))
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
-
-
-def test_preset_perturbs_grasped_objects_and_keeps_other_settings():
-    cfg = TrainCfg(seed=4, environment=PERTURBED).with_perturbations()
-    assert (cfg.seed, cfg.environment.worlds) == (4, PERTURBED.worlds)
-    assert cfg.environment.randomisation.perturbation == (3.0, 0.08)
-    assert cfg.environment.randomisation.perturbation_share == 0.5
-    assert cfg.environment.action.turn == 0.006

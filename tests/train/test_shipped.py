@@ -72,7 +72,8 @@ def test_policies_that_come_with_the_package_say_where_they_are_from_and_are_sma
         assert sum(file.stat().st_size for file in (FOLDER / name).iterdir()) < 1.5e6
         run = TrainingRun.load(FOLDER / name)
         weights = torch.load(pretrained_checkpoint(name), weights_only=True)["actor_state_dict"]
-        assert weights["obs_normalizer._mean"].shape[1] == ObservationLayout.of(run.task()).size
+        layout = ObservationLayout.of(run.task(), run.cfg.environment.observation)
+        assert weights["obs_normalizer._mean"].shape[1] == layout.size
 
 
 def test_policy_made_for_shipping_is_the_runs_own_in_the_same_task(folder, tmp_path):

@@ -14,10 +14,13 @@ from made_up_task import (
     make_environment,
     make_task,
 )
+from small_insertion import EXACT_STATE
 
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import PairTable
 from concent_warp.train.environment.environment import TERMS, Environment
+from concent_warp.train.environment.state_estimate import FIRST_FRAMES
+from concent_warp.train.observation_cfg import ObservationCfg, SensorErrorsCfg
 from concent_warp.train.task.task import Task
 
 EXACT = changed(
@@ -379,20 +382,41 @@ def test_any_flag_of_dropped_contacts_is_an_overflow():
     assert not physics.overflow.any()
 
 
-def test_noise_is_of_its_deviation_on_object_positions_alone():
-    task, rng = make_task(SETTINGS), np.random.default_rng(0)
-    plain, noisy = (
-        make_environment(task, changed(SETTINGS, worlds=100, observation={"noise": noise}), made_up_states(task, 1))[0]
-        for noise in (0.0, 0.02)
+def test_sensor_errors_are_of_their_deviations_on_what_is_measured_alone():
+    task, count = make_task(SETTINGS), 300
+    sensors = SensorErrorsCfg(encoder_std=0.001, encoder_step=0.0, position_std=0.02, orientation_std=0.0, rate=20.0)
+    states = made_up_states(task, 1)
+    torch.manual_seed(0)
+    plain, sensed = (
+        make_environment(task, changed(SETTINGS, worlds=count, observation=observation), states)[0]
+        for observation in ({}, {"sensors": sensors, "smoothing": 0.1})
     )
-    torch.manual_seed(int(rng.integers(100)))
-    away = noisy.get_observations()["policy"] - plain.get_observations()["policy"]
-    for name in ("object 1", "object 2", "object 3"):
-        columns = noisy.layout.columns(name)
-        shift = away[:, columns][:, :3]
-        assert float(shift.std()) == pytest.approx(0.02, rel=0.15)
-        away[:, columns.start : columns.start + 3] = 0
-    assert not away.any()
+    assert list(plain.get_observations().keys()) == ["policy"]
+    assert torch.equal(sensed.get_observations()["truth"], plain.observation)
+    away = sensed.get_observations()["policy"] - plain.observation
+    gain = 1 - np.exp(-1 / (20.0 * 0.1))
+    # At the start an estimate has the errors that averaging leaves: of free objects those of a moving average, of the
+    # fixed one those of the mean of its frames so far.
+    left = {"object 1": gain / (2 - gain), "object 2": 1 / FIRST_FRAMES, "object 3": gain / (2 - gain)}
+    for name, share in left.items():
+        columns = sensed.layout.columns(name)
+        expected = 0.02 * np.sqrt(0.25 + 0.75 * share)
+        shift = away[:, columns.start : columns.start + 3]
+        assert shift.std(dim=0).tolist() == pytest.approx([expected] * 3, rel=0.15), name
+        assert shift.mean(dim=0).abs().max() < 4 * expected / np.sqrt(count), name
+        assert not away[:, columns.start + 3 : columns.stop].any(), name
+    lead = away[:, sensed.layout.columns("command leads")] * torch.as_tensor(task.robot.lead)
+    assert lead.std(dim=0).tolist() == pytest.approx([0.001] * 2, rel=0.15)
+    assert sensed.layout.columns("joint velocities").stop == sensed.layout.columns("command leads").start
+    velocity = sensed.get_observations()["policy"][:, sensed.layout.columns("joint velocities")]
+    assert not velocity.any()
+    assert not away[:, sensed.layout.columns("gripper command")].any()
+    assert 0 < float(away[:, sensed.layout.columns("end effector")].abs().max()) < 0.01
+    used = torch.as_tensor(task.table.used[states.stage[0]])
+    slots = away[:, sensed.layout.base :].reshape(count, len(used), -1)
+    assert not slots[:, ~used].any()
+    assert not slots[:, used, 0].any()
+    assert slots[:, used, 1:10].ne(0).float().mean(dim=0).min() > 0.95
 
 
 def test_parts_in_their_order_are_a_step():
@@ -415,25 +439,36 @@ def test_parts_in_their_order_are_a_step():
     torch.testing.assert_close(other.reward, pair[0][0].reward, rtol=0, atol=0)
 
 
-def test_state_comes_back_and_one_that_lacks_a_part_or_is_of_another_shape_is_refused():
-    task, rng = make_task(SETTINGS), np.random.default_rng(0)
-    environment, physics = make_environment(task, SETTINGS, made_up_states(task))
+@pytest.mark.parametrize("observation", [EXACT_STATE, ObservationCfg(history=2)])
+def test_state_comes_back_and_one_that_lacks_a_part_or_is_of_another_shape_is_refused(observation):
+    cfg = replace(SETTINGS, observation=observation)
+    task, rng = make_task(cfg), np.random.default_rng(0)
+    environment, physics = make_environment(task, cfg, made_up_states(task))
     for _ in range(3):
         physics.chosen = made_up_qpos(task, rng, SETTINGS.worlds), rng.normal(size=(SETTINGS.worlds, task.compiled.nv))
         environment.step(torch.ones(SETTINGS.worlds, 3))
-    state, shown = environment.state(), environment.observation.clone()
+    state, shown = environment.state(), environment.get_observations()
     buffers = environment._state()
-    assert set(state) == {
+    names = {
         "qpos", "qvel", "ctrl", "warmstart", "mocap position", "mocap quaternion", "length", "return", "stage",
-        "from start", "stages met", "steps within", "steps at rest", "success average",
+        "from start", "stages met", "steps within", "steps at rest", "success average", "history", "stuck qpos",
+        "stuck qvel", "stuck ctrl", "stuck mocap position", "stuck mocap quaternion", "stuck stage", "stuck stored",
+        "stuck best distance", "stuck waited",
     }  # fmt: skip
+    estimated = {
+        "past position", "past orientation", "past hand", "past turn", "position", "orientation", "constant", "seen",
+        "read", "clock", "newest", "latency", "phase", "qpos", "qvel", "mocap position", "mocap orientation",
+    }  # fmt: skip
+    assert set(state) == names | ({f"estimated {name}" for name in estimated} if environment.estimate else set())
     for name, value in buffers.items():
         assert value.data_ptr() != state[name].data_ptr()
         value.zero_()
     environment.restore(state)
     for name, value in buffers.items():
         torch.testing.assert_close(value, state[name], rtol=0, atol=0)
-    torch.testing.assert_close(environment.observation, shown, rtol=0, atol=0)
+    assert set(environment.get_observations().keys()) == set(shown.keys())
+    for name, value in environment.get_observations().items():
+        torch.testing.assert_close(value, shown[name], rtol=0, atol=0)
     with pytest.raises(TrainError, match="more"):
         environment.restore({**state, "more": torch.zeros(1)})
     del state["stage"], state["ctrl"]

@@ -17,6 +17,8 @@ CASES = {
     "one stage": (changed(reward={"vcp": 0.4, "lenience": 0.9}), {"first": 2, "empty": 1}),
     "engineered": (changed(reward={"kind": "engineered"}, collision="full"), {"first": 1, "last": 1}),
     "without pairs": (SETTINGS, {"empty": 1}),
+    "history": (changed(observation={"history": 3}), {"first": 1}),
+    "no leads": (changed(observation={"leads": False, "history": 2}), {}),
     "one object": (
         changed(action={"gripper_actuators": ()}, lost=0.01, chain={"hold": 1}),
         {"objects": ("block",), "target": None},
@@ -48,6 +50,8 @@ def test_steps_are_those_of_the_reference(case):
     reference = Reference(task, cfg)
     rows = np.arange(cfg.worlds) % len(states.qpos)
     episodes = [reference.begin(states, row)[1] for row in rows]
+    for world, episode in enumerate(episodes):
+        reference.observe(of_world(physics, world), episode)
     rng, seen = np.random.default_rng(len(case)), Counter()
     physics.dropping = 6
     assert environment.max_episode_length == reference.steps > 3
@@ -104,7 +108,7 @@ def test_steps_are_those_of_the_reference(case):
         assert environment._stages_met.tolist() == [one.met for one in episodes]
         assert environment.episode_length_buf.tolist() == [one.length for one in episodes]
         close(environment._return, [one.total for one in episodes])
-        expected = [reference.observation(of_world(physics, i), episodes[i].stage) for i in range(cfg.worlds)]
+        expected = [reference.observe(of_world(physics, i), episodes[i]) for i in range(cfg.worlds)]
         close(observation["policy"], expected, atol=1e-5)
         if step in (4, STEPS - 1):
             log = environment.read_log()

@@ -4,17 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_insertion import SETTINGS, make_demonstration, make_model, make_task
+from small_insertion import EXACT_STATE, SETTINGS, make_demonstration, make_model, make_task
 
 from concent_warp.errors import TrainError
 from concent_warp.model import Model
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.spheres.build import ContactGeometryCfg
-from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, ResetCfg, TrainCfg
+from concent_warp.train.cfg import ActionCfg, EnvironmentCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.environment.physics import MujocoPhysics
+from concent_warp.train.observation_cfg import ObservationCfg
+from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.task.slots import _select_pairs
 from concent_warp.train.task.task import Task
@@ -29,8 +31,8 @@ def sorter() -> Task:
 
 
 def test_observation_of_the_shape_sorter_is_the_papers_table(sorter):
-    layout = ObservationLayout.of(sorter)
-    assert layout.parts == (
+    layout = ObservationLayout.of(sorter, ObservationCfg(leads=False))
+    paper = (
         ("joint angles", 14),
         ("joint velocities", 7),
         ("gripper opening", 1),
@@ -40,21 +42,28 @@ def test_observation_of_the_shape_sorter_is_the_papers_table(sorter):
         ("object 2", 9),
         *((f"slot {i}", 13) for i in range(8)),
     )
+    assert layout.parts == paper
     assert layout.base == 44
     assert layout.size == 148
+    with_leads = ObservationLayout.of(sorter, ObservationCfg())
+    assert with_leads.parts == (*paper[:2], ("command leads", 7), *paper[2:])
+    assert with_leads.base == 51
+    assert with_leads.size == 155
     assert sorter.robot.actions == 8
 
 
 def test_observation_of_the_shape_sorter_reads_the_state(sorter):
     states = sample_reset_states(sorter, ResetCfg(), 0, count=2)
     physics = MujocoPhysics(sorter.compiled, 2, 10)
-    environment = Environment(sorter, EnvironmentCfg(worlds=2), physics, states)
+    environment = Environment(sorter, EnvironmentCfg(worlds=2, observation=EXACT_STATE), physics, states)
     environment.start_from([0, 1])
     shown, layout = environment.observation.numpy(), environment.layout
     arm = states.qpos[:, :7]
     np.testing.assert_allclose(
         shown[:, layout.columns("joint angles")], np.hstack([np.sin(arm), np.cos(arm)]), atol=1e-6
     )
+    leads = (states.ctrl[:, sorter.robot.actuator] - arm) / sorter.robot.lead
+    np.testing.assert_allclose(shown[:, layout.columns("command leads")], leads, atol=1e-5)
     fingers = states.qpos[:, 7:9].mean(axis=1)
     np.testing.assert_allclose(shown[:, layout.columns("gripper opening")][:, 0], fingers, atol=1e-6)
     np.testing.assert_allclose(shown[:, layout.columns("gripper command")][:, 0], states.ctrl[:, 7], atol=1e-6)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_insertion import SETTINGS, make_demonstration, make_model
+from small_insertion import EXACT_STATE, SETTINGS, make_demonstration, make_model
 
 from concent_warp.cli import main
 from concent_warp.errors import TrainError
@@ -14,11 +14,12 @@ from concent_warp.events.extract import extract
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.simulate.mujoco_engine import MujocoEngine
-from concent_warp.train.cfg import PpoCfg, TrainCfg
+from concent_warp.train.cfg import PpoCfg, StressCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
 from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, load_checkpoint
+from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
@@ -32,8 +33,8 @@ def made() -> TrainingRun:
     model = make_model()
     recording = Recording(model.scene.xml, (make_demonstration(model),))
     events = extract(model, recording[0], MujocoEngine(model, threads=1))
-    cfg = TrainCfg(environment=replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8)), ppo=SHORT)
-    return TrainingRun(model, recording, events, cfg)
+    environment = replace(SETTINGS, worlds=4, reset=replace(SETTINGS.reset, states=8), observation=ObservationCfg())
+    return TrainingRun(model, recording, events, TrainCfg(environment=environment, ppo=SHORT))
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
@@ -41,13 +42,14 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def test_insertion_is_learnt_from_contact_events_on_a_cpu(made):
-    cfg = TrainCfg(environment=SETTINGS, ppo=LEARNING)
+    settings = replace(SETTINGS, observation=replace(EXACT_STATE, leads=False))
+    cfg = TrainCfg(environment=settings, ppo=LEARNING, stress=StressCfg(every=0))
     trainer, last = train_run(replace(made, cfg=cfg), None, device="cpu")
     assert last is not None
     assert last.seconds < 120
     task = made.task()
     states = replace(made, cfg=cfg).evaluation_states(task, 64, 0)
-    environment = make_environment(task, SETTINGS, states, device="cpu")
+    environment = make_environment(task, settings, states, device="cpu")
     torch.manual_seed(1)
     untrained = run_episodes(environment, lambda o: 2 * torch.rand(len(o["policy"]), 4) - 1, states)
     trained = run_episodes(environment, trainer.policy(), states)

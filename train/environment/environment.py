@@ -22,6 +22,7 @@ from concent_warp.checkpoint_file import check_state
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg
+from concent_warp.train.environment.initial_states import InitialStates
 from concent_warp.train.environment.observation import BaseObservation, ObservationLayout
 from concent_warp.train.environment.physics import Graph, Physics, captured
 from concent_warp.train.environment.quaternions import invert_quaternion, rotate_vectors
@@ -31,7 +32,9 @@ from concent_warp.train.environment.reward import (
     engineered_reward,
     relative_pose,
 )
+from concent_warp.train.environment.state_estimate import StateEstimate
 from concent_warp.train.environment.virtual_collision import virtual_collision
+from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
 
@@ -49,7 +52,14 @@ class Environment(VecEnv):
     stage follows when the target is met (`ChainCfg`); the episode ends when object 1 is at rest in place.
     """
 
-    def __init__(self, task: Task, cfg: EnvironmentCfg, physics: Physics, states: ResetStates) -> None:
+    def __init__(
+        self,
+        task: Task,
+        cfg: EnvironmentCfg,
+        physics: Physics,
+        states: ResetStates,
+        sensors: SensorErrorsCfg | None = None,
+    ) -> None:
         """Create the environment and start an episode in all worlds.
 
         Args:
@@ -57,47 +67,77 @@ class Environment(VecEnv):
             cfg: Settings.
             physics: The simulated worlds, with the bodies, joints, actuators and sites of the task's model.
             states: Initial states.
+            sensors: Errors of the instruments that the policy observes through; those of the settings by default.
         """
-        self.task, self.physics, self.layout = task, physics, ObservationLayout.of(task)
+        self.task, self.physics, self.layout = task, physics, ObservationLayout.of(task, cfg.observation)
         self.num_envs, self.num_actions, self.device = physics.worlds, task.robot.actions, physics.device
         self.control_step = cfg.decimation * task.replay.timestep
         """Time between actions [s]."""
         self.max_episode_length = max(1, round(cfg.seconds / self.control_step))
         self.cfg = asdict(cfg)
-        self._settings, self._states = cfg, states
+        self._settings = cfg
+        self.perturbs_trials = False
+        """Whether random forces act on the grasped object in evaluations too."""
+        self._initial = InitialStates(states, cfg.reset.stuck, self.num_envs, self.device, self.control_step)
         self._make_tables()
         self._make_buffers()
-        self._base = BaseObservation(task, physics, cfg.observation.noise)
+        self._base = BaseObservation(task, self.device, cfg.observation)
+        sensors = sensors or cfg.observation.sensors
+        self.estimate = (
+            None if sensors.exact else StateEstimate(task, physics, cfg.observation, sensors, self.control_step)
+        )
+        """State as the policy observes it; None where it observes the true one."""
         warp_device = wp.device_from_torch(self.device)
         with wp.ScopedDevice(warp_device):
             stage = wp.from_torch(self.stage)
-            self._observation = wp.zeros((self.num_envs, self.layout.size), dtype=float)
-            self._pairs = ContactPairs(
-                task.table,
-                *physics.poses(),
-                stage,
-                amplitude=(cfg.reward.far[0], cfg.reward.near[0]),
-                sigma=(cfg.reward.far[1], cfg.reward.near[1]),
-                features=cast(wp.array, self._observation[:, self.layout.base :]),
-            )
+            size = self.num_envs, self.layout.size
+            truth = wp.zeros(size, dtype=float)
+            observation = truth if self.estimate is None else wp.zeros(size, dtype=float)
+            self._pairs = self._contact_pairs(physics.poses(), stage, truth)
+            self._seen_pairs = self._pairs
+            if self.estimate is not None:
+                self._seen_pairs = self._contact_pairs(self.estimate.kinematics.poses(), stage, observation)
             self._virtual = virtual_collision(task, physics, stage, cfg.virtual) if cfg.collision == "vcp" else None
             self._measure()
             capture = cfg.capture != "none"
             self._measured = Graph(self._measure, warp_device, capture)
             self._paired = Graph(self._pairs.launch, warp_device, capture)
+            self._seen_paired = Graph(self._seen_pairs.launch, warp_device, capture)
             pairs, virtual = self._pairs, self._virtual
             self._distance, self._worst = wp.to_torch(pairs.distance), wp.to_torch(pairs.worst_distance)
             self._reach, self._finite = wp.to_torch(pairs.reach), wp.to_torch(pairs.finite)
             self._worst_pair = wp.to_torch(pairs.worst)
+            self._seen_worst = wp.to_torch(self._seen_pairs.worst_distance)
             self._severe = None if virtual is None else wp.to_torch(virtual.severe)
             self._penalty = self._none if virtual is None else wp.to_torch(virtual.reward)
         wp.synchronize_device(warp_device)
-        self.observation = wp.to_torch(self._observation)
-        """The observation, shape (N, layout.size); overwritten by the next step."""
+        self._kept_alive = truth, observation
+        self.truth, self.observation = wp.to_torch(truth), wp.to_torch(observation)
+        """What the policy would observe without sensor errors, and the observation, shape (N, layout.size) each;
+        overwritten by the next step, and the same without sensor errors."""
+        self.history = self.observation.new_zeros(self.num_envs, cfg.observation.history, self.layout.size)
+        """The latest observations, the present one first, shape (N, history, layout.size)."""
         whole = cfg.capture == "step" and self.device.startswith("cuda")
-        parts = (self._apply_action, self._evaluate_step, self._read_base)
-        self._command, self._evaluate, self._observe = (captured(part, whole, fuse=cfg.fuse) for part in parts)
+        parts = (
+            self._apply_action, self._evaluate_step, self._read_base, self._read_encoders, self._track_objects,
+            self._keep_observation,
+        )  # fmt: skip
+        self._command, self._evaluate, self._observe, self._encoders, self._tracker, self._remember = (
+            captured(part, whole, fuse=cfg.fuse) for part in parts
+        )
         self.reset()
+
+    def _contact_pairs(self, poses: tuple[wp.array, wp.array], stage: wp.array, observation: wp.array) -> ContactPairs:
+        """Return the contact pairs at poses, with their features in an observation."""
+        reward = self._settings.reward
+        return ContactPairs(
+            self.task.table,
+            *poses,
+            stage,
+            amplitude=(reward.far[0], reward.near[0]),
+            sigma=(reward.far[1], reward.near[1]),
+            features=cast(wp.array, observation[:, self.layout.base :]),
+        )
 
     def _make_tables(self) -> None:
         """Copy constant arrays to the device."""
@@ -126,9 +166,6 @@ class Environment(VecEnv):
         self._worlds = torch.arange(self.num_envs, device=self.device)[:, None]
         force, torque = cfg.randomisation.perturbation
         self._perturbation_std = real([force] * 3 + [torque] * 3) if force or torque else None
-        pool = self._states
-        self._pool = [real(v) for v in (pool.qpos, pool.qvel, pool.ctrl, pool.mocap[..., :3], pool.mocap[..., 3:])]
-        self._pool += [index(pool.stage).int(), torch.as_tensor(pool.begins, device=self.device)]
 
     def _make_buffers(self) -> None:
         """Allocate the buffers that captured graphs refer to."""
@@ -146,6 +183,7 @@ class Environment(VecEnv):
         self.stage = torch.full((n,), self.task.first, dtype=torch.int32, device=device)
         """Present stage of each world."""
         self._from_start = torch.zeros(n, dtype=torch.bool, device=device)
+        self._started = torch.ones(n, dtype=torch.bool, device=device)
         self._stages_met = torch.zeros_like(self.stage)
         self._steps_within = torch.zeros_like(self.stage)
         self._steps_at_rest = torch.zeros_like(self.stage)
@@ -177,23 +215,42 @@ class Environment(VecEnv):
             self.refresh()
 
     def start_from(self, rows: Sequence[int]) -> None:
-        """Start an episode in every world from the initial states of these rows, one each; without perturbations."""
-        self._perturbing.zero_()
+        """Start an episode in every world from the initial states of these rows, one each.
+
+        Without random force perturbations, unless `perturbs_trials` is set.
+        """
+        self._perturbing.fill_(float(self.perturbs_trials))
         index = torch.as_tensor(np.asarray(rows), device=self.device)
         with torch.no_grad():
             self._start(torch.ones_like(self.done), index)
         self.refresh()
 
-    def refresh(self) -> None:
-        """Compute poses, distances and observation of the present state."""
+    def refresh(self, *, measure: bool = True) -> None:
+        """Compute poses, distances and observation of the present state; without `measure` from the last readings."""
         with torch.no_grad():
             self.physics.update_poses()
             self._paired.launch()
+            if self.estimate is not None:
+                if measure:
+                    self._encoders()
+                    self.estimate.kinematics.update()
+                    self._tracker()
+                self.estimate.kinematics.update()
+                self._seen_paired.launch()
             self._observe()
+            if measure:
+                self._remember()
 
     def get_observations(self) -> TensorDict:
-        """Return a copy of the present observation; rsl-rl keeps it during the next step."""
-        return TensorDict({"policy": self.observation.clone()}, batch_size=[self.num_envs], device=self.device)
+        """Return copies of the present observations, which rsl-rl keeps during the next step.
+
+        "policy" is what the policy observes; "truth", with sensor errors only, is the same without them, for the value
+        function.
+        """
+        parts = {"policy": self.history.flatten(1).clone()}
+        if self.estimate is not None:
+            parts["truth"] = self.truth.clone()
+        return TensorDict(parts, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Act for one control step; see `rsl_rl.env.VecEnv.step`."""
@@ -267,7 +324,7 @@ class Environment(VecEnv):
         check_state(state, parts, "the environment of the checkpoint", where=None, error=TrainError)
         for name, value in parts.items():
             value.copy_(state[name])
-        self.refresh()
+        self.refresh(measure=False)
 
     def _state(self) -> dict[str, torch.Tensor]:
         """Return the tensors of which `state` returns copies."""
@@ -285,8 +342,10 @@ class Environment(VecEnv):
             "steps within": self._steps_within,
             "steps at rest": self._steps_at_rest,
             "success average": self._success_average,
+            "history": self.history,
         }
-        return parts | p.memory
+        estimated = {} if self.estimate is None else self.estimate.memory
+        return parts | p.memory | self._initial.memory | estimated
 
     def parts(self) -> tuple[Callable[[], None], ...]:
         """Return the parts of a step in order, for profiling: commands, physics, distances, rewards and resets, poses
@@ -393,6 +452,10 @@ class Environment(VecEnv):
         self.done.copy_(failed | self.time_out)
         self._record_divergence(diverged)
         self._count(terms)
+        state = p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage
+        moving = valid & ~self.done & ~self.success
+        self._initial.keep_stuck(state, self._worst, moving, self._perturbing)
+        self._started.zero_()
         self._start(self.done)
 
     def _reaching(self) -> torch.Tensor:
@@ -413,7 +476,8 @@ class Environment(VecEnv):
             valid: Worlds without failure, shape (N,) bool.
         """
         chain = self._settings.chain
-        near = (self._worst_pair >= 0) & (self._worst < chain.tolerance) & valid
+        # The controller moves on by what it observes, not by the truth.
+        near = (self._worst_pair >= 0) & (self._seen_worst < chain.tolerance) & valid
         self._steps_within.copy_(torch.where(near, self._steps_within + 1, 0))
         met = self._steps_within >= chain.hold
         self._stages_met.copy_(torch.maximum(self._stages_met, self.stage - self.task.first + met))
@@ -455,11 +519,12 @@ class Environment(VecEnv):
         """Start episodes in the worlds of a mask (N,) bool, from initial states of rows (N,), by default random."""
         p = self.physics
         if rows is None:
-            rows = torch.randint(0, len(self._pool[0]), (self.num_envs,), device=self.device)
+            rows = self._initial.sample(self._success_average * self._perturbing)
         states = (p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage, self._from_start)
-        for state, pool in zip(states, self._pool, strict=True):
+        for state, given in zip(states, self._initial.at(rows), strict=True):
             shaped = mask.view(-1, *[1] * (state.ndim - 1))
-            state.copy_(torch.where(shaped, pool[rows].to(state.dtype), state))
+            state.copy_(torch.where(shaped, given.to(state.dtype), state))
+        self._started.logical_or_(mask)
         p.warmstart.copy_(torch.where(mask[:, None], 0.0, p.warmstart))
         self._stages_met.copy_(torch.where(mask, self.stage - self.task.first, self._stages_met))
         for counter in (self._steps_within, self._steps_at_rest, self.episode_length_buf, self._return):
@@ -467,5 +532,23 @@ class Environment(VecEnv):
         p.reset_commands(mask)
 
     def _read_base(self) -> None:
-        """Write the parts before the slots to the observation; a kernel has written the slots."""
-        self.observation[:, : self.layout.base] = self._base.read()
+        """Write the parts before the slots to the observations; a kernel has written the slots."""
+        self.truth[:, : self.layout.base] = self._base.read(self.physics)
+        if self.estimate is not None:
+            self.observation[:, : self.layout.base] = self._base.read(self.estimate)
+
+    def _keep_observation(self) -> None:
+        """Put the present observation first in the history; where an episode starts, it has always been so."""
+        present = self.observation[:, None]
+        self.history[:, 1:] = torch.where(self._started[:, None, None], present, self.history[:, :-1])
+        self.history[:, :1] = present
+
+    def _read_encoders(self) -> None:
+        """Read the joints."""
+        if self.estimate is not None:
+            self.estimate.read_encoders(self._started)
+
+    def _track_objects(self) -> None:
+        """Update the estimated poses of the objects."""
+        if self.estimate is not None:
+            self.estimate.track_objects(self._started, self._frames[self.stage.long()] > 0)

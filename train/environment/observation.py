@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 
 from concent_warp.kernels.contact_pairs import SLOT_SIZE
-from concent_warp.train.environment.physics import Physics
 from concent_warp.train.environment.quaternions import rotation_columns
+from concent_warp.train.observation_cfg import ObservationCfg
 from concent_warp.train.task.task import Task
 
 
@@ -19,14 +20,19 @@ class ObservationLayout:
     parts: tuple[tuple[str, int], ...]
 
     @staticmethod
-    def of(task: Task) -> ObservationLayout:
-        """Return the layout of a task; 148 numbers, as in the paper, for the shape sorter with the embedded arm."""
+    def of(task: Task, cfg: ObservationCfg) -> ObservationLayout:
+        """Return the layout of a task.
+
+        For the shape sorter with the embedded arm: 148 numbers as in the paper, and the 7 leads of the commands.
+        """
         robot = task.robot
         hinges = int(robot.turning.sum())
         parts = [("joint angles", 2 * hinges)] if hinges else []
         if hinges < len(robot.joint):
             parts.append(("joint positions", len(robot.joint) - hinges))
         parts.append(("joint velocities", len(robot.joint)))
+        if cfg.leads:
+            parts.append(("command leads", len(robot.joint)))
         if len(robot.gripper):
             parts += [("gripper opening", 1), ("gripper command", 1)]
         parts.append(("end effector", 3))
@@ -58,37 +64,50 @@ class ObservationLayout:
         raise KeyError(part)
 
 
+class ObservedState(Protocol):
+    """What is observed: the true worlds, or an estimate of them; shapes as in `Physics`."""
+
+    qpos: torch.Tensor
+    qvel: torch.Tensor
+    position: torch.Tensor
+    quaternion: torch.Tensor
+    site: torch.Tensor
+
+    @property
+    def ctrl(self) -> torch.Tensor: ...  # noqa: D102
+
+
 class BaseObservation:
     """Computes the parts of the observation that describe robot and objects."""
 
-    def __init__(self, task: Task, physics: Physics, noise: float) -> None:
-        """Store indices into the state; `noise` is the standard deviation of noise on object positions [m]."""
+    def __init__(self, task: Task, device: str, cfg: ObservationCfg) -> None:
+        """Store indices into the state."""
         robot = task.robot
 
         def index(values: object) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.long, device=physics.device)
+            return torch.as_tensor(values, dtype=torch.long, device=device)
 
-        self._physics, self._noise = physics, noise
         self._hinges, self._slides = index(robot.qpos[robot.turning]), index(robot.qpos[~robot.turning])
-        self._dofs = index(robot.dof)
+        self._dofs, self._arm, self._actuators = index(robot.dof), index(robot.qpos), index(robot.actuator)
         self._gripper = index(robot.gripper)
-        self._opening = torch.as_tensor(robot.opening, dtype=torch.float32, device=physics.device)
+        self._opening = torch.as_tensor(robot.opening, dtype=torch.float32, device=device)
+        self._lead = torch.as_tensor(robot.lead, dtype=torch.float32, device=device) if cfg.leads else None
         self._tool = robot.tool
         self._objects = index(list(task.objects))
 
-    def read(self) -> torch.Tensor:
+    def read(self, state: ObservedState) -> torch.Tensor:
         """Return the parts before the slots, shape (N, base)."""
-        p = self._physics
-        qpos = p.qpos.float()
+        qpos, ctrl = state.qpos.float(), state.ctrl
         turned = qpos[:, self._hinges]
-        parts = [turned.sin(), turned.cos(), qpos[:, self._slides], p.qvel[:, self._dofs].float()]
+        parts = [turned.sin(), turned.cos(), qpos[:, self._slides], state.qvel[:, self._dofs].float()]
+        if self._lead is not None:
+            parts.append((ctrl[:, self._actuators] - qpos[:, self._arm]) / self._lead)
         if len(self._gripper):
             parts += [
                 (qpos * self._opening).sum(dim=1, keepdim=True),
-                p.ctrl[:, self._gripper].mean(dim=1, keepdim=True),
+                ctrl[:, self._gripper].mean(dim=1, keepdim=True),
             ]
-        place = p.position[:, self._objects]
-        if self._noise:
-            place = place + self._noise * torch.randn_like(place)
-        objects = torch.cat([place, rotation_columns(p.quaternion[:, self._objects])], dim=-1)
-        return torch.cat([*parts, p.site[:, self._tool], objects.flatten(1)], dim=1)
+        objects = torch.cat(
+            [state.position[:, self._objects], rotation_columns(state.quaternion[:, self._objects])], dim=-1
+        )
+        return torch.cat([*parts, state.site[:, self._tool], objects.flatten(1)], dim=1)

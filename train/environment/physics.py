@@ -27,6 +27,29 @@ DROPPED = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRF
 """Warnings that contacts or constraints were dropped for lack of memory."""
 
 
+class Kinematics(Protocol):
+    """Forward kinematics of N worlds at positions of one's own; the tensors are views of what the kinematics read."""
+
+    qpos: torch.Tensor
+    """Shape (N, nq)."""
+    mocap: tuple[torch.Tensor, torch.Tensor]
+    """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of fixed objects."""
+    position: torch.Tensor
+    """Body origins [m], world frame, shape (N, nbody, 3)."""
+    quaternion: torch.Tensor
+    """Body orientations, wxyz, shape (N, nbody, 4)."""
+    site: torch.Tensor
+    """Site positions [m], world frame, shape (N, nsite, 3)."""
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays, of `wp.vec3` and `wp.quat`, shape (N, nbody)."""
+        ...
+
+    def update(self) -> None:
+        """Compute the poses from the generalised positions."""
+        ...
+
+
 class Physics(Protocol):
     """N worlds of one model; the tensors are views of the simulator's memory, so writing to them sets the state."""
 
@@ -75,6 +98,10 @@ class Physics(Protocol):
 
     def update_poses(self) -> None:
         """Compute the poses from the generalised positions."""
+        ...
+
+    def kinematics(self) -> Kinematics:
+        """Return kinematics of the same bodies, at the positions of these worlds until others are written."""
         ...
 
 
@@ -206,6 +233,10 @@ class MujocoPhysics:
             mujoco.mj_kinematics(m, d)
             self._read(i, d)
 
+    def kinematics(self) -> Kinematics:
+        """See `Physics.kinematics`."""
+        return MujocoKinematics(self.model, self.worlds)
+
     def _write(self, i: int, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """Copy the tensors of a world to its data, if they changed since they were read from it."""
         given = [array[i] for array in (*self._arrays[:2], *self._places)]
@@ -221,6 +252,36 @@ class MujocoPhysics:
         values = (d.qpos, d.qvel, d.qacc_warmstart, d.xpos, d.xquat, d.site_xpos)
         for array, value in zip(self._arrays, values, strict=True):
             array[i] = value
+
+
+class MujocoKinematics:
+    """Forward kinematics in C MuJoCo."""
+
+    def __init__(self, model: mujoco.MjModel, worlds: int) -> None:
+        """Start at the model's reference positions."""
+        self._model, self._data = model, mujoco.MjData(model)
+        self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
+        self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
+        self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
+        self.qpos = torch.from_numpy(np.tile(model.qpos0, (worlds, 1)))
+        places = [np.tile(values, (worlds, 1, 1)) for values in (self._data.mocap_pos, self._data.mocap_quat)]
+        self.mocap = torch.from_numpy(places[0]), torch.from_numpy(places[1])
+        self.site = torch.zeros(worlds, model.nsite, 3)
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays."""
+        return self._xpos, self._xquat
+
+    def update(self) -> None:
+        """Compute the poses from the generalised positions."""
+        m, d = self._model, self._data
+        given = self.qpos.numpy(), self.mocap[0].numpy(), self.mocap[1].numpy()
+        found = self.position.numpy(), self.quaternion.numpy(), self.site.numpy()
+        for i, (qpos, place, turn) in enumerate(zip(*given, strict=True)):
+            d.qpos[:], d.mocap_pos[:], d.mocap_quat[:] = qpos, place, turn
+            mujoco.mj_kinematics(m, d)
+            for array, value in zip(found, (d.xpos, d.xquat, d.site_xpos), strict=True):
+                array[i] = value
 
 
 class WarpPhysics:
@@ -263,6 +324,7 @@ class WarpPhysics:
         self.buffers: tuple[int, int] | None = (nconmax, njmax)
         self.device = str(wp.device_to_torch(wp.get_device(device)))
         self._warp_device, self._decimation, self._mjw = wp.get_device(device), decimation, mjw
+        self._capture = capture
         edited = sorted({name for force_model, _ in force_models for name in force_model.edits})
         varied = dict(fields or {})
         for name in set(edited) - set(varied):
@@ -340,6 +402,10 @@ class WarpPhysics:
         """Compute the poses from the generalised positions."""
         self._update_poses.launch()
 
+    def kinematics(self) -> Kinematics:
+        """See `Physics.kinematics`."""
+        return WarpKinematics(self.model, self._model, self.worlds, self._warp_device, self._capture)
+
     def _steps(self) -> None:
         """Launch the steps of one action."""
         for k in range(self._decimation):
@@ -354,6 +420,38 @@ class WarpPhysics:
                     force_model.launch(self._model, self._data, values)
             self._mjw.step(self._model, self._data)
         self._mjw.kinematics(self._model, self._data)
+
+
+class WarpKinematics:
+    """Forward kinematics in MuJoCo-Warp, captured in a graph."""
+
+    def __init__(
+        self, model: mujoco.MjModel, warp_model: Any, worlds: int, device: wp.Device, capture: bool
+    ) -> None:
+        """Start at the model's reference positions; `warp_model` is MuJoCo-Warp's model."""
+        import mujoco_warp as mjw
+
+        with wp.ScopedDevice(device):
+            # Kinematics read no contacts; these are the smallest buffers there are.
+            self._data = d = mjw.make_data(model, nworld=worlds, nconmax=1, njmax=1)
+            self.qpos, self.site = wp.to_torch(d.qpos), wp.to_torch(d.site_xpos)
+            self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
+            torch_device = self.qpos.device
+            self.mocap = (
+                (wp.to_torch(d.mocap_pos), wp.to_torch(d.mocap_quat))
+                if model.nmocap
+                else (torch.zeros(worlds, 0, 3, device=torch_device), torch.zeros(worlds, 0, 4, device=torch_device))
+            )
+            mjw.kinematics(warp_model, d)  # loads the module
+            self._update = Graph(lambda: mjw.kinematics(warp_model, d), device, capture)
+
+    def poses(self) -> tuple[wp.array, wp.array]:
+        """Return positions and orientations as Warp arrays."""
+        return self._data.xpos, self._data.xquat
+
+    def update(self) -> None:
+        """Compute the poses from the generalised positions."""
+        self._update.launch()
 
 
 class Graph:

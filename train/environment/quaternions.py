@@ -47,3 +47,10 @@ def rotation_columns(q: torch.Tensor) -> torch.Tensor:
         ],
         dim=-1,
     )
+
+
+def rotation_from_vector(v: torch.Tensor) -> torch.Tensor:
+    """Return the unit quaternions (..., 4) of rotation vectors (..., 3) [rad]."""
+    half = 0.5 * torch.linalg.vector_norm(v, dim=-1, keepdim=True)
+    # torch.sinc is sin(pi x) / (pi x), so that this is sin(half) / (2 half) without a division by 0.
+    return torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * v], dim=-1)

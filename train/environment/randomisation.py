@@ -39,6 +39,9 @@ def sample_model_fields(
     rng = np.random.default_rng([seed, 2])
     found = dict(fields or {})
 
+    def drawn(extent: tuple[float, float], shape: int | tuple[int, ...] = worlds) -> np.ndarray:
+        return rng.choice(extent, shape) if cfg.extremes else rng.uniform(*extent, shape)
+
     def scaled(name: str, factor: np.ndarray, *, rows: np.ndarray | slice = slice(None), column: int | None = None):
         given, value = found.get(name), getattr(m, name)
         values = np.tile(value, (worlds, *[1] * value.ndim)) if given is None else given.copy()
@@ -49,22 +52,22 @@ def sample_model_fields(
     robot = np.isin(m.geom_bodyid, _moved_by_robot(task))
     for extent, rows in ((cfg.friction, np.flatnonzero(~robot)), (cfg.grip, np.flatnonzero(robot))):
         if extent != UNCHANGED:
-            scaled("geom_friction", rng.uniform(*extent, worlds), rows=rows, column=0)
+            scaled("geom_friction", drawn(extent), rows=rows, column=0)
     if cfg.stiffness != UNCHANGED:
-        factor = rng.uniform(*cfg.stiffness, worlds)
+        factor = drawn(cfg.stiffness)
         scaled("actuator_gainprm", factor, column=0)
         scaled("actuator_biasprm", factor, column=1)
     if cfg.damping != UNCHANGED:
-        scaled("dof_damping", rng.uniform(*cfg.damping, worlds))
+        scaled("dof_damping", drawn(cfg.damping))
     if cfg.joint_friction != ZERO:
         actuator, dof = task.robot.actuator, task.robot.dof
         strongest = np.where(m.actuator_forcelimited[actuator], m.actuator_forcerange[actuator, 1], np.inf)
         share = np.ones(len(dof)) if np.isinf(strongest).any() else strongest / strongest.max()
         loss = found.get("dof_frictionloss", np.tile(m.dof_frictionloss, (worlds, 1))).copy()
-        loss[:, dof] += rng.uniform(*cfg.joint_friction, (worlds, 1)) * share
+        loss[:, dof] += drawn(cfg.joint_friction, (worlds, 1)) * share
         found["dof_frictionloss"] = loss
     if cfg.mass != UNCHANGED:
-        factor, bodies = rng.uniform(*cfg.mass, worlds), np.array(task.objects)
+        factor, bodies = drawn(cfg.mass), np.array(task.objects)
         scaled("body_mass", factor, rows=bodies)
         scaled("body_inertia", factor, rows=bodies)
     return found

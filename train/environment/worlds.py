@@ -29,7 +29,14 @@ CONES = {
 
 
 def make_environment(
-    task: Task, cfg: EnvironmentCfg, states: ResetStates, *, device: str | None = None, seed: int = 0
+    task: Task,
+    cfg: EnvironmentCfg,
+    states: ResetStates,
+    *,
+    device: str | None = None,
+    seed: int = 0,
+    refine: int = 1,
+    time_constant: float | None = None,
 ) -> Environment:
     """Return the environment of a task.
 
@@ -39,12 +46,15 @@ def make_environment(
         states: Initial states of the episodes.
         device: Warp's name of the device; the first CUDA device by default, the CPU without one.
         seed: Seed of the values that are sampled for each world.
+        refine: Simulation steps in place of each one of the settings, for finer physics.
+        time_constant: Time constant of all contacts [s]; by default that of the model's geoms.
 
     Raises:
         TrainError: The worlds do not fit the memory.
     """
     check_worlds(task, cfg, device)
-    return Environment(task, cfg, _make_physics(task, cfg, device=device, seed=seed), states)
+    physics = _make_physics(task, cfg, device=device, seed=seed, refine=refine, time_constant=time_constant)
+    return Environment(task, cfg, physics, states)
 
 
 def check_worlds(task: Task, cfg: EnvironmentCfg, device: str | None = None) -> None:
@@ -76,12 +86,19 @@ def check_worlds(task: Task, cfg: EnvironmentCfg, device: str | None = None) -> 
         )
 
 
-def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0) -> Physics:
+def _make_physics(
+    task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0, refine: int = 1,
+    time_constant: float | None = None,
+) -> Physics:
     """Return the simulated worlds of a task."""
     from concent_warp.simulate.warp_engine import preferred_device
 
     device = preferred_device() if device is None else device
     m = _with_solver_settings(task.compiled, cfg)
+    m.opt.timestep /= refine
+    if time_constant is not None:
+        m.geom_solref[:, 0] = time_constant
+    steps = simulation_steps(task.compiled, cfg) * refine
     on_cpu = not device.startswith("cuda")
     in_c = cfg.engine == "mujoco" or (cfg.engine == "auto" and on_cpu)
     if in_c:
@@ -95,13 +112,13 @@ def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None,
     )
     if in_c:
         return MujocoPhysics(
-            m, cfg.worlds, cfg.simulation_steps, effects.force_models, fields=fields, command_dynamics=command_dynamics
+            m, cfg.worlds, steps, effects.force_models, fields=fields, command_dynamics=command_dynamics
         )
     contacts, constraints = buffer_sizes(task, cfg)
     return WarpPhysics(
         m,
         cfg.worlds,
-        cfg.simulation_steps,
+        steps,
         effects.force_models,
         device=device,
         nconmax=contacts,
@@ -115,7 +132,7 @@ def _make_physics(task: Task, cfg: EnvironmentCfg, *, device: str | None = None,
 def _with_solver_settings(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjModel:
     """Return a copy of a model with the settings' solver, friction cones and time step."""
     limited = copy.copy(m)
-    limited.opt.timestep *= cfg.stride
+    limited.opt.timestep *= cfg.decimation // simulation_steps(m, cfg)
     if cfg.cone != "auto":
         limited.opt.cone = CONES[cfg.cone]
     if cfg.cone == "pyramidal":
@@ -124,6 +141,18 @@ def _with_solver_settings(m: mujoco.MjModel, cfg: EnvironmentCfg) -> mujoco.MjMo
     limited.opt.iterations = m.opt.iterations if cfg.solver_iterations is None else cfg.solver_iterations
     limited.opt.ls_iterations = m.opt.ls_iterations if cfg.ls_iterations is None else cfg.ls_iterations
     return limited
+
+
+def simulation_steps(m: mujoco.MjModel, cfg: EnvironmentCfg) -> int:
+    """Return the simulation steps per action; see `EnvironmentCfg.stride`."""
+    if cfg.stride is not None:
+        return cfg.decimation // cfg.stride
+    constants = m.geom_solref[(m.geom_contype != 0) | (m.geom_conaffinity != 0), 0]
+    constants = constants[constants > 0]  # others are stiffness and damping, from which no step follows
+    longest = constants.min() / 2 if len(constants) else m.opt.timestep
+    strides = [k for k in range(1, cfg.decimation + 1) if cfg.decimation % k == 0]
+    fitting = [k for k in strides if k * m.opt.timestep <= longest * (1 + 1e-9)]
+    return cfg.decimation // max(fitting, default=1)
 
 
 def buffer_sizes(task: Task, cfg: EnvironmentCfg) -> tuple[int, int]:

@@ -76,6 +76,9 @@ class Iteration:
 
 
 Report = Callable[[Iteration], None]
+Examination = Callable[[Callable[[TensorDict], torch.Tensor]], tuple[int, int]]
+"""Given a policy without exploration, returns the numbers of successes and of episodes."""
+MakeExamination = Callable[[], Examination]
 MakeEnvironment = Callable[[tuple[int, int] | None], TrainingEnvironment]
 """Makes the environment anew with room for so many contacts and constraint rows a world, by default as at first."""
 
@@ -90,6 +93,7 @@ class Trainer:
         folder: Path | None = None,
         process: DistributedProcess | None = None,
         make_environment: MakeEnvironment | None = None,
+        make_examination: MakeExamination | None = None,
     ) -> None:
         """Create policy and value function.
 
@@ -99,9 +103,11 @@ class Trainer:
             folder: Run folder for checkpoints and metrics; None writes none.
             process: This process of a data-parallel training, within its group; a single process by default.
             make_environment: Makes the environment with larger buffers when they overflow; by default they stay.
+            make_examination: Makes the examination by which the best policy is kept; none by default.
         """
         self.environment, self.cfg, self.folder = environment, cfg, folder
         self._make_environment, self._warned_of_overflow = make_environment, False
+        self._make_examination, self._examine = make_examination, None
         self.process = process or DistributedProcess()
         self.device = str(environment.device)
         torch.set_float32_matmul_precision("high" if cfg.ppo.tf32 else "highest")
@@ -112,6 +118,9 @@ class Trainer:
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
         self.history: list[Iteration] = []
         self._has_diverged = False
+        self.best: dict[str, Any] = {}
+        """The policy that did best in an examination: its weights "actor_state_dict", the "iteration", "successes" and
+        "episodes"; empty before the first examination."""
 
     def learn(self, report: Report | None = None, *, seconds: float | None = None) -> Iteration | None:
         """Train until the last iteration, the target success or a time limit; return the last iteration.
@@ -133,6 +142,7 @@ class Trainer:
             try:
                 while self.iteration < self.cfg.ppo.iterations:
                     last, observations = self._iterate(observations)
+                    self._keep_best(last)
                     write(last)
                     if report is not None:
                         report(last)
@@ -150,6 +160,26 @@ class Trainer:
                 raise
             self.save()
         return last
+
+    def _keep_best(self, this: Iteration) -> None:
+        """Examine the policy where it is due, note the result in the log, and keep the policy if it is the best.
+
+        Learning goes on as if there had been no examination.
+        """
+        every = self.cfg.stress.every
+        if self._make_examination is None or not every or self.iteration % every or not self.process.is_rank_zero:
+            return
+        begun, state = time.monotonic(), _random_state(self.device)
+        if self._examine is None:
+            self._examine = self._make_examination()
+        successes, episodes = self._examine(self.policy())
+        self.algorithm.train_mode()
+        _restore_random_state(state, self.device)
+        this.log |= {"stress success": successes / episodes, "stress seconds": time.monotonic() - begun}
+        if not self.best or successes >= self.best["successes"]:
+            weights = {name: value.clone() for name, value in self.algorithm.actor.state_dict().items()}
+            self.best = {"actor_state_dict": weights, "iteration": self.iteration}
+            self.best |= {"successes": successes, "episodes": episodes}
 
     def _decision_of_rank_zero(self, late: bool) -> bool:
         """Return the decision of rank 0, since the ranks' clocks differ."""
@@ -296,7 +326,7 @@ class Trainer:
     def weights(self) -> dict[str, Any]:
         """Return the state of policy, value function and optimiser, with iterations, steps and seconds of training."""
         length = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
-        return {**self.algorithm.save(), **length}
+        return {**self.algorithm.save(), **length, "best": self.best}
 
     def save(self) -> None:
         """Write a checkpoint atomically, with the environment and random number generators of all ranks."""
@@ -365,6 +395,7 @@ class Trainer:
                         raise ValueError(f"{name} of shape {tuple(moment.shape)} for weights {tuple(weight.shape)}")
         ppo.learning_rate = float(document["learning_rate"])
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
+        self.best = document.get("best", {})
         buffers = document.get("buffers")
         if self._make_environment is not None and buffers is not None and buffers != self.environment.buffers:
             contacts, constraints = buffers
@@ -380,10 +411,15 @@ class Trainer:
 
 
 def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, process: DistributedProcess) -> PPO:
-    """Return rsl-rl's PPO for an environment; its gradients are averaged over ranks."""
+    """Return rsl-rl's PPO for an environment; its gradients are averaged over ranks.
+
+    The value function also sees what the environment offers beside the policy's observation (Pinto et al., "Asymmetric
+    actor critic for image-based robot learning", RSS 2018).
+    """
+    observations = environment.get_observations()
     settings = {
         "num_steps_per_env": cfg.steps,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "obs_groups": {"actor": ["policy"], "critic": sorted(map(str, observations.keys()))},
         "actor": network_settings(cfg, actor=True),
         "critic": network_settings(cfg, actor=False),
         "multi_gpu": process.rsl_rl(),
@@ -404,7 +440,7 @@ def _make_ppo(environment: TrainingEnvironment, cfg: PpoCfg, process: Distribute
     }
     with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints the networks
         algorithm = PPO.construct_algorithm(
-            environment.get_observations(),
+            observations,
             environment,  # pyright: ignore[reportArgumentType]
             settings,
             str(environment.device),
@@ -442,6 +478,22 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         if not isinstance(value, int | float if name == "seconds" else int) or value < 0:
             raise TrainError(f"{name} of the checkpoint is no count", where=path, expected="at least 0", found=value)
     return document
+
+
+def chosen_weights(weights: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint with the policy that did best in the stress test in place of the last one, if there is one.
+
+    Raises:
+        TrainError: What it says about that policy is incomplete.
+    """
+    best = weights.get("best") or {}
+    if not best:
+        return dict(weights)
+    if not isinstance(best, Mapping) or not isinstance(best.get("actor_state_dict"), Mapping):
+        raise TrainError("the checkpoint's best policy has no weights")
+    outcome = {name: best.get(name, 0) for name in ("iteration", "successes", "episodes")}
+    kept = {name: value for name, value in weights.items() if name != "best"}
+    return {**kept, "actor_state_dict": best["actor_state_dict"], "stress": outcome}
 
 
 def _seed_everything(seed: int) -> None:

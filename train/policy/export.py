@@ -53,7 +53,7 @@ def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str,
         raise TrainError("the export format is unknown", where=out, expected=f"a name in {' or '.join(SUFFIXES)}")
     task = run.task()
     described = _describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
-    module = _policy_module(run.cfg, ObservationLayout.of(task).size, task.robot.actions, weights["actor_state_dict"])
+    module = _policy_module(run.cfg, described["observation"]["size"], task.robot.actions, weights["actor_state_dict"])
     to_bytes = _onnx if out.suffix == ".onnx" else _torchscript
     write_bytes(out, to_bytes(module, described))
     return described
@@ -140,6 +140,7 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
         "joint angles": ("sines of all angles, then their cosines", hinges),
         "joint positions": ("positions [m]", slides),
         "joint velocities": ("velocities [rad/s or m/s]", joints),
+        "command leads": ("command minus joint position, relative to the largest lead", joints),
         "gripper opening": ("opening as measured [m], see gripper", []),
         "gripper command": ("mean command of the gripper's actuators [m]", []),
         "end effector": ("position [m], world frame", [m.site(robot.tool).name]),
@@ -147,14 +148,16 @@ def _described_observation(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     for i, body in enumerate(task.objects):
         what = "position [m], world frame, then the first two columns of the rotation matrix"
         meaning[f"object {i + 1}"] = (what, [m.body(body).name])
-    layout = ObservationLayout.of(task)
+    layout, history = ObservationLayout.of(task, cfg.environment.observation), cfg.environment.observation.history
     parts = []
     for name, width in layout.parts:
         what, of = meaning.get(name, ("a contact slot, see slots", []))
         parts.append({"name": name, "start": layout.columns(name).start, "size": width, "meaning": what, "of": of})
     return {
         "input": INPUT,
-        "size": layout.size,
+        "size": layout.size * history,
+        "history": f"{history} observations of {layout.size} numbers each, the present one first; at the start of an "
+        "episode the first in place of earlier ones",
         "parts": parts,
         "normalisation": "within the policy: pass values unnormalised" if cfg.ppo.normalise else "none",
         "slots": _described_slots(task),

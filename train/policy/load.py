@@ -10,7 +10,7 @@ from typing import Any
 from concent_warp.errors import TrainError
 from concent_warp.run_folder import check_training
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, chosen_weights, load_checkpoint
 from concent_warp.train.policy.episodes import PolicyFunction
 from concent_warp.train.policy.pretrained import FOLDER, pretrained_checkpoint, pretrained_names
 from concent_warp.train.run import TrainingRun
@@ -52,8 +52,14 @@ class Policy:
             path = pretrained_checkpoint(source)
         check_training(path)
         checkpoint = path / CHECKPOINT if path.is_dir() else path
-        weights = load_checkpoint(checkpoint)
+        weights = chosen_weights(load_checkpoint(checkpoint))
         return Policy(TrainingRun.load(checkpoint.parent), weights, checkpoint.parent)
+
+    @property
+    def stress(self) -> tuple[int, int] | None:
+        """Successes and episodes of the stress test by which the policy was chosen; None without a test."""
+        found = self.weights.get("stress")
+        return None if found is None else (int(found["successes"]), int(found["episodes"]))
 
     @property
     def pretrained(self) -> bool:

@@ -49,6 +49,8 @@ def write_pretrained(policy: Policy, out: Path, *, overwrite: bool = False) -> d
         folder = Path(made) / out.name
         replace(run, recording=replace(run.recording, demonstrations=(one,))).save(folder)
         kept = {name: weights[name] for name in ("actor_state_dict", "iteration", "steps", "seconds")}
+        if "stress" in weights:
+            kept["stress"] = weights["stress"]
         write_checkpoint(folder / CHECKPOINT, kept)
         length = {
             "iterations": weights["iteration"],

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from concent_warp.train.cfg import ResetCfg
+from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.reset_states import ResetCandidate, ResetSampler, move_body, vertical_rotation
 from concent_warp.train.task.task import Task
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.train.cfg import PostureSolverCfg
+from concent_warp.train.reset_cfg import PostureSolverCfg
 from concent_warp.train.task.robot import Robot
 
 

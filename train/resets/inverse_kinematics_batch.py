@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import TrainError
-from concent_warp.train.cfg import NewtonSolverCfg
+from concent_warp.train.reset_cfg import NewtonSolverCfg
 from concent_warp.train.task.robot import Robot
 
 if TYPE_CHECKING:

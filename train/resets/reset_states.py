@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.errors import TrainError
 from concent_warp.simulate.inputs import compile_model
-from concent_warp.train.cfg import ResetCfg
+from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.inverse_kinematics import solve_inverse_kinematics
 from concent_warp.train.resets.inverse_kinematics_batch import solve_inverse_kinematics_batch
 from concent_warp.train.task.movable_fixtures import mocap_id

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from concent_warp.train.cfg import ResetCfg
+from concent_warp.train.reset_cfg import ResetCfg
 from concent_warp.train.resets.chained import ChainedResetSampler
 from concent_warp.train.resets.reset_states import ResetSampler, ResetStates
 from concent_warp.train.task.task import Task

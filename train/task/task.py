@@ -18,6 +18,7 @@ from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
 from concent_warp.train.cfg import ALL, EnvironmentCfg
+from concent_warp.train.task.edges import with_edge_spheres
 from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.slots import slot_table
@@ -102,7 +103,12 @@ class Task:
             touched = [e.sphere for e in events.entities if e.sphere is not None]
             collidable[:] = False
             collidable[touched] = True
-        replayer, model = model, replace(model, scene=with_movable_fixtures(model.scene))
+        replayer, replayed = model, collidable
+        if cfg.edges.count:
+            model = with_edge_spheres(model, collidable, cfg.edges)
+            added = len(model.geometry) - len(collidable) if model.geometry is not None else 0
+            collidable = np.append(collidable, np.ones(added, dtype=bool))
+        model = replace(model, scene=with_movable_fixtures(model.scene))
         compiled, _ = compile_model(model, collidable)
         unsupported = [
             a.effect for a in model.effects if a.effect.commands and a.effect.delay_and_lag(compiled, a.array) is None
@@ -114,7 +120,7 @@ class Task:
             )
         table, robot_slots = slot_table(compiled, events, cfg.observation.slots)
         objects = tuple(int(compiled.body(name).id) for name in _objects_by_handling(model, events))
-        replay = _replay(compiled, replayer, demonstration, collidable)
+        replay = _replay(compiled, replayer, demonstration, replayed)
         task = Task(
             model=model,
             events=events,

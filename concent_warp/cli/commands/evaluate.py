@@ -13,7 +13,7 @@ from concent_warp.checks import Bounds
 from concent_warp.cli.given_policy import Pretrained, given_policy
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
-from concent_warp.deploy.cfg import EvaluateCfg, WorldName, check_evaluation
+from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.run_folder import check_folder, make_folder
 
@@ -32,8 +32,9 @@ class Arguments:
     """Run folder of a training, or its checkpoint file."""
     pretrained: Pretrained = None
     """Run a policy that comes with the package, shape_sorter where no name is given."""
-    world: Literal["simulation", "reality", "both"] = "both"
-    """Where to run the policy."""
+    world: Literal["simulation", "stress", "reality", "both", "all"] = "both"
+    """Where to run the policy: simulation as in training, the same under worse conditions (stress), Reality, both
+    simulation and Reality, or all three."""
     episodes: Annotated[int, Bounds(1, 1_000_000)] = 200
     """Initial states, of which each is run once in each world."""
     seed: int = 0
@@ -51,7 +52,11 @@ class Arguments:
 def run(arguments: Arguments) -> dict[str, Evaluation]:
     """Evaluate and print."""
     cfg = arguments.cfg
-    worlds: tuple[WorldName, ...] = ("simulation", "reality") if arguments.world == "both" else (arguments.world,)
+    several: dict[str, tuple[TrialName, ...]] = {
+        "both": ("simulation", "reality"),
+        "all": ("simulation", "stress", "reality"),
+    }
+    worlds = several[arguments.world] if arguments.world in ("both", "all") else (arguments.world,)
     check_evaluation(cfg, worlds[-1], arguments.episodes)
     if arguments.out is not None:
         check_folder(arguments.out)

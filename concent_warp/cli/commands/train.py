@@ -118,5 +118,8 @@ def run(arguments: Arguments) -> Policy:
         say(f"nothing is left to train: {cfg.ppo.iterations} iterations are done")
     else:
         say(f"{last.steps:,} steps in {last.seconds:.0f} s, success while exploring {last.log['success']:.1%}")
+    if policy.stress is not None:
+        successes, episodes = policy.stress
+        say(f"stress test: {successes} of {episodes} succeed under the best policy, which is the one that is kept")
     say_written(folder / CHECKPOINT)
     return policy

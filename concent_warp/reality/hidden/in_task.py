@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ConcentError
+from concent_warp.reality.fingers import actuator_names, pad_geoms
 from concent_warp.reality.hidden.drives import DRIVES
 from concent_warp.reality.hidden.gears import GEARS
 from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig
@@ -130,27 +131,3 @@ def no_plan(rng: np.random.Generator, k: int) -> RigTrial:
     """Raise an error: the motion of a task is the policy's, and none is planned."""
     del rng, k
     raise NotImplementedError("a policy moves the world of a task")
-
-
-def actuator_names(m: mujoco.MjModel) -> list[str]:
-    """Return the names of a model's actuators."""
-    return [m.actuator(a).name for a in range(m.nu)]
-
-
-def pad_geoms(m: mujoco.MjModel, grippers: Sequence[str]) -> tuple[str, ...]:
-    """Return the named geoms that can touch and whose bodies the grippers move."""
-    joints: set[int] = set()
-    for name in set(grippers) & set(actuator_names(m)):
-        a = m.actuator(name).id
-        target = int(m.actuator_trnid[a, 0])
-        if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
-            wraps = range(m.tendon_adr[target], m.tendon_adr[target] + m.tendon_num[target])
-            joints |= {int(m.wrap_objid[w]) for w in wraps if m.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
-        else:
-            joints.add(target)
-    for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
-        pair = {int(m.eq_obj1id[e]), int(m.eq_obj2id[e])}
-        joints |= pair if pair & joints else set()
-    bodies = {int(m.jnt_bodyid[j]) for j in joints}
-    geoms = [g for g in range(m.ngeom) if int(m.geom_bodyid[g]) in bodies and m.geom_contype[g]]
-    return tuple(m.geom(g).name for g in geoms if m.geom(g).name)

@@ -18,6 +18,7 @@ from concent_warp.errors import ModelError, SceneError
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
+from concent_warp.scene.spheres.edges import edge_spheres
 from concent_warp.scene.spheres.inset import InsetCfg, inset
 from concent_warp.scene.spheres.mass import MassSplitCfg, split_mass
 from concent_warp.scene.spheres.sampling import farthest_point_sampling
@@ -45,6 +46,11 @@ class ContactGeometryCfg:
     """Spheres within the object, or centred on its surface as in the paper (which inflates it by the radius)."""
     radius: Annotated[float, Bounds(0, 10, above_low=True)] | Literal["auto"] = 0.004
     """Radius [m]; "auto" makes it half the mean spacing of the object's spheres, so that neighbours touch."""
+    edges: Annotated[int, Bounds(0, 100_000)] = 0
+    """Further, smaller spheres along the edges of all objects, which spheres of `radius` round off; shared among the
+    objects like `count`. Only for inset spheres."""
+    edge_radius: Annotated[float, Bounds(0, 10, above_low=True)] = 0.0015
+    """Radius of the spheres along edges [m]."""
     thin: Literal["shrink", "refuse"] = "shrink"
     """Where an object is thinner than an inset sphere: make the sphere as large as fits, or raise an error."""
     friction: Annotated[float, Bounds(0, 100)] | None = None
@@ -124,8 +130,8 @@ class ContactGeometryCfg:
     ) -> ContactGeometry:
         """Return `count` spheres on one body."""
         wanted = self.radius if self.radius != "auto" else _spacing(surface.area, count) / 2
-        points, _ = surface.sample(max(self.candidates, count), rng)
-        radius = np.full(len(points), wanted)
+        surface_points, _ = surface.sample(max(self.candidates, count), rng)
+        points, radius = surface_points, np.full(len(surface_points), wanted)
         if self.placement == "inset":
             points, radius = inset(surface, points, wanted, self.inset)
             if self.thin == "refuse" and radius.min() < wanted * (1 - 1e-6):
@@ -140,9 +146,15 @@ class ContactGeometryCfg:
                 raise ModelError(
                     f"body {name!r} has no room for {count} spheres within it", found=f"{int(roomy.sum())} places"
                 )
-            points, radius = points[roomy], radius[roomy]
+            surface_points, points, radius = surface_points[roomy], points[roomy], radius[roomy]
         chosen = farthest_point_sampling(points, count)
-        points, radius = points[chosen], radius[chosen]
+        edges = round(self.edges * count / self.count) if self.placement == "inset" else 0
+        extra = edge_spheres(
+            surface, surface_points, (points, radius), edges, self.edge_radius,
+            min_radius=self.min_radius_share * self.edge_radius, cfg=self.inset,
+        )  # fmt: skip
+        points, radius = np.concatenate([points[chosen], extra[0]]), np.concatenate([radius[chosen], extra[1]])
+        count = len(points)
         model = scene.model
         row = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         rotation = np.empty(9)

@@ -1,0 +1,158 @@
+"""Trials of policies in a Reality whose friction, masses and gains nobody knows, seen through sensors; and a page.
+
+    python -m benchmarks.train.cases --out runs/a --cases ours --seeds 12 13
+    python -m benchmarks.train.learning --out runs/a --cases ours --seeds 12 13 --train.ppo.iterations 100
+    python -m benchmarks.train.trials runs/a runs/b --processes 8     # policies of these folders, then the page
+    python -m benchmarks.train.trials                                 # the page alone
+
+A folder holds trainings with one set of settings, as `benchmarks/train/learning.py` makes them. The stress test is
+repeated here for all policies, on a CPU, from other initial states than those by which a policy was chosen.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from joblib import Parallel, delayed
+from scipy.stats import rankdata
+
+from benchmarks.measurements import Measurements, Row
+from benchmarks.pages import machine_line, read_data, table, write_data, write_page
+from benchmarks.train.learning import POLICY, changed
+from benchmarks.train.table1 import Args as Table1Args
+from benchmarks.train.table1 import trial
+from concent_warp.deploy.cfg import RealityWorldCfg
+from concent_warp.train.policy.evaluate import wilson
+from concent_warp.train.policy.load import Policy
+
+NAME = "train_trials"
+CASE, STAGE = "ours", "insert"
+ABOUT = """\
+`python -m benchmarks.train.trials FOLDERS`: insertion by policies trained in simulation, in a Reality that neither
+the model nor the policy knows. In each episode the objects' friction is 0.2 to 0.5 (0.3 in the model), that of the
+fingers 0.8 to 1.2 times, masses 0.9 to 1.1 times, gains 0.95 to 1.05 times the model's; shapes are exact, with
+chamfered edges, steps 0.5 ms, the integrator Euler's. The demonstration that the geometry was fitted to was recorded
+in such a world. The policy sees encoder readings (0.2 mrad of noise, steps of 0.1 mrad), velocities as their
+differences, and object poses at 30 Hz with 1 mm and 1 degree of noise per axis, a quarter of the variance constant
+over an episode, 5 % of frames lost, one to two frames late. An episode succeeds where the block ends within 3 mm of
+its place at the bottom of the hole after 3 s. A seed is a demonstration, a fitted geometry and a policy; intervals
+are Wilson's, of these policies.
+
+*In simulation*: success in the training's own worlds. *Stress test*: the same policy in the model with all spheres
+and sharp edges in the physics, stiff contacts, short steps, and friction factors of 0.6 or 1.7 (`StressCfg`).
+
+What the figures do not show: other tasks; policies trained for longer, since success in the stress test was still
+rising when these trainings ended; how far one or two seeds speak for settings. Seeds 12 and 13 were used to choose.
+Eight trainings ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead
+0.015` with seeds 12 and 13, and without edges seeds 20 to 25.
+"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line."""
+
+    folders: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Folders of trainings; without any, the page is written from the stored data."""
+    episodes: int = 200
+    """Episodes of a trial."""
+    stress_episodes: int = 100
+    """Episodes of a stress test."""
+    processes: int = 1
+
+
+def measure(folder: Path, seed: int, episodes: int, stress_episodes: int) -> Row:
+    """Try a policy, and repeat its stress test."""
+    torch.set_num_threads(1)
+    row = trial(Table1Args(out=folder, episodes=episodes), CASE, seed, RealityWorldCfg())
+    policy = Policy.load(training(folder, seed) / POLICY)
+    test = policy.run.stress_test(device="cpu", episodes=stress_episodes, seed=seed)
+    found = test(policy.act_in(test.environment))
+    geometry = policy.run.model.geometry
+    assert geometry is not None
+    row["stress"] = {"successes": int(found.success.sum()), "episodes": stress_episodes}
+    row["spheres"] = len(geometry)
+    row["settings"] = changed({**json.loads(json.dumps(asdict(policy.run.cfg))), "stress": {}})
+    return row
+
+
+def training(folder: Path, seed: int) -> Path:
+    """Return the folder of a training."""
+    return folder / "runs" / f"{CASE}_{STAGE}_{seed}"
+
+
+def page(rows: Sequence[Row]) -> str:
+    """Return the page."""
+    groups: dict[tuple[str, int, int], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["settings"], row["spheres"], round(row["trained"]["steps"], -5)), []).append(row)
+
+    def successes(of: Sequence[Row]) -> tuple[int, int]:
+        return sum(row["successes"] for row in of), sum(row["episodes"] for row in of)
+
+    lines = []
+    for (settings, spheres, steps), of in sorted(groups.items(), key=lambda one: -np.divide(*successes(one[1]))):
+        count, episodes = successes(of)
+        low, high = wilson(count, episodes)
+        each = ", ".join(
+            f"{row['seed']}: {row['successes'] / row['episodes']:.1%}" for row in sorted(of, key=lambda r: r["seed"])
+        )
+        simulated = np.mean([row["simulation"]["rate"] for row in of])
+        stressed = np.mean([row["stress"]["successes"] / row["stress"]["episodes"] for row in of])
+        name = f"`{settings}`" if settings else "default"
+        lines.append([
+            name, f"{spheres}", f"{steps / 1e6:.1f} M", f"{count / episodes:.1%}", f"{low:.1%} to {high:.1%}", each,
+            f"{simulated:.1%}", f"{stressed:.1%}",
+        ])  # fmt: skip
+    head = ["settings", "spheres", "steps", "succeed", "95 %", "seeds", "in simulation", "stress test"]
+    parts = ["# Trials of policies", "Written by `benchmarks/train/trials.py`; do not edit.", ABOUT, table(head, lines)]
+    parts += ["## Does the stress test predict success?", prediction(rows)]
+    for what, name in (("Trials", "machine"), ("Policies", "trained_on")):
+        parts += [f"{what}: {line}" for line in dict.fromkeys(machine_line(row[name]) for row in rows)]
+    return "\n\n".join(parts)
+
+
+def prediction(rows: Sequence[Row]) -> str:
+    """Return what the rank correlation of stress test and trial is, with an interval over policies."""
+    stress = np.array([row["stress"]["successes"] / row["stress"]["episodes"] for row in rows])
+    real = np.array([row["successes"] / row["episodes"] for row in rows])
+    rng = np.random.default_rng(0)
+    drawn = [rank_correlation(stress[k], real[k]) for k in rng.integers(len(rows), size=(2000, len(rows)))]
+    low, high = np.nanpercentile(drawn, [2.5, 97.5])
+    return (
+        f"Spearman's rank correlation over {len(rows)} policies, settings and seeds mixed: "
+        f"{rank_correlation(stress, real):.2f} [{low:.2f}, {high:.2f}] (bootstrap over policies)."
+    )
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return Spearman's rank correlation of two sets of numbers (n,)."""
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+
+
+def main() -> None:
+    """Try what is not tried yet, and write the page."""
+    args = tyro.cli(Args, description=__doc__)
+    data = read_data(NAME)
+    for folder in args.folders:
+        kept = Measurements(folder / f"{NAME}.jsonl")
+        seeds = sorted(int(path.name.rsplit("_", 1)[1]) for path in (folder / "runs").glob(f"{CASE}_{STAGE}_*"))
+        left = [seed for seed in seeds if kept.wanted(f"{folder.name} {seed}")]
+        jobs = (delayed(measure)(folder, seed, args.episodes, args.stress_episodes) for seed in left)
+        found = Parallel(n_jobs=args.processes, return_as="generator")(jobs)
+        for seed, row in zip(left, found, strict=True):
+            assert row is not None
+            kept.add(f"{folder.name} {seed}", row)
+        data |= kept.rows
+    write_data(NAME, data)
+    write_page(NAME, page(list(data.values())))
+
+
+if __name__ == "__main__":
+    main()
