@@ -14,7 +14,8 @@ import torch
 import warp as wp
 
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.environment.physics import Graph, WarpPhysics
+from concent_warp.train.environment.graphs import Graph
+from concent_warp.train.environment.physics import WarpPhysics
 
 PARTS = ("command", "physics", "distances", "judge", "poses and pairs", "observe")
 """Parts of a step, as `Environment.parts` returns them."""

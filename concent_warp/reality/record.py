@@ -24,7 +24,6 @@ from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
-from concent_warp.simulate.fields import apply_fields
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,9 @@ def _perform(
         # A generator of its own, so that all else is the same with and without variation.
         pads = pad_geoms(model, task.robot.gripper_actuators)
         fields = variation.sample(model, scene.objects(), pads, 1, rng.spawn(1)[0])
-        apply_fields(model, {name: values[0] for name, values in fields.items()}, data)
+        for name, values in fields.items():
+            getattr(model, name)[:] = values[0]
+        mujoco.mj_setConst(model, data)
     data.qpos[:] = home(model)
     block_joint = model.joint("block_joint").qposadr[0]
     data.qpos[block_joint : block_joint + 2] = block

@@ -71,5 +71,3 @@ class VariationCfg:
             "actuator_gainprm": gain,
             "actuator_biasprm": bias,
         }
-
-

@@ -11,7 +11,8 @@ from small_insertion import SETTINGS
 from concent_warp.errors import TrainError
 from concent_warp.train.cfg import TrainCfg
 from concent_warp.train.environment.environment import TERMS, Environment
-from concent_warp.train.environment.physics import WarpPhysics, _compiled_or_plain
+from concent_warp.train.environment.graphs import _compiled_or_plain
+from concent_warp.train.environment.physics import WarpPhysics
 from concent_warp.train.environment.randomisation import sample_model_fields
 from concent_warp.train.environment.worlds import _make_physics, make_environment, simulation_steps
 

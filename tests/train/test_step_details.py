@@ -230,7 +230,7 @@ def test_reset_spreads_the_elapsed_times_and_forgets_the_past():
     assert not environment.episode_length_buf.any()
     environment._sums += 3
     environment._success_average += 0.5
-    environment._has_diverged.fill_(True)
+    environment._divergence.happened.fill_(True)
     environment._return += 1
     torch.manual_seed(0)
     environment.reset()

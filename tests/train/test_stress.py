@@ -96,7 +96,7 @@ def test_extremes_are_the_ends_of_the_ranges(task, extremes):
         assert len(np.unique(np.column_stack(list(factors.values())) > 1.05, axis=0)) > 8
 
 
-def test_test_worlds_are_the_models_own_with_all_spheres_and_smaller_steps(run):
+def test_stress_worlds_are_the_models_own_with_all_spheres_and_smaller_steps(run):
     test = with_stress(run, StressCfg(episodes=5, refine=4)).stress_test(device="cpu")
     environment = test.environment
     assert environment.num_envs == 5
@@ -115,7 +115,7 @@ def test_test_worlds_are_the_models_own_with_all_spheres_and_smaller_steps(run):
     assert environment.task.collidable.all()
 
 
-def test_test_perturbs_the_grasped_object(run):
+def test_stress_test_perturbs_the_grasped_object(run):
     always = replace(run.cfg.environment, randomisation=replace(NOTHING_VARIES, perturbation_share=1.0))
     cfg = replace(run.cfg, environment=always, stress=replace(QUICK, perturbation=(2.0, 0.0)))
     test = replace(run, cfg=cfg).stress_test(device="cpu")
@@ -131,7 +131,7 @@ def test_test_perturbs_the_grasped_object(run):
     assert float(torch.stack(forces[1:])[..., :3].std()) == pytest.approx(2.0, rel=0.2)
 
 
-def test_test_is_of_the_whole_task_from_states_that_training_does_not_have(run):
+def test_stress_test_is_of_the_whole_task_from_states_that_training_does_not_have(run):
     chain = replace(CHAIN, worlds=4, reset=replace(CHAIN.reset, states=6))
     cfg = TrainCfg(environment=chain, stress=replace(QUICK, episodes=6))
     test = replace(run, cfg=cfg).stress_test(device="cpu")

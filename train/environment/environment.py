@@ -7,7 +7,6 @@ a captured graph.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, cast
@@ -22,9 +21,11 @@ from concent_warp.checkpoint_file import check_state
 from concent_warp.errors import TrainError
 from concent_warp.kernels.contact_pairs import ContactPairs
 from concent_warp.train.cfg import EnvironmentCfg
+from concent_warp.train.environment.first_divergence import FirstDivergence
+from concent_warp.train.environment.graphs import Graph, captured
 from concent_warp.train.environment.initial_states import InitialStates
 from concent_warp.train.environment.observation import BaseObservation, ObservationLayout
-from concent_warp.train.environment.physics import Graph, Physics, captured
+from concent_warp.train.environment.physics import Physics
 from concent_warp.train.environment.quaternions import invert_quaternion, rotate_vectors
 from concent_warp.train.environment.reward import (
     disturbance_penalty,
@@ -197,8 +198,7 @@ class Environment(VecEnv):
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
-        self._diverged_state = torch.zeros(m.nq + m.nv + m.nu + 7 * m.nmocap + 1, dtype=torch.float64, device=device)
-        self._has_diverged = torch.zeros((), dtype=torch.bool, device=device)
+        self._divergence = FirstDivergence(m, str(device))
         self._none = torch.zeros(n, device=device)
         self._success_average = torch.zeros((), device=device)
         self._perturbing = torch.ones((), device=device)
@@ -210,7 +210,7 @@ class Environment(VecEnv):
             self._start(torch.ones_like(self.done))
             self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
             self._return.zero_()
-            for value in (self._sums, self._success_average, self._has_diverged):
+            for value in (self._sums, self._success_average, self._divergence.happened):
                 value.zero_()
             self.refresh()
 
@@ -295,13 +295,7 @@ class Environment(VecEnv):
         It has "qpos" (nq,), "qvel" (nv,), "ctrl" (nu,) before the action, the poses of fixed objects, "mocap_pos"
         (nmocap, 3) [m] and "mocap_quat" (nmocap, 4), and the index of the "world", shape ().
         """
-        if not bool(self._has_diverged):
-            return None
-        m, values = self.task.compiled, self._diverged_state.cpu().numpy()
-        shapes = {"qpos": (m.nq,), "qvel": (m.nv,), "ctrl": (m.nu,), "mocap_pos": (m.nmocap, 3)}
-        shapes |= {"mocap_quat": (m.nmocap, 4), "world": ()}
-        parts = np.split(values, np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1])
-        return {name: part.reshape(shape) for part, (name, shape) in zip(parts, shapes.items(), strict=True)}
+        return self._divergence.state()
 
     @property
     def buffers(self) -> tuple[int, int] | None:
@@ -450,7 +444,7 @@ class Environment(VecEnv):
         finished = (self.episode_length_buf >= self.max_episode_length) | (self._steps_at_rest >= self._rest)
         self.time_out.copy_(finished & ~failed)
         self.done.copy_(failed | self.time_out)
-        self._record_divergence(diverged)
+        self._divergence.record(diverged, (*self._before, *p.mocap, self._worlds))
         self._count(terms)
         state = p.qpos, p.qvel, p.ctrl, *p.mocap, self.stage
         moving = valid & ~self.done & ~self.success
@@ -505,15 +499,6 @@ class Environment(VecEnv):
         sums.append(((p.overflow & p.dropping) != 0).double().sum())
         self._sums += torch.stack(sums)
         p.overflow.zero_()
-
-    def _record_divergence(self, diverged: torch.Tensor) -> None:
-        """Store the state before the step in which a world first diverged."""
-        world = diverged.to(torch.uint8).argmax()
-        parts = [*self._before, *self.physics.mocap, self._worlds]
-        state = torch.cat([values.index_select(0, world[None]).flatten().double() for values in parts])
-        first = diverged.any() & ~self._has_diverged
-        self._diverged_state.copy_(torch.where(first, state, self._diverged_state))
-        self._has_diverged.logical_or_(first)
 
     def _start(self, mask: torch.Tensor, rows: torch.Tensor | None = None) -> None:
         """Start episodes in the worlds of a mask (N,) bool, from initial states of rows (N,), by default random."""

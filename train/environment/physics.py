@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,6 +15,8 @@ import warp as wp
 from concent_warp.simulate.fields import apply_fields
 from concent_warp.simulate.mujoco_engine import quiet_warnings
 from concent_warp.train.environment.command_dynamics import CommandDynamics, CommandFilter
+from concent_warp.train.environment.graphs import Graph, captured
+from concent_warp.train.environment.kinematics import Kinematics, MujocoKinematics, WarpKinematics
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
@@ -25,29 +26,6 @@ UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, 
 """Warnings after which MuJoCo resets a world to its reference pose."""
 DROPPED = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """Warnings that contacts or constraints were dropped for lack of memory."""
-
-
-class Kinematics(Protocol):
-    """Forward kinematics of N worlds at positions of one's own; the tensors are views of what the kinematics read."""
-
-    qpos: torch.Tensor
-    """Shape (N, nq)."""
-    mocap: tuple[torch.Tensor, torch.Tensor]
-    """Positions [m] (N, nmocap, 3) and orientations (N, nmocap, 4) of fixed objects."""
-    position: torch.Tensor
-    """Body origins [m], world frame, shape (N, nbody, 3)."""
-    quaternion: torch.Tensor
-    """Body orientations, wxyz, shape (N, nbody, 4)."""
-    site: torch.Tensor
-    """Site positions [m], world frame, shape (N, nsite, 3)."""
-
-    def poses(self) -> tuple[wp.array, wp.array]:
-        """Return positions and orientations as Warp arrays, of `wp.vec3` and `wp.quat`, shape (N, nbody)."""
-        ...
-
-    def update(self) -> None:
-        """Compute the poses from the generalised positions."""
-        ...
 
 
 class Physics(Protocol):
@@ -254,36 +232,6 @@ class MujocoPhysics:
             array[i] = value
 
 
-class MujocoKinematics:
-    """Forward kinematics in C MuJoCo."""
-
-    def __init__(self, model: mujoco.MjModel, worlds: int) -> None:
-        """Start at the model's reference positions."""
-        self._model, self._data = model, mujoco.MjData(model)
-        self._xpos = wp.zeros((worlds, model.nbody), dtype=wp.vec3, device="cpu")
-        self._xquat = wp.zeros((worlds, model.nbody), dtype=wp.quat, device="cpu")
-        self.position, self.quaternion = wp.to_torch(self._xpos), wp.to_torch(self._xquat)
-        self.qpos = torch.from_numpy(np.tile(model.qpos0, (worlds, 1)))
-        places = [np.tile(values, (worlds, 1, 1)) for values in (self._data.mocap_pos, self._data.mocap_quat)]
-        self.mocap = torch.from_numpy(places[0]), torch.from_numpy(places[1])
-        self.site = torch.zeros(worlds, model.nsite, 3)
-
-    def poses(self) -> tuple[wp.array, wp.array]:
-        """Return positions and orientations as Warp arrays."""
-        return self._xpos, self._xquat
-
-    def update(self) -> None:
-        """Compute the poses from the generalised positions."""
-        m, d = self._model, self._data
-        given = self.qpos.numpy(), self.mocap[0].numpy(), self.mocap[1].numpy()
-        found = self.position.numpy(), self.quaternion.numpy(), self.site.numpy()
-        for i, (qpos, place, turn) in enumerate(zip(*given, strict=True)):
-            d.qpos[:], d.mocap_pos[:], d.mocap_quat[:] = qpos, place, turn
-            mujoco.mj_kinematics(m, d)
-            for array, value in zip(found, (d.xpos, d.xquat, d.site_xpos), strict=True):
-                array[i] = value
-
-
 class WarpPhysics:
     """Worlds of MuJoCo-Warp; a captured CUDA graph steps them."""
 
@@ -420,97 +368,3 @@ class WarpPhysics:
                     force_model.launch(self._model, self._data, values)
             self._mjw.step(self._model, self._data)
         self._mjw.kinematics(self._model, self._data)
-
-
-class WarpKinematics:
-    """Forward kinematics in MuJoCo-Warp, captured in a graph."""
-
-    def __init__(
-        self, model: mujoco.MjModel, warp_model: Any, worlds: int, device: wp.Device, capture: bool
-    ) -> None:
-        """Start at the model's reference positions; `warp_model` is MuJoCo-Warp's model."""
-        import mujoco_warp as mjw
-
-        with wp.ScopedDevice(device):
-            # Kinematics read no contacts; these are the smallest buffers there are.
-            self._data = d = mjw.make_data(model, nworld=worlds, nconmax=1, njmax=1)
-            self.qpos, self.site = wp.to_torch(d.qpos), wp.to_torch(d.site_xpos)
-            self.position, self.quaternion = wp.to_torch(d.xpos), wp.to_torch(d.xquat)
-            torch_device = self.qpos.device
-            self.mocap = (
-                (wp.to_torch(d.mocap_pos), wp.to_torch(d.mocap_quat))
-                if model.nmocap
-                else (torch.zeros(worlds, 0, 3, device=torch_device), torch.zeros(worlds, 0, 4, device=torch_device))
-            )
-            mjw.kinematics(warp_model, d)  # loads the module
-            self._update = Graph(lambda: mjw.kinematics(warp_model, d), device, capture)
-
-    def poses(self) -> tuple[wp.array, wp.array]:
-        """Return positions and orientations as Warp arrays."""
-        return self._data.xpos, self._data.xquat
-
-    def update(self) -> None:
-        """Compute the poses from the generalised positions."""
-        self._update.launch()
-
-
-class Graph:
-    """Warp launches, captured once and replayed on torch's current stream."""
-
-    def __init__(self, launches: Callable[[], None], device: Any, capture: bool) -> None:
-        """Capture `launches`, which must have run before; without `capture` they are called each time."""
-        self._launches, self._device, self._graph = launches, device, None
-        self._streams: dict[int, wp.Stream] = {}
-        if capture:
-            with wp.ScopedDevice(device), wp.ScopedCapture() as captured:
-                launches()
-            self._graph = captured.graph
-
-    def launch(self) -> None:
-        """Launch the graph on torch's current stream."""
-        stream = None
-        if self._device.is_cuda:
-            current = torch.cuda.current_stream(wp.device_to_torch(self._device))
-            if current.cuda_stream not in self._streams:
-                self._streams[current.cuda_stream] = wp.stream_from_torch(current)
-            stream = self._streams[current.cuda_stream]
-        with wp.ScopedDevice(self._device), wp.ScopedStream(stream):
-            if self._graph is None:
-                self._launches()
-            else:
-                wp.capture_launch(self._graph, stream=stream)
-
-
-def _compiled_or_plain(part: Callable[[], None]) -> Callable[[], None]:
-    """Run torch operations on fixed buffers; return them compiled into few kernels, or uncompiled if that fails."""
-    from torch._dynamo.exc import TorchDynamoException
-
-    compiled = torch.compile(part, fullgraph=True, dynamic=False)
-    try:
-        with torch.no_grad():
-            compiled()
-    except TorchDynamoException as error:
-        lines = str(error).strip().splitlines()
-        warnings.warn(f"operations are not fused: {lines[0] if lines else type(error).__name__}", stacklevel=2)
-        return part
-    return compiled
-
-
-def captured(part: Callable[[], None], capture: bool, *, fuse: bool = False) -> Callable[[], None]:
-    """Return torch operations on fixed buffers as a CUDA graph, fused if asked; unchanged without `capture`."""
-    if not capture:
-        return part
-    if fuse:
-        part = _compiled_or_plain(part)
-    with torch.no_grad():
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(2):
-                part()
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            part()
-    recorded = part, graph  # compiled kernels must outlive their launches
-    return lambda: recorded[1].replay()

@@ -87,7 +87,12 @@ def check_worlds(task: Task, cfg: EnvironmentCfg, device: str | None = None) -> 
 
 
 def _make_physics(
-    task: Task, cfg: EnvironmentCfg, *, device: str | None = None, seed: int = 0, refine: int = 1,
+    task: Task,
+    cfg: EnvironmentCfg,
+    *,
+    device: str | None = None,
+    seed: int = 0,
+    refine: int = 1,
     time_constant: float | None = None,
 ) -> Physics:
     """Return the simulated worlds of a task."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
-import random
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -28,6 +27,7 @@ from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.learning.metrics import curve
 from concent_warp.train.learning.normalisation import bound_observations
+from concent_warp.train.learning.random_state import random_state, restore_random_state, seed_everything
 
 CHECKPOINT = TRAIN_CHECKPOINT
 """File of the latest checkpoint in a run folder."""
@@ -111,10 +111,10 @@ class Trainer:
         self.process = process or DistributedProcess()
         self.device = str(environment.device)
         torch.set_float32_matmul_precision("high" if cfg.ppo.tf32 else "highest")
-        _seed_everything(cfg.seed)  # the same networks on all ranks
+        seed_everything(cfg.seed)  # the same networks on all ranks
         self.algorithm = _make_ppo(environment, cfg.ppo, self.process)
         if not self.process.is_rank_zero:
-            _seed_everything(self.process.seed(cfg.seed))
+            seed_everything(self.process.seed(cfg.seed))
         self.iteration, self.steps, self.seconds = 0, 0, 0.0
         self.history: list[Iteration] = []
         self._has_diverged = False
@@ -169,12 +169,12 @@ class Trainer:
         every = self.cfg.stress.every
         if self._make_examination is None or not every or self.iteration % every or not self.process.is_rank_zero:
             return
-        begun, state = time.monotonic(), _random_state(self.device)
+        begun, state = time.monotonic(), random_state(self.device)
         if self._examine is None:
             self._examine = self._make_examination()
         successes, episodes = self._examine(self.policy())
         self.algorithm.train_mode()
-        _restore_random_state(state, self.device)
+        restore_random_state(state, self.device)
         this.log |= {"stress success": successes / episodes, "stress seconds": time.monotonic() - begun}
         if not self.best or successes >= self.best["successes"]:
             weights = {name: value.clone() for name, value in self.algorithm.actor.state_dict().items()}
@@ -300,12 +300,12 @@ class Trainer:
             TrainError: It does not fit the memory.
         """
         assert self._make_environment is not None
-        random_state, state = _random_state(self.device), self.environment.state()
+        random, state = random_state(self.device), self.environment.state()
         del self.environment
         gc.collect()
         self.environment = self._make_environment(buffers)
         self.environment.restore(state)
-        _restore_random_state(random_state, self.device)
+        restore_random_state(random, self.device)
 
     @contextlib.contextmanager
     def _writer(self) -> Iterator[Report]:
@@ -333,7 +333,7 @@ class Trainer:
         if self.folder is None:
             return
         worlds = {name: value.cpu() for name, value in self.environment.state().items()}
-        ranks = self.process.gather({"environment": worlds, "random": _random_state(self.device)})
+        ranks = self.process.gather({"environment": worlds, "random": random_state(self.device)})
         if not self.process.is_rank_zero:
             return
         document = {**self.weights(), "learning_rate": self.algorithm.learning_rate, "ranks": ranks}
@@ -402,7 +402,7 @@ class Trainer:
             check_at_least(1, TrainError, contacts=contacts, constraints=constraints)
             self._rebuild((int(contacts), int(constraints)))
         self.environment.restore(state["environment"])
-        _restore_random_state(state["random"], self.device)
+        restore_random_state(state["random"], self.device)
 
     def policy(self) -> Callable[[TensorDict], torch.Tensor]:
         """Return the deterministic policy: from observations to actions, shape (N, A)."""
@@ -494,23 +494,3 @@ def chosen_weights(weights: Mapping[str, Any]) -> dict[str, Any]:
     outcome = {name: best.get(name, 0) for name in ("iteration", "successes", "episodes")}
     kept = {name: value for name, value in weights.items() if name != "best"}
     return {**kept, "actor_state_dict": best["actor_state_dict"], "stress": outcome}
-
-
-def _seed_everything(seed: int) -> None:
-    """Seed all generators."""
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002
-    torch.manual_seed(seed)
-
-
-def _random_state(device: str) -> dict[str, Any]:
-    """Return the state of torch's generators on the CPU and on a device; training samples from no others."""
-    cuda = torch.cuda.get_rng_state(device).cpu() if device.startswith("cuda") else None
-    return {"cpu": torch.get_rng_state(), "cuda": cuda}
-
-
-def _restore_random_state(state: dict[str, Any], device: str) -> None:
-    """Set torch's generators to a state that `_random_state` returned."""
-    torch.set_rng_state(state["cpu"].cpu())
-    if state["cuda"] is not None and device.startswith("cuda"):
-        torch.cuda.set_rng_state(state["cuda"].cpu(), device)
