@@ -57,7 +57,7 @@ _HOMES = {
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
     "train.observation_cfg": ("SensorErrorsCfg",),
-    "train.policy.evaluate": ("Evaluation",),
+    "train.trials.evaluate": ("Evaluation",),
     "train.policy.load": ("Policy", "load_policy"),
     "train.train": ("train",),
 }
@@ -114,9 +114,9 @@ if TYPE_CHECKING:
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
     from concent_warp.train.observation_cfg import SensorErrorsCfg
-    from concent_warp.train.policy.evaluate import Evaluation
     from concent_warp.train.policy.load import Policy, load_policy
     from concent_warp.train.train import train
+    from concent_warp.train.trials.evaluate import Evaluation
 
 
 def __getattr__(name: str) -> Any:

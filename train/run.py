@@ -21,10 +21,10 @@ from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.ppo import CHECKPOINT, Examination, Iteration, Report, Trainer
-from concent_warp.train.policy.episodes import PolicyFunction
-from concent_warp.train.policy.stress import StressTest
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.episodes import PolicyFunction
+from concent_warp.train.trials.stress import StressTest
 
 MODEL, EVENTS, DEMONSTRATION = "model.toml", "events.json", "demonstration.h5"
 CHANGEABLE = ("iterations", "checkpoint", "target", "capture", "fuse")

@@ -171,8 +171,8 @@ def with_stage(run: TrainingRun, stage: str) -> TrainingRun:
 def simulated(run: TrainingRun, checkpoint: Path, args: Args, device: str) -> dict[str, Any]:
     """Return what the policy without exploration does in simulation, from states that training has not seen."""
     from concent_warp.train.environment.worlds import make_environment
-    from concent_warp.train.policy.evaluate import run_episodes
     from concent_warp.train.policy.load import Policy
+    from concent_warp.train.trials.evaluate import run_episodes
 
     task = run.task()
     states = run.evaluation_states(task, args.episodes, run.cfg.seed)

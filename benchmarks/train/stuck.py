@@ -30,10 +30,10 @@ from concent_warp.errors import ConcentError
 from concent_warp.train.cfg import EnvironmentCfg, RandomisationCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.policy.episodes import Episodes, PolicyFunction
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.run import TrainingRun
+from concent_warp.train.trials.episodes import Episodes, PolicyFunction
 
 NAME = "train_stuck"
 LOST = 0.05

@@ -31,10 +31,10 @@ from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.observation_cfg import SensorErrorsCfg
-from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.evaluate import run_episodes, wilson
 
 NAME = "train_table1"
 TOLERANCE, HOLD = 0.004, 2

@@ -28,8 +28,8 @@ from benchmarks.train.learning import POLICY, changed
 from benchmarks.train.table1 import Args as Table1Args
 from benchmarks.train.table1 import trial
 from concent_warp.deploy.cfg import RealityWorldCfg
-from concent_warp.train.policy.evaluate import wilson
 from concent_warp.train.policy.load import Policy
+from concent_warp.train.trials.evaluate import wilson
 
 NAME = "train_trials"
 CASE, STAGE = "ours", "insert"

@@ -18,10 +18,10 @@ from concent_warp.reality.hidden.in_task import TaskWorld
 from concent_warp.reality.sensors.video import render_video, write_video
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.policy.evaluate import Evaluation, run_episodes
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.evaluate import Evaluation, run_episodes
 
 
 def evaluate(

@@ -94,7 +94,7 @@ def _make_player(
     torch.manual_seed(seed)
     settings = replace(run.cfg.environment, worlds=1)
     if world == "reality":
-        environment = reality_environment(task, settings, states, cfg)
+        environment = reality_environment(task, settings, states, cfg, seed=seed)
         shown = environment.physics.model
     else:
         environment = make_environment(task, settings, states, device=device)

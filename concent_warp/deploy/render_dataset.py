@@ -144,7 +144,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     import torch
 
     from concent_warp.train.environment.worlds import make_environment
-    from concent_warp.train.policy.episodes import SUCCESS, Episodes
+    from concent_warp.train.trials.episodes import SUCCESS, Episodes
 
     cfg, run = to.cfg, policy.run
     task = run.task()

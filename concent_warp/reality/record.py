@@ -84,6 +84,8 @@ def record(
         ConcentError: A seed or a setting is out of bounds.
     """
     check_settings(cfg)
+    if variation is not None:
+        check_settings(variation)
     for seed in seeds:
         check_seed(seed)
     scene = cfg.task.build()

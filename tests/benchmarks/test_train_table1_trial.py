@@ -114,8 +114,8 @@ def trial(train_table1, monkeypatch, tmp_path):
             asked["states"] = count, seed
             return states
 
-        def reality_environment(task, cfg, starts, world):
-            asked["cfg"], asked["starts"], asked["world"] = cfg, starts, world
+        def reality_environment(task, cfg, starts, world, seed):
+            asked["cfg"], asked["starts"], asked["world"], asked["seed"] = cfg, starts, world, seed
             return Environment(
                 task, replace(cfg, collision="full"), ChosenPhysics(task.compiled, cfg.worlds, 3), starts
             )

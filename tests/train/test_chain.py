@@ -11,11 +11,11 @@ from small_insertion import CHAIN, HOLE, SETTINGS, make_task
 from concent_warp.errors import TrainError
 from concent_warp.train.environment.environment import TERMS, Environment
 from concent_warp.train.environment.worlds import _make_physics, make_environment
-from concent_warp.train.policy.evaluate import run_episodes
 from concent_warp.train.resets.sample import ResetStates, sample_reset_states
 from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.stages import _worst_distance
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.evaluate import run_episodes
 
 WORLDS = 6
 

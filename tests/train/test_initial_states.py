@@ -20,19 +20,27 @@ def initial(worlds: int, **settings: float) -> InitialStates:
     return InitialStates(SAMPLED, cfg, worlds, "cpu", CONTROL_STEP)
 
 
-def state_of(worlds: int, number: float) -> tuple[torch.Tensor, ...]:
+def state_of(worlds: int, number: float, stage: int = 1) -> tuple[torch.Tensor, ...]:
     """Return a state whose numbers all are this one, and the index of the world in hundreds."""
     m = TASK.compiled
     shapes = (m.nq,), (m.nv,), (m.nu,), (m.nmocap, 3), (m.nmocap, 4)
     world = 100 * torch.arange(worlds)
     parts = [(number + world.double()).view(-1, *[1] * len(s)).expand(worlds, *s).clone() for s in shapes]
-    return *parts, (number + world).int()
+    return *parts, torch.full((worlds,), stage, dtype=torch.int32)
 
 
-def keep(states: InitialStates, number: float, distance: list[float], moving: object = True, counts: float = 1) -> None:
+def keep(
+    states: InitialStates,
+    number: float,
+    distance: list[float],
+    moving: object = True,
+    counts: float = 1,
+    stage: int = 1,
+) -> None:
     """Offer a state with these distances to the target."""
     mask = torch.zeros(len(distance), dtype=torch.bool) | torch.as_tensor(moving)
-    states.keep_stuck(state_of(len(distance), number), torch.tensor(distance), mask, torch.tensor(float(counts)))
+    state = state_of(len(distance), number, stage)
+    states.keep_stuck(state, torch.tensor(distance), mask, torch.tensor(float(counts)))
 
 
 def stored(states: InitialStates) -> int:
@@ -44,7 +52,7 @@ def kept(states: InitialStates, rows: int = 8) -> list[float]:
     parts = states.at(torch.arange(4, 4 + rows))
     for part in parts[:-2]:  # but for the stage, a whole number, and whether it is before the first stage
         assert (part.flatten(1) == part.flatten(1)[:, :1]).all()
-    assert torch.equal(parts[-2].float(), parts[0][:, 0])
+    assert set(parts[-2].tolist()) <= {0, 1}
     assert not parts[-1].any()
     return parts[0][:, 0].tolist()
 
@@ -64,6 +72,26 @@ def test_state_is_stuck_after_the_time_without_progress():
         keep(states, k, [distance])
     assert stored(states) == 2
     assert kept(states, 3) == [3.0, 23.0, 0.0]
+
+
+def test_progress_towards_the_target_of_another_stage_counts_from_its_start():
+    states = initial(1)
+    keep(states, 1, [0.01], stage=0)
+    for k, distance in enumerate((0.05, 0.045, 0.04, 0.035, 0.03)):  # farther than ever before, and coming nearer
+        keep(states, k, [distance])
+    assert stored(states) == 0
+    for k in range(3):
+        keep(states, k, [0.03])
+    assert stored(states) == 1
+
+
+def test_progress_counts_anew_where_an_episode_starts():
+    states = initial(2)
+    for k in range(3):
+        keep(states, k, [0.02, 0.02])
+    states.forget_progress(torch.tensor([True, False]))
+    keep(states, 3, [0.02, 0.02])
+    assert stored(states) == 1
 
 
 def test_progress_is_a_decrease_by_the_gain_since_the_last_progress():

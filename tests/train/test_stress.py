@@ -19,11 +19,11 @@ from concent_warp.train.learning.metrics import read_curve
 from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Trainer, chosen_weights, load_checkpoint
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
-from concent_warp.train.policy.stress import stressed
 from concent_warp.train.policy.write_pretrained import write_pretrained
 from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.run import TrainingRun, train_run
 from concent_warp.train.train import train
+from concent_warp.train.trials.stress import stressed
 
 QUICK = StressCfg(every=2, episodes=3, refine=1)
 ACTOR = "actor_state_dict"

@@ -20,9 +20,9 @@ from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.learning.metrics import CURVE, read_curve
 from concent_warp.train.learning.ppo import CHECKPOINT, DIVERGED_STATE_FILE, Iteration, load_checkpoint
 from concent_warp.train.observation_cfg import ObservationCfg
-from concent_warp.train.policy.evaluate import run_episodes, wilson
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
+from concent_warp.train.trials.evaluate import run_episodes, wilson
 
 LEARNING = PpoCfg(iterations=40, hidden=(64, 64), learning_rate=2e-3)
 SHORT = PpoCfg(iterations=4, steps=4, hidden=(16,), epochs=2, batches=2)

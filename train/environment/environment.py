@@ -510,6 +510,7 @@ class Environment(VecEnv):
             shaped = mask.view(-1, *[1] * (state.ndim - 1))
             state.copy_(torch.where(shaped, given.to(state.dtype), state))
         self._started.logical_or_(mask)
+        self._initial.forget_progress(mask)
         p.warmstart.copy_(torch.where(mask[:, None], 0.0, p.warmstart))
         self._stages_met.copy_(torch.where(mask, self.stage - self.task.first, self._stages_met))
         for counter in (self._steps_within, self._steps_at_rest, self.episode_length_buf, self._return):

@@ -43,6 +43,7 @@ class InitialStates:
         self._stored = torch.zeros((), dtype=torch.long, device=device)
         self._best = torch.full((worlds,), torch.inf, device=device)
         self._waited = torch.zeros(worlds, dtype=torch.int32, device=device)
+        self._stage = torch.full((worlds,), -1, dtype=torch.int32, device=device)
 
     @property
     def memory(self) -> dict[str, torch.Tensor]:
@@ -51,7 +52,7 @@ class InitialStates:
             return {}
         names = ("qpos", "qvel", "ctrl", "mocap position", "mocap quaternion", "stage")
         stuck = {name: part[self._sampled :] for name, part in zip(names, self._pool, strict=True)}
-        own = {"stored": self._stored, "best distance": self._best, "waited": self._waited}
+        own = {"stored": self._stored, "best distance": self._best, "waited": self._waited, "of stage": self._stage}
         return {f"stuck {name}": value for name, value in (stuck | own).items()}
 
     def sample(self, success: torch.Tensor) -> torch.Tensor:
@@ -75,10 +76,17 @@ class InitialStates:
         """
         return tuple(part[rows] for part in (*self._pool, self._begins))
 
+    def forget_progress(self, mask: torch.Tensor) -> None:
+        """Let progress count anew in the worlds of a mask (N,) bool, where episodes start."""
+        self._best.masked_fill_(mask, torch.inf)
+        self._waited.masked_fill_(mask, 0)
+
     def keep_stuck(
         self, state: tuple[torch.Tensor, ...], distance: torch.Tensor, moving: torch.Tensor, counts: torch.Tensor
     ) -> None:
         """Store the states of worlds whose distance to the target has not decreased for `StuckCfg.after`.
+
+        The progress of a world whose stage is another than before counts from then on.
 
         Args:
             state: Parts as `at` returns them, but for the last, with N rows each.
@@ -89,7 +97,9 @@ class InitialStates:
         """
         if not self._room:
             return
-        better = distance < self._best - self._cfg.gain
+        stage = state[-1]
+        better = (distance < self._best - self._cfg.gain) | (stage != self._stage)
+        self._stage.copy_(stage)
         self._best.copy_(torch.where(moving, torch.where(better, distance, self._best), torch.inf))
         self._waited.copy_(torch.where(moving & ~better, self._waited + 1, 0))
         stuck = (self._waited == self._after) & (distance < self._cfg.within) & (counts > 0)

@@ -79,7 +79,7 @@ class Physics(Protocol):
         ...
 
     def kinematics(self) -> Kinematics:
-        """Return kinematics of the same bodies, at the positions of these worlds until others are written."""
+        """Return kinematics of the same bodies, at the model's reference positions until others are written."""
         ...
 
 

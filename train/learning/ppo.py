@@ -171,7 +171,14 @@ class Trainer:
             return
         begun, state = time.monotonic(), random_state(self.device)
         if self._examine is None:
-            self._examine = self._make_examination()
+            try:
+                self._examine = self._make_examination()
+            except TrainError as error:
+                self._warn(f"no stress test, and the last policy is kept: {error}")
+                self._make_examination = None
+                restore_random_state(state, self.device)
+                return
+        torch.manual_seed(self.cfg.seed)  # the same chances for all policies
         successes, episodes = self._examine(self.policy())
         self.algorithm.train_mode()
         restore_random_state(state, self.device)
@@ -395,7 +402,7 @@ class Trainer:
                         raise ValueError(f"{name} of shape {tuple(moment.shape)} for weights {tuple(weight.shape)}")
         ppo.learning_rate = float(document["learning_rate"])
         self.iteration, self.steps, self.seconds = (document[name] for name in ("iteration", "steps", "seconds"))
-        self.best = document.get("best", {})
+        self.best = chosen_best(document)
         buffers = document.get("buffers")
         if self._make_environment is not None and buffers is not None and buffers != self.environment.buffers:
             contacts, constraints = buffers
@@ -472,7 +479,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     numbers = ("iteration", "steps", "seconds")
     weights = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "learning_rate")
     keys = ("actor_state_dict", *numbers)
-    document = read_checkpoint(path, keys=keys, finite=(*weights, *numbers), error=TrainError)
+    document = read_checkpoint(path, keys=keys, finite=(*weights, *numbers, "best"), error=TrainError)
     for name in numbers:
         value = document[name]
         if not isinstance(value, int | float if name == "seconds" else int) or value < 0:
@@ -480,17 +487,34 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return document
 
 
-def chosen_weights(weights: Mapping[str, Any]) -> dict[str, Any]:
+def chosen_best(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a checkpoint says of the policy that did best in the stress test, as `Trainer.best`.
+
+    Raises:
+        TrainError: It is incomplete.
+    """
+    best = checkpoint.get("best") or {}
+    if not best:
+        return {}
+    if not isinstance(best, Mapping) or not isinstance(best.get("actor_state_dict"), Mapping):
+        raise TrainError("the checkpoint's best policy has no weights")
+    for name in ("iteration", "successes", "episodes"):
+        if not isinstance(best.get(name), int) or best[name] < 0:
+            raise TrainError(
+                f"{name} of the checkpoint's best policy is no count", expected="at least 0", found=best.get(name)
+            )
+    return dict(best)
+
+
+def chosen_weights(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Return a checkpoint with the policy that did best in the stress test in place of the last one, if there is one.
 
     Raises:
         TrainError: What it says about that policy is incomplete.
     """
-    best = weights.get("best") or {}
-    if not best:
-        return dict(weights)
-    if not isinstance(best, Mapping) or not isinstance(best.get("actor_state_dict"), Mapping):
-        raise TrainError("the checkpoint's best policy has no weights")
-    outcome = {name: best.get(name, 0) for name in ("iteration", "successes", "episodes")}
-    kept = {name: value for name, value in weights.items() if name != "best"}
-    return {**kept, "actor_state_dict": best["actor_state_dict"], "stress": outcome}
+    outcome = chosen_best(checkpoint)
+    if not outcome:
+        return dict(checkpoint)
+    weights = outcome.pop("actor_state_dict")
+    kept = {name: value for name, value in checkpoint.items() if name != "best"}
+    return {**kept, "actor_state_dict": weights, "stress": outcome}

@@ -11,9 +11,9 @@ from concent_warp.errors import TrainError
 from concent_warp.run_folder import check_training
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, chosen_weights, load_checkpoint
-from concent_warp.train.policy.episodes import PolicyFunction
 from concent_warp.train.policy.pretrained import FOLDER, pretrained_checkpoint, pretrained_names
 from concent_warp.train.run import TrainingRun
+from concent_warp.train.trials.episodes import PolicyFunction
 
 
 @dataclass(frozen=True)

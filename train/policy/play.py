@@ -9,8 +9,8 @@ import numpy as np
 
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.episodes import Episodes, PolicyFunction
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.episodes import Episodes, PolicyFunction
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.run_folder import check_folder, make_folder
 
 if TYPE_CHECKING:
-    from concent_warp.train.policy.evaluate import Evaluation
+    from concent_warp.train.trials.evaluate import Evaluation
 
 
 @dataclass(frozen=True)

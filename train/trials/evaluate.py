@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.policy.episodes import MISSED, SUCCESS, Episodes, PolicyFunction
 from concent_warp.train.resets.sample import ResetStates
+from concent_warp.train.trials.episodes import MISSED, SUCCESS, Episodes, PolicyFunction
 
 Watch = Callable[[np.ndarray, np.ndarray], None]
 """Called with the indices (R,) of the running episodes and their positions (R, nq)."""

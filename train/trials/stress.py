@@ -13,10 +13,10 @@ from dataclasses import replace
 from concent_warp.train.cfg import EnvironmentCfg, StressCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
-from concent_warp.train.policy.episodes import PolicyFunction
-from concent_warp.train.policy.evaluate import Evaluation, run_episodes
 from concent_warp.train.resets.sample import sample_reset_states
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.episodes import PolicyFunction
+from concent_warp.train.trials.evaluate import Evaluation, run_episodes
 
 SEED, OTHER_SEED = 2_000_000, 3_000_000
 """Added to a training's seed, or to another one, for the initial states and worlds of a test."""
