@@ -453,7 +453,7 @@ def test_state_comes_back_and_one_that_lacks_a_part_or_is_of_another_shape_is_re
         "qpos", "qvel", "ctrl", "warmstart", "mocap position", "mocap quaternion", "length", "return", "stage",
         "from start", "stages met", "steps within", "steps at rest", "success average", "history", "stuck qpos",
         "stuck qvel", "stuck ctrl", "stuck mocap position", "stuck mocap quaternion", "stuck stage", "stuck stored",
-        "stuck best distance", "stuck waited",
+        "stuck best distance", "stuck waited", "stuck of stage",
     }  # fmt: skip
     estimated = {
         "past position", "past orientation", "past hand", "past turn", "position", "orientation", "constant", "seen",

@@ -228,18 +228,26 @@ class Environment(VecEnv):
     def refresh(self, *, measure: bool = True) -> None:
         """Compute poses, distances and observation of the present state; without `measure` from the last readings."""
         with torch.no_grad():
-            self.physics.update_poses()
-            self._paired.launch()
-            if self.estimate is not None:
-                if measure:
-                    self._encoders()
-                    self.estimate.kinematics.update()
-                    self._tracker()
-                self.estimate.kinematics.update()
-                self._seen_paired.launch()
-            self._observe()
+            self._update_poses_and_pairs()
+            self._sense_and_observe(measure)
+
+    def _update_poses_and_pairs(self) -> None:
+        """Compute poses and distances of the present state."""
+        self.physics.update_poses()
+        self._paired.launch()
+
+    def _sense_and_observe(self, measure: bool = True) -> None:
+        """Compute the observation of the present state; see `refresh`."""
+        if self.estimate is not None:
             if measure:
-                self._remember()
+                self._encoders()
+                self.estimate.kinematics.update()
+                self._tracker()
+            self.estimate.kinematics.update()
+            self._seen_paired.launch()
+        self._observe()
+        if measure:
+            self._remember()
 
     def get_observations(self) -> TensorDict:
         """Return copies of the present observations, which rsl-rl keeps during the next step.
@@ -345,13 +353,9 @@ class Environment(VecEnv):
         """Return the parts of a step in order, for profiling: commands, physics, distances, rewards and resets, poses
         and distances of the new states, observation.
         """
-
-        def poses_and_pairs() -> None:
-            self.physics.update_poses()
-            self._paired.launch()
-
         return (
-            self._command, self.physics.advance, self._measured.launch, self._evaluate, poses_and_pairs, self._observe,
+            self._command, self.physics.advance, self._measured.launch, self._evaluate, self._update_poses_and_pairs,
+            self._sense_and_observe,
         )  # fmt: skip
 
     def relative_position(self) -> torch.Tensor:
