@@ -10,7 +10,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import torch
-from small_insertion import EXACT_STATE, NOTHING_VARIES
 
 from concent_warp.events.cfg import StagingCfg
 from concent_warp.events.sequence import ContactEvent, ContactEventSequence, ContactPair, Entity, Stage
@@ -34,6 +33,7 @@ from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.robot import Robot
 from concent_warp.train.task.stages import DemonstratedStages
 from concent_warp.train.task.task import Replay, Task
+from tests.train.small_insertion import EXACT_STATE, NOTHING_VARIES
 
 XML = """
 <mujoco>
