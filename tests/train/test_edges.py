@@ -15,6 +15,15 @@ from concent_warp.train.task.task import Task
 CFG = EdgeCfg()
 
 
+def extended(model: Model, touched: np.ndarray | None = None) -> cw.ContactGeometry:
+    """Return the spheres of a model with those along edges, near touched ones or near all."""
+    assert model.geometry is not None
+    touched = np.ones(len(model.geometry), dtype=bool) if touched is None else touched
+    found = with_edge_spheres(model, touched, CFG).geometry
+    assert found is not None
+    return found
+
+
 @pytest.fixture(scope="module")
 def model() -> Model:
     """Return the shape sorter with spheres that no fit has moved."""
@@ -25,7 +34,7 @@ def model() -> Model:
 def test_small_massless_spheres_lie_within_the_objects_near_touched_ones(model):
     touched = np.zeros(512, dtype=bool)
     touched[model.geometry.of("block")[:20]] = True
-    found = with_edge_spheres(model, touched, CFG).geometry
+    found = extended(model, touched)
     for name in ("body", "position", "radius", "mass", "friction"):
         np.testing.assert_array_equal(getattr(found, name)[:512], getattr(model.geometry, name))
     added = slice(512, None)
@@ -46,9 +55,10 @@ def test_small_massless_spheres_lie_within_the_objects_near_touched_ones(model):
 def test_geometry_with_edge_spheres_of_its_own_gets_hardly_more(model):
     scene = model.scene
     own = Model(scene, cw.ContactGeometryCfg(edges=400).build(scene))
-    more = [len(with_edge_spheres(m, np.ones(len(m.geometry), dtype=bool), CFG).geometry) for m in (model, own)]
-    assert more[0] - len(model.geometry) > 300
-    assert more[1] - len(own.geometry) < 0.2 * (more[0] - len(model.geometry))
+    assert own.geometry is not None
+    more = len(extended(model)) - len(model.geometry)
+    assert more > 300
+    assert len(extended(own)) - len(own.geometry) < 0.2 * more
 
 
 def test_edges_move_as_the_faces_beside_them(model):
