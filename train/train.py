@@ -11,8 +11,9 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import RunFolder, plain, run_folder, write_settings
 from concent_warp.train.cfg import TrainCfg
+from concent_warp.train.learning.best_policy import chosen_weights
 from concent_warp.train.learning.distributed import DistributedProcess
-from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, chosen_weights
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.run import TrainingRun, train_run
 

@@ -228,7 +228,7 @@ def test_reset_spreads_the_elapsed_times_and_forgets_the_past():
     task = exact_task()
     environment, physics = make_environment(task, replace(EXACT, worlds=300, episode=0.3), made_up_states(task))
     assert not environment.episode_length_buf.any()
-    environment._sums += 3
+    environment._log.sums += 3
     environment._success_average += 0.5
     environment._divergence.happened.fill_(True)
     environment._return += 1
@@ -280,7 +280,7 @@ def test_log_is_of_the_steps_since_the_last_one_and_of_all_ranks():
     environment._from_start[:] = torch.tensor([True, True, False, False])
     environment.step(still(environment))
     # One episode has ended: lost, after one step, and it began before the first stage.
-    total = environment._sums.clone()
+    total = environment._log.sums.clone()
     log = environment.read_log(lambda sums: 3 * sums)
     assert log["steps"] == 12
     assert log["episodes"] == log["chains"] == log["diverged worlds"] + 3 == 3
@@ -292,9 +292,9 @@ def test_log_is_of_the_steps_since_the_last_one_and_of_all_ranks():
     reach = float(total[TERMS.index("reach")])
     assert log["reach"] == pytest.approx(reach / 4)
     assert not any(environment.read_log().values())
-    environment._sums[:] = 0.0
-    environment._sums[environment._names.index("episodes")] = 1.0
-    environment._sums[environment._names.index("return")] = 5.0
+    environment._log.sums[:] = 0.0
+    environment._log.sums[environment._log.names.index("episodes")] = 1.0
+    environment._log.sums[environment._log.names.index("return")] = 5.0
     assert environment.read_log()["return"] == 5.0
     single = make_task(EXACT, first=2)
     log = make_environment(single, EXACT)[0].read_log()

@@ -15,8 +15,9 @@ from concent_warp.train.cfg import EdgeCfg, RandomisationCfg, StressCfg, TrainCf
 from concent_warp.train.environment.physics import MujocoPhysics
 from concent_warp.train.environment.randomisation import sample_model_fields
 from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.learning.best_policy import chosen_weights
 from concent_warp.train.learning.metrics import read_curve
-from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Trainer, chosen_weights, load_checkpoint
+from concent_warp.train.learning.ppo import CHECKPOINT, Iteration, Trainer, load_checkpoint
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.policy.write_pretrained import write_pretrained

@@ -34,16 +34,11 @@ from concent_warp.train.environment.reward import (
     relative_pose,
 )
 from concent_warp.train.environment.state_estimate import StateEstimate
+from concent_warp.train.environment.step_log import TERMS, StepLog
 from concent_warp.train.environment.virtual_collision import virtual_collision
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.task import Task
-
-TERMS = ("reach", "stages", "action", "velocity", "press", "disturb", "vcp", "failure")
-"""Terms of the reward, in the order of `Environment.terms`."""
-EPISODE_SUMS = ("episodes", "success", "time outs", "dropped", "severe", "diverged", "return", "length")
-CHAIN_SUMS = ("chains", "chain success")
-"""Sums over episodes that started before the first stage; the number that met each stage's target follows."""
 
 
 class Environment(VecEnv):
@@ -193,8 +188,7 @@ class Environment(VecEnv):
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self._return = torch.zeros(n, device=device)
         chained = [self.task.events.stages[s].name for s in self.task.chained]
-        self._names = (*TERMS, "steps", *EPISODE_SUMS, *CHAIN_SUMS, *(f"met {name}" for name in chained), "overflow")
-        self._sums = torch.zeros(len(self._names), dtype=torch.float64, device=device)
+        self._log = StepLog(chained, is_chain=self.task.demonstrated is not None, device=str(device))
         self._before = [torch.zeros_like(t) for t in (self.physics.qpos, self.physics.qvel, self.physics.ctrl)]
         objects = len(self.task.objects)
         self._pose_before = torch.zeros(n, objects, 3, device=device), torch.zeros(n, objects, 4, device=device)
@@ -210,7 +204,7 @@ class Environment(VecEnv):
             self._start(torch.ones_like(self.done))
             self.episode_length_buf.copy_(torch.randint_like(self.episode_length_buf, self.max_episode_length))
             self._return.zero_()
-            for value in (self._sums, self._success_average, self._divergence.happened):
+            for value in (self._log.sums, self._success_average, self._divergence.happened):
                 value.zero_()
             self.refresh()
 
@@ -285,17 +279,7 @@ class Environment(VecEnv):
         Args:
             total: Sums a tensor over ranks; by default only this process's worlds count.
         """
-        values = self._sums.clone() if total is None else total(self._sums.clone())
-        sums = dict(zip(self._names, values.tolist(), strict=True))
-        self._sums.zero_()
-        per = dict.fromkeys((*TERMS, "overflow"), "steps")
-        per |= {name: "chains" for name in self._names if name.startswith(("met ", "chain "))}
-        means = {name: value / max(sums[per.get(name, "episodes")], 1.0) for name, value in sums.items()}
-        chained = {name: means.pop(name) for name in self._names if name == "chains" or per.get(name) == "chains"}
-        if self.task.demonstrated is not None:
-            success, means["success of all"] = chained.pop("chain success"), means["success"]
-            means |= {**chained, "success": success, "chains": sums["chains"]}
-        return {**means, "steps": sums["steps"], "episodes": sums["episodes"], "diverged worlds": sums["diverged"]}
+        return self._log.read(total)
 
     def diverged_state(self) -> dict[str, np.ndarray] | None:
         """Return the state before the step in which a world first diverged, None if none has.
@@ -494,14 +478,10 @@ class Environment(VecEnv):
         keep = torch.exp(-ended.sum() / self.num_envs)
         share = (self.done & succeeded).double().sum() / ended.sum().clamp(min=1.0)
         self._success_average.copy_(torch.lerp(share, self._success_average.double(), keep))
-        counts = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
-        sums = [*terms.double().sum(dim=0).unbind(), (ended * 0 + 1).sum(), ended.sum()]
-        sums += [count.double().sum() for count in counts]
-        sums += [(ended * self._return).sum(), (ended * self.episode_length_buf).sum()]
-        sums += [chains.double().sum(), (chains & succeeded).double().sum()]
-        sums += [(chains & (self.reached > k)).double().sum() for k in range(len(self.task.chained))]
-        sums.append(((p.overflow & p.dropping) != 0).double().sum())
-        self._sums += torch.stack(sums)
+        outcomes = [succeeded, self.time_out, *self.failure.unbind(dim=1)]
+        sums = [(ended * self._return).sum(), (ended * self.episode_length_buf).sum()]
+        counts = [chains, chains & succeeded, *(chains & (self.reached > k) for k in range(len(self.task.chained)))]
+        self._log.add(terms, ended, outcomes, sums, [*counts, (p.overflow & p.dropping) != 0])
         p.overflow.zero_()
 
     def _start(self, mask: torch.Tensor, rows: torch.Tensor | None = None) -> None:

@@ -23,6 +23,7 @@ from concent_warp.checks import check_at_least
 from concent_warp.errors import TrainError
 from concent_warp.run_folder import TRAIN_CHECKPOINT
 from concent_warp.train.cfg import PpoCfg, TrainCfg
+from concent_warp.train.learning.best_policy import chosen_best
 from concent_warp.train.learning.distributed import DistributedProcess
 from concent_warp.train.learning.distribution import SquashedGaussian
 from concent_warp.train.learning.metrics import curve
@@ -485,36 +486,3 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         if not isinstance(value, int | float if name == "seconds" else int) or value < 0:
             raise TrainError(f"{name} of the checkpoint is no count", where=path, expected="at least 0", found=value)
     return document
-
-
-def chosen_best(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a checkpoint says of the policy that did best in the stress test, as `Trainer.best`.
-
-    Raises:
-        TrainError: It is incomplete.
-    """
-    best = checkpoint.get("best") or {}
-    if not best:
-        return {}
-    if not isinstance(best, Mapping) or not isinstance(best.get("actor_state_dict"), Mapping):
-        raise TrainError("the checkpoint's best policy has no weights")
-    for name in ("iteration", "successes", "episodes"):
-        if not isinstance(best.get(name), int) or best[name] < 0:
-            raise TrainError(
-                f"{name} of the checkpoint's best policy is no count", expected="at least 0", found=best.get(name)
-            )
-    return dict(best)
-
-
-def chosen_weights(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a checkpoint with the policy that did best in the stress test in place of the last one, if there is one.
-
-    Raises:
-        TrainError: What it says about that policy is incomplete.
-    """
-    outcome = chosen_best(checkpoint)
-    if not outcome:
-        return dict(checkpoint)
-    weights = outcome.pop("actor_state_dict")
-    kept = {name: value for name, value in checkpoint.items() if name != "best"}
-    return {**kept, "actor_state_dict": weights, "stress": outcome}

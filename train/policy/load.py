@@ -10,7 +10,8 @@ from typing import Any
 from concent_warp.errors import TrainError
 from concent_warp.run_folder import check_training
 from concent_warp.train.environment.environment import Environment
-from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, chosen_weights, load_checkpoint
+from concent_warp.train.learning.best_policy import chosen_weights
+from concent_warp.train.learning.ppo import CHECKPOINT, Trainer, load_checkpoint
 from concent_warp.train.policy.pretrained import FOLDER, pretrained_checkpoint, pretrained_names
 from concent_warp.train.run import TrainingRun
 from concent_warp.train.trials.episodes import PolicyFunction

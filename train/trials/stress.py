@@ -7,6 +7,7 @@ alone, so that a policy can be chosen by it before any trial.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -66,8 +67,17 @@ class StressTest:
         return self._made
 
     def __call__(self, policy: PolicyFunction, progress: Callable[[float], None] | None = None) -> Evaluation:
-        """Return the outcomes of a policy's episodes."""
-        return run_episodes(self.environment, policy, self._states, progress=progress)
+        """Return the outcomes of a policy's episodes; they are repeated where the simulator had dropped contacts."""
+        while True:
+            environment = self.environment
+            environment.read_log()
+            found = run_episodes(environment, policy, self._states, progress=progress)
+            buffers = environment.buffers
+            if not environment.read_log()["overflow"] or buffers is None:
+                return found
+            warnings.warn("contacts were dropped in the stress test: the episodes are repeated", stacklevel=2)
+            self._cfg = replace(self._cfg, nconmax=2 * buffers[0], njmax=2 * buffers[1])
+            self._made = None
 
 
 def stressed(cfg: EnvironmentCfg, stress: StressCfg) -> EnvironmentCfg:
@@ -82,6 +92,8 @@ def stressed(cfg: EnvironmentCfg, stress: StressCfg) -> EnvironmentCfg:
         collision="full",
         cone="elliptic",
         stride=1,
+        nconmax=None,  # what was enough for fewer spheres
+        njmax=None,
         edges=t.edges,
         randomisation=harder,
         observation=replace(cfg.observation, sensors=t.sensors),
