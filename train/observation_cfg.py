@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Duration, Interval, Rate, Share
+from concent_warp.checks import Bounds, Duration, Share
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class SensorErrorsCfg:
     """Standard deviation of a joint reading [rad or m]."""
     encoder_step: float = 1e-4
     """Step in which joint readings are quantised [rad or m]; 0 for none."""
-    rate: Rate = 30.0
+    rate: Annotated[float, Bounds(1, 1000)] = 30.0
     """Frame rate of the tracker [Hz]."""
     position_std: float = 1e-3
     """Standard deviation of a tracked position per axis [m]."""
@@ -35,7 +35,7 @@ class SensorErrorsCfg:
     from frame to frame."""
     dropout: Share = 0.05
     """Share of frames in which an object is not found."""
-    latency: Interval = (1.0, 2.0)
+    latency: Annotated[tuple[float, float], Bounds(0, 100, ascending=True)] = (1.0, 2.0)
     """Time from a frame to its pose [frames]; sampled once for each episode."""
 
 
