@@ -280,3 +280,18 @@ def test_training_returns_the_policy_that_did_best(run):
     policy = train(one.model, one.recording, one.cfg, events=one.events, device="cpu")
     assert policy.stress is not None
     assert policy.stress[1] == 3
+
+
+def test_episodes_with_dropped_contacts_are_repeated_with_more_room(run):
+    few = replace(run.cfg.environment, engine="warp", episode=0.2)
+    small = replace(run, cfg=replace(run.cfg, environment=few, stress=replace(QUICK, episodes=2)))
+    test = small.stress_test(device="cpu")
+    assert (test._cfg.nconmax, test._cfg.njmax) == (None, None)
+    test._cfg = replace(test._cfg, nconmax=2, njmax=64)
+    with pytest.warns(UserWarning, match="contacts were dropped in the stress test"):
+        found = test(lambda observation: torch.zeros(observation.batch_size[0], run.task().robot.actions))
+    assert len(found.success) == 2
+    buffers = test.environment.buffers
+    assert buffers is not None
+    assert buffers[0] > 2
+    assert test.environment.read_log()["overflow"] == 0
