@@ -81,7 +81,7 @@ def click(page: Page, label: str) -> None:
 def test_robot_and_spheres_are_drawn_and_those_that_touch_are_red(page, tmp_path):
     import cv2
 
-    page.wait_for(r"[1-9]\d+ of 512 spheres touch")
+    page.wait_for(r"[1-9]\d+ of 912 spheres touch")
     end = time.monotonic() + 30
     while True:
         page.screenshot(tmp_path / "page.png")

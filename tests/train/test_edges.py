@@ -76,10 +76,12 @@ def test_edges_move_as_the_faces_beside_them(model):
 
 
 def test_task_has_them_in_its_physics_beside_the_spheres_of_the_events():
-    run = cw.load_policy("shape_sorter").run
-    plain = run.task()
-    cfg = replace(run.cfg.environment, edges=EdgeCfg(count=200))
-    task = Task.build(run.model, run.recording[0], cfg, run.events)
+    run = cw.load_policy("pick_align_insert").run  # its geometry has none
+    without = replace(run.cfg.environment, stage="insert", edges=EdgeCfg(count=0))
+    plain, task = (
+        Task.build(run.model, run.recording[0], cfg, run.events)
+        for cfg in (without, replace(without, edges=EdgeCfg(count=200)))
+    )
     more = len(task.collidable) - len(plain.collidable)
     assert more > 10
     assert task.collidable[-more:].all()
