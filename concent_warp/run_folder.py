@@ -33,8 +33,15 @@ TRAIN_SETTINGS = "train.toml"
 """File of the settings of a training; a folder that holds one is the run folder of a training."""
 EPISODES = ".staging"
 """Folder of the episodes of a data set that are not packed yet, each named by six digits."""
-STATES = ("checkpoint.*", f"{EPISODES}/{6 * '[0-9]'}", f"{EPISODES}/dropped-*", "meta/info.json", "dataset.hdf5")
-"""Patterns of the files from which a run is resumed: of fits and trainings, and of data sets."""
+STATES = (
+    "checkpoint.*",
+    f"seed_*/{TRAIN_CHECKPOINT}",
+    f"{EPISODES}/{6 * '[0-9]'}",
+    f"{EPISODES}/dropped-*",
+    "meta/info.json",
+    "dataset.hdf5",
+)
+"""Patterns of the files from which a run is resumed: of fits, trainings with one seed and several, and data sets."""
 FREE = ("out", "resume", "overwrite", "engine", "recording", "model", "scene")
 """Settings that may differ when a run is continued: paths, and those without influence on the result."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -161,7 +161,7 @@ def train_run(
     process = process or DistributedProcess()
     with process.raise_together():
         if folder is not None and process.is_rank_zero and resume:
-            _check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
+            check_unchanged(TrainCfg.load(folder / SETTINGS), run.cfg, folder)
         task, device, seed = run.task(), process.device(device), process.seed(run.cfg.seed)
         check_worlds(task, run.cfg.environment, device)  # before much is computed
         states = sample_reset_states(task, run.cfg.environment.reset, seed, device=device)
@@ -199,7 +199,7 @@ def train_run(
     return trainer, trainer.learn(report, seconds=seconds)
 
 
-def _check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
+def check_unchanged(before: TrainCfg, now: TrainCfg, folder: Path) -> None:
     """Check that settings are those that a training was started with.
 
     Raises:

@@ -56,6 +56,8 @@ class Arguments:
     """Reward; short for --environment.reward.kind."""
     collision: Literal["vcp", "full"] | None = None
     """Spheres in the physics; short for --environment.collision."""
+    seeds: Count = 1
+    """Policies to train, one after the other; the one that does best in the stress test is kept."""
     iterations: Count | None = None
     """Iterations of PPO; short for --ppo.iterations."""
     train: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
@@ -87,24 +89,26 @@ def run(arguments: Arguments) -> Policy:
     events = None if arguments.events is None else ContactEventSequence.load(arguments.events)
     quiet_warp()
     from concent_warp.train.learning.ppo import CHECKPOINT
+    from concent_warp.train.several_seeds import SEEDS_FILE
     from concent_warp.train.train import train
 
     begin_with = None if arguments.begin_with is None else given_policy(arguments.begin_with, None)
     cfg = arguments.cfg()
     last: Iteration | None = None
+    total = arguments.seeds * cfg.ppo.iterations
     with status_bar("training") as update:
 
         def progress(this: Iteration) -> None:
             nonlocal last
             last = this
             text = f"{this.steps:,} steps, success {this.log['success']:.1%}, {this.rate:,.0f} steps/s"
-            left = this.seconds / this.iteration * (cfg.ppo.iterations - this.iteration)
-            update(this.iteration / cfg.ppo.iterations, text, left)
+            update(this.iteration / total, text, this.seconds / this.iteration * (total - this.iteration))
 
         policy = train(
             model,
             recording,
             cfg,
+            seeds=arguments.seeds,
             events=events,
             demonstration=arguments.demonstration,
             begin_with=begin_with,
@@ -115,11 +119,13 @@ def run(arguments: Arguments) -> Policy:
             progress=progress,
         )
     if last is None:
-        say(f"nothing is left to train: {cfg.ppo.iterations} iterations are done")
+        say(f"nothing is left to train: {total} iterations are done")
     else:
         say(f"{last.steps:,} steps in {last.seconds:.0f} s, success while exploring {last.log['success']:.1%}")
     if policy.stress is not None:
         successes, episodes = policy.stress
         say(f"stress test: {successes} of {episodes} succeed under the best policy, which is the one that is kept")
+        if arguments.seeds > 1:
+            say(f"its seed is {policy.run.cfg.seed}; {SEEDS_FILE} has the results of all")
     say_written(folder / CHECKPOINT)
     return policy

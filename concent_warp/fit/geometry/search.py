@@ -110,7 +110,7 @@ class FitResult:
         >>> run = cw.load_policy("shape_sorter").run
         >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
         >>> len(fit.history), fit.mask.shape
-        (1, (512,))
+        (1, (912,))
     """
 
     model: Model

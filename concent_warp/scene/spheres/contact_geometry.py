@@ -30,7 +30,7 @@ class ContactGeometry:
         >>> import concent_warp as cw
         >>> geometry = cw.load_policy("shape_sorter").run.model.geometry
         >>> geometry.bodies, geometry.position.shape
-        (('block', 'box'), (512, 3))
+        (('block', 'box'), (912, 3))
     """
 
     bodies: tuple[str, ...]
