@@ -30,6 +30,8 @@ from concent_warp.train.reset_cfg import ResetCfg
 Range = tuple[float, float]
 ALL = "all"
 """Name of the chain of all stages."""
+LAST = "last"
+"""Name of the last stage, whatever it is called."""
 SINGLE_STAGE_DURATION, CHAIN_DURATION = 3.0, 12.0
 """Default durations of an episode of one stage and of a chain of stages [s]."""
 SETTINGS = TRAIN_SETTINGS
@@ -215,8 +217,8 @@ class EnvironmentCfg:
         4096
     """
 
-    stage: str = "insert"
-    """Stage of the contact event sequence whose target event is trained; "all" chains all stages."""
+    stage: str = LAST
+    """Stage of the contact event sequence whose target event is trained; "last" is the last one, "all" chains all."""
     worlds: Worlds = 4096
     """Number of environments simulated in parallel, on each rank."""
     episode: PositiveDuration | None = None
@@ -348,8 +350,13 @@ class PpoCfg:
 class StressCfg:
     """The stress test: episodes in the model's best physics, with friction and masses at the ends of their ranges.
 
-    All spheres and sharp edges are in the physics, cones are elliptic, contacts stiff and steps short.
+    Objects have the shapes of the scene, or all spheres with sharp edges; cones are elliptic, contacts stiff and steps
+    short.
     """
+
+    shapes: Literal["nominal", "spheres"] = "nominal"
+    """Shapes of the objects: those of the scene's geoms, or the spheres. The spheres where the scene has no shapes to
+    collide with, such as a mesh with a hole."""
 
     every: Annotated[int, Bounds(0, 1_000_000)] = 50
     """Iterations between tests during training, of which the best policy is kept; 0 for none. A training that ends
@@ -373,7 +380,7 @@ class StressCfg:
     sensors: SensorErrorsCfg = field(default_factory=SensorErrorsCfg)
     """Errors of the instruments."""
     edges: EdgeCfg = field(default_factory=EdgeCfg)
-    """Small spheres along edges."""
+    """Small spheres along edges, where there are spheres."""
 
 
 @dataclass(frozen=True)

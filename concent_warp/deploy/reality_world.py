@@ -49,8 +49,11 @@ def reality_environment(
     bodies = [task.compiled.body(i).name for i in range(task.compiled.nbody)]
     if [model.body(i).name for i in range(model.nbody)] != bodies or model.nq != task.compiled.nq:
         raise TrainError("Reality has other bodies than the model", where=task.model.scene.source)
-    if task.target_position is not None:
-        task = replace(task, target_position=np.array([0.0, 0.0, world.shapes.floor + world.shapes.block_size / 2]))
+    goal = task.model.scene.goal()
+    if goal is None and task.model.scene.spec().modelname == "shape_sorter":
+        goal = world.shapes.goal()
+    if goal is not None and task.target_position is not None and task.stage == len(task.events.stages) - 1:
+        task = replace(task, target_position=goal)
     steps = round(cfg.decimation * task.replay.timestep / world.reality.timestep)
     actors = [[Actor(one.effect.force, one.effect.command) for one in real.hidden()] for _ in range(cfg.worlds)]
     names = [task.compiled.body(i).name for i in task.objects]

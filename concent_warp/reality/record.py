@@ -12,7 +12,7 @@ import numpy as np
 
 from concent_warp.checks import Bounds, check_seed, check_settings
 from concent_warp.reality.expert.inverse_kinematics import solve_path
-from concent_warp.reality.expert.plan import ExpertCfg, plan
+from concent_warp.reality.expert.plan import ExpertCfg, Task, plan
 from concent_warp.reality.expert.steering import aligned, arm_joints, deflection, finger_joints
 from concent_warp.reality.fingers import pad_geoms
 from concent_warp.reality.run import WorldLog, simulate, simulate_to_rest
@@ -24,11 +24,12 @@ from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
+from concent_warp.scene.tabletop import yaw_quaternion
 
 
 @dataclass(frozen=True)
 class RealityCfg:
-    """Settings of recordings in Reality: the shape sorter demonstrated by the scripted expert."""
+    """Settings of recordings in Reality: a task demonstrated by the scripted expert, by default the shape sorter."""
 
     task: ShapeSorterCfg = field(default_factory=ShapeSorterCfg)
     """Nominal positions and sizes; the block's pose is sampled around these for each demonstration."""
@@ -41,9 +42,9 @@ class RealityCfg:
     footage: FootageCfg = field(default_factory=FootageCfg)
     """Colour cameras."""
     place_spread: Annotated[float, Bounds(0, 10)] = 0.02
-    """Half width of the square in which the block's position is sampled [m]."""
+    """Half width of the square in which the position of object 1 is sampled [m]."""
     yaw_spread: Annotated[float, Bounds(0, math.pi)] = 0.15
-    """Half width of the block's rotation about the vertical [rad]."""
+    """Half width of its rotation about the vertical [rad]."""
     settling_time: Annotated[float, Bounds(0, 3600)] = 0.3
     """Time simulated before the recording starts, so that objects and arm come to rest [s]."""
 
@@ -57,28 +58,36 @@ class Truth:
     qpos: np.ndarray
     """Positions, shape (T, nq); the joints are those of the scene."""
     block_position: np.ndarray
-    """Block origin [m], world frame, shape (T, 3)."""
+    """Origin of object 1, the block [m], world frame, shape (T, 3)."""
     contacts: dict[tuple[str, str], np.ndarray]
     """Whether two bodies were in contact, by body pair in alphabetical order, shape (T,) bool."""
     box_force: np.ndarray
-    """Force of the box on the block [N], shape (T, 3)."""
+    """Force of object 2, the box, on object 1 [N], shape (T, 3)."""
     success: bool
-    """Whether the block came to rest in the hole."""
+    """Whether object 1 came to rest in its place."""
 
 
 def record(
     cfg: RealityCfg,
     seeds: list[int],
     *,
+    task: Task | None = None,
     effects: tuple[HiddenEffect, ...] = (),
     variation: VariationCfg | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, list[Truth]]:
     """Return a recording with one demonstration per seed in the same scene, and the truth of each.
 
-    The box has the configured pose in every demonstration; the block's pose and the expert's offsets are sampled from
-    the seed. With `variation`, so are friction, masses and gains; by default they are the nominal scene's. `progress`
-    is called with the share done, 0..1.
+    Object 2 has the configured pose in every demonstration; the pose of object 1 and the expert's offsets are sampled
+    from the seed. With `variation`, so are friction, masses and gains; by default they are the nominal scene's.
+
+    Args:
+        cfg: Settings.
+        seeds: One for each demonstration.
+        task: What is demonstrated; the shape sorter `cfg.task` by default.
+        effects: Hidden effects.
+        variation: What varies between demonstrations.
+        progress: Called with the share done, 0..1.
 
     Raises:
         ConcentError: A seed or a setting is out of bounds.
@@ -88,11 +97,14 @@ def record(
         check_settings(variation)
     for seed in seeds:
         check_seed(seed)
-    scene = cfg.task.build()
+    task = task or cfg.task
+    check_settings(task)
+    scene = task.build()
     demonstrations, truths = [], []
     for k, seed in enumerate(seeds):
         demonstration, truth = _perform(
             cfg,
+            task,
             scene,
             f"demo_{k}",
             np.random.default_rng(seed),
@@ -107,6 +119,7 @@ def record(
 
 def _perform(
     cfg: RealityCfg,
+    nominal: Task,
     scene: Scene,
     name: str,
     rng: np.random.Generator,
@@ -115,10 +128,10 @@ def _perform(
     progress: Callable[[float], None] | None,
 ) -> tuple[Demonstration, Truth]:
     """Run one demonstration."""
-    block = np.array(cfg.task.block_position) + rng.uniform(-cfg.place_spread, cfg.place_spread, 2)
-    task = replace(
-        cfg.task, block_position=tuple(block), block_yaw=cfg.task.block_yaw + rng.uniform(-1, 1) * cfg.yaw_spread
-    )
+    moved = scene.model.body(nominal.objects[0])
+    place = moved.pos[:2] + rng.uniform(-cfg.place_spread, cfg.place_spread, 2)
+    yaw = 2 * math.atan2(moved.quat[3], moved.quat[0]) + rng.uniform(-1, 1) * cfg.yaw_spread
+    task = nominal.placed_at((float(place[0]), float(place[1])), yaw)
     world = cfg.world.build(scene, effects)
     model = world.compile()
     data = mujoco.MjData(model)
@@ -130,9 +143,9 @@ def _perform(
             getattr(model, name)[:] = values[0]
         mujoco.mj_setConst(model, data)
     data.qpos[:] = home(model)
-    block_joint = model.joint("block_joint").qposadr[0]
-    data.qpos[block_joint : block_joint + 2] = block
-    data.qpos[block_joint + 3 : block_joint + 7] = [np.cos(task.block_yaw / 2), 0, 0, np.sin(task.block_yaw / 2)]
+    joint = model.jnt_qposadr[model.body(task.objects[0]).jntadr[0]]
+    data.qpos[joint : joint + 2] = place
+    data.qpos[joint + 3 : joint + 7] = yaw_quaternion(yaw)
     for joint in finger_joints(model):
         data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint, 1]
     gripper = [model.actuator(a).id for a in task.robot.gripper_actuators]
@@ -179,19 +192,27 @@ def _perform(
             for channel, stream in measured.items():
                 time, value = effect.measure(channel, stream.time, stream.value)
                 measured[channel] = replace(stream, time=time, value=value)
-    demonstration = Demonstration(
-        name, "put the block into the hole of the box", truth.success, qpos, qvel, actions, measured, points, image
-    )
+    demonstration = Demonstration(name, task.text, truth.success, qpos, qvel, actions, measured, points, image)
     return demonstration, truth
 
 
-def _judge(model: mujoco.MjModel, log: WorldLog, task: ShapeSorterCfg) -> Truth:
+def _judge(model: mujoco.MjModel, log: WorldLog, task: Task) -> Truth:
     """Return the true states and contacts of a log."""
-    address = model.sensor_adr[model.sensor("block_position").id]
-    position = np.array(log.sensordata)[:, address : address + 3]
+    first, second = task.objects
+    readings = np.array(log.sensordata)
+
+    def reading(name: str) -> np.ndarray:
+        sensor = model.sensor(name)
+        return readings[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+
+    position = reading(f"{first}_position")
     names = {pair for pairs in log.pairs for pair in pairs}
     contacts = {pair: np.array([pair in pairs for pairs in log.pairs]) for pair in sorted(names)}
-    force = np.array([-pairs.get(("block", "box"), np.zeros(3)) for pairs in log.pairs])
-    seat = np.array([*task.box_position, task.floor + task.block_size / 2])
-    success = bool(np.abs(position[-1] - seat).max() < 0.003)
+    pair = (min(first, second), max(first, second))
+    sign = 1.0 if pair[1] == first else -1.0
+    force = np.array([sign * pairs.get(pair, np.zeros(3)) for pairs in log.pairs])
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, reading(f"{second}_orientation")[-1])
+    place = rotation.reshape(3, 3).T @ (position[-1] - reading(f"{second}_position")[-1])
+    success = bool(np.abs(place - task.goal()).max() < 0.003)
     return Truth(np.array(log.time), np.array(log.qpos), position, contacts, force, success)

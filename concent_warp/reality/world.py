@@ -48,7 +48,7 @@ class WorldCfg:
     integrator: Literal["implicitfast", "implicit", "Euler", "RK4"] = "implicitfast"
     """Integrator, named as in MJCF."""
     chamfer: float = 0.0015
-    """Chamfer of the edges of free box-shaped objects [m]."""
+    """Chamfer of the edges of free boxes and cylinders [m]."""
     solref: tuple[Positive, Positive] = (0.003, 1.0)
     """Contact time constant [s] and damping ratio [-]."""
 
@@ -64,15 +64,15 @@ class WorldCfg:
         for name in scene.objects():
             for geom in spec.body(name).geoms:
                 geom.solref = list(self.solref)
-                if geom.type == mujoco.mjtGeom.mjGEOM_BOX and spec.body(name).joints:
-                    self.chamfer_box(spec, geom)
+                if geom.type in CHAMFERED and spec.body(name).joints:
+                    self.chamfer_geom(spec, geom)
         for effect in effects:
             if effect.edit is not None:
                 effect.edit(spec)
         return spec
 
-    def chamfer_box(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
-        """Replace a box by the convex mesh of a box with chamfered edges, with the mass and inertia of the box."""
+    def chamfer_geom(self, spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
+        """Replace a box or a cylinder by a convex mesh with chamfered edges, with the mass and inertia it had."""
         name = f"{geom.name}_chamfered"
         body = geom.parent
         compiled = spec.copy().compile()
@@ -81,7 +81,7 @@ class WorldCfg:
         body.mass, body.inertia = compiled.body_mass[base], compiled.body_inertia[base]
         body.ipos, body.iquat = compiled.body_ipos[base], compiled.body_iquat[base]
         mesh = spec.add_mesh(name=name)
-        mesh.uservert = chamfered_box(np.array(geom.size), self.chamfer).ravel()
+        mesh.uservert = CHAMFERED[geom.type](np.array(geom.size), self.chamfer).ravel()
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
 
 
@@ -94,3 +94,25 @@ def chamfered_box(half: np.ndarray, chamfer: float) -> np.ndarray:
             inner[axis] = half[axis]
             corners.append(signs * inner)
     return np.array(corners)
+
+
+def chamfered_cylinder(size: np.ndarray, chamfer: float, sides: int = 48) -> np.ndarray:
+    """Return the corners [m] of a prism about the z axis whose ends are cut at 45 degrees, shape (4 * sides, 3).
+
+    Args:
+        size: Radius of the circle around the prism and half its length [m], shape (2,) or longer.
+        chamfer: Chamfer of both ends [m].
+        sides: Sides of the prism.
+    """
+    angle = 2 * np.pi * np.arange(sides) / sides
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    rings = ((size[0], size[1] - chamfer), (size[0] - chamfer, size[1]))
+    up = np.array([0, 0, 1.0])
+    return np.concatenate([radius * circle + sign * height * up for radius, height in rings for sign in (-1, 1)])
+
+
+CHAMFERED = {
+    mujoco.mjtGeom.mjGEOM_BOX: chamfered_box,
+    mujoco.mjtGeom.mjGEOM_CYLINDER: chamfered_cylinder,
+}
+"""Corners of what stands for a geom of a kind, by half sizes as in MJCF [m], shape (3,), and chamfer [m]."""

@@ -21,6 +21,9 @@ MESHES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
 """Kinds of mesh files that a scene may name."""
 OBJECTS_TEXT = "concent_objects"
 """Name of the MJCF <text> element that lists the bodies to be given contact geometry."""
+GOAL_NUMERIC = "concent_goal"
+"""Name of the MJCF <numeric> element with the place of the first object when the task is done, in the frame of the
+second [m]."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,27 @@ class Scene:
             return tuple(names)
         free = [j for j in range(m.njnt) if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         return tuple(m.body(m.jnt_bodyid[j]).name for j in free)
+
+    def goal(self) -> np.ndarray | None:
+        """Return where the first object is when the task is done, in the frame of the second [m], shape (3,).
+
+        It is stated in the MJCF element ``<custom><numeric name="concent_goal" data="0 0 0.02"/></custom>``; None
+        without it.
+
+        Raises:
+            SceneError: The element has not three finite numbers.
+        """
+        m = self.model
+        numeric = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, GOAL_NUMERIC)
+        if numeric < 0:
+            return None
+        start = m.numeric_adr[numeric]
+        found = m.numeric_data[start : start + m.numeric_size[numeric]].copy()
+        if found.shape != (3,) or not np.isfinite(found).all():
+            raise SceneError(
+                f"<numeric name={GOAL_NUMERIC!r}> is no place", where=self.source, expected="x y z in m", found=found
+            )
+        return found
 
 
 def _standalone(spec: mujoco.MjSpec, source: str) -> Scene:

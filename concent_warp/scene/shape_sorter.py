@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar
 
 import mujoco
 import numpy as np
 
 from concent_warp.checks import Bounds, Length, Place, TimeStep, Turn
 from concent_warp.scene.robot import HOME_ANGLES, RobotCfg
-from concent_warp.scene.scene import OBJECTS_TEXT, Scene
-
-TABLE_FRICTION = 0.6
+from concent_warp.scene.scene import Scene
+from concent_warp.scene.tabletop import add_body, add_objects, tabletop
 
 
 @dataclass(frozen=True)
 class ShapeSorterCfg:
     """Sizes and places of the shape sorter."""
 
+    objects: ClassVar[tuple[str, str]] = ("block", "box")
+    """Bodies of the object that is moved and of the one that it is moved to."""
+    text: ClassVar[str] = "put the block into the hole of the box"
+    """What is to be done."""
     robot: RobotCfg = field(default_factory=RobotCfg)
     """The arm."""
     block_size: Length = 0.04
@@ -48,34 +51,24 @@ class ShapeSorterCfg:
 
     def build(self) -> Scene:
         """Return the scene: robot, table, block, box and the sensors of both objects' poses."""
-        spec = self.robot.build()
-        spec.modelname = "shape_sorter"
-        spec.option.timestep = self.timestep
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        spec.option.impratio = 10.0
-        spec.option.iterations = 50
-        spec.option.ls_iterations = 50
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-        _add_table(spec)
+        spec = tabletop(self.robot, "shape_sorter", self.timestep)
         self.add_block(spec)
         self.add_box(spec)
-        spec.add_text(name=OBJECTS_TEXT, data="block box")
-        for body in ("block", "box"):
-            for suffix, kind in (
-                ("position", mujoco.mjtSensor.mjSENS_FRAMEPOS),
-                ("orientation", mujoco.mjtSensor.mjSENS_FRAMEQUAT),
-            ):
-                spec.add_sensor(name=f"{body}_{suffix}", type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body)
+        add_objects(spec, *self.objects)
         return Scene.from_spec(spec, source="shape sorter")
+
+    def placed_at(self, position: tuple[float, float], yaw: float) -> ShapeSorterCfg:
+        """Return the task with the block at a place on the table [m], turned by `yaw` [rad]."""
+        return replace(self, block_position=position, block_yaw=yaw)
+
+    def goal(self) -> np.ndarray:
+        """Return where the block is when it is in the hole, in the frame of the box [m], shape (3,)."""
+        return np.array([0.0, 0.0, self.floor + self.block_size / 2])
 
     def add_block(self, spec: mujoco.MjSpec) -> None:
         """Add the free block, its frame at its centre."""
         half = self.block_size / 2
-        block = spec.worldbody.add_body(
-            name="block", pos=[*self.block_position, half], quat=yaw_quaternion(self.block_yaw)
-        )
-        block.add_freejoint(name="block_joint")
+        block = add_body(spec, "block", self.block_position, half, self.block_yaw, free=True)
         block.add_geom(
             name="block",
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -88,7 +81,7 @@ class ShapeSorterCfg:
     def add_box(self, spec: mujoco.MjSpec) -> None:
         """Add the box, its frame on the table under the hole's centre; walls overlap at the corners."""
         outer, inner, height = self.box_size / 2, self.hole_size / 2, self.box_height / 2
-        box = spec.worldbody.add_body(name="box", pos=[*self.box_position, 0], quat=yaw_quaternion(self.box_yaw))
+        box = add_body(spec, "box", self.box_position, 0.0, self.box_yaw, free=False)
         wall, centre = (outer - inner) / 2, (outer + inner) / 2
         plates = {
             "floor": ((0, 0, self.floor / 2), (outer, outer, self.floor / 2)),
@@ -108,19 +101,6 @@ class ShapeSorterCfg:
             )
 
 
-def _add_table(spec: mujoco.MjSpec) -> None:
-    """Add a table whose top is the plane z = 0, a light and a camera that looks at the workspace."""
-    spec.worldbody.add_geom(
-        name="table",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0.4, 0, -0.02],
-        size=[0.6, 0.6, 0.02],
-        friction=[TABLE_FRICTION, 0.005, 0.0001],
-        rgba=[0.80, 0.77, 0.72, 1],
-    )
-    spec.worldbody.add_light(pos=[0.6, -0.4, 1.6], dir=[-0.1, 0.3, -1.0], castshadow=True)
-
-
 def home(model: mujoco.MjModel) -> np.ndarray:
     """Return the scene's initial qpos (nq,) with the embedded arm in its ready pose and the gripper open."""
     qpos = model.qpos0.copy()
@@ -129,8 +109,3 @@ def home(model: mujoco.MjModel) -> np.ndarray:
         if joint >= 0:
             qpos[model.jnt_qposadr[joint]] = angle
     return qpos
-
-
-def yaw_quaternion(yaw: float) -> list[float]:
-    """Return the quaternion (wxyz) of a rotation about the vertical [rad]."""
-    return [float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2))]

@@ -97,8 +97,9 @@ def test_extremes_are_the_ends_of_the_ranges(task, extremes):
         assert len(np.unique(np.column_stack(list(factors.values())) > 1.05, axis=0)) > 8
 
 
-def test_stress_worlds_are_the_models_own_with_all_spheres_and_smaller_steps(run):
-    test = with_stress(run, StressCfg(episodes=5, refine=4)).stress_test(device="cpu")
+@pytest.mark.parametrize("shapes", ["nominal", "spheres"])
+def test_stress_worlds_are_the_models_own_with_smaller_steps(run, shapes):
+    test = with_stress(run, StressCfg(shapes=shapes, episodes=5, refine=4)).stress_test(device="cpu")
     environment = test.environment
     assert environment.num_envs == 5
     assert test.environment is environment
@@ -112,7 +113,10 @@ def test_stress_worlds_are_the_models_own_with_all_spheres_and_smaller_steps(run
     assert environment.control_step == pytest.approx(run.cfg.environment.decimation * timestep)
     geometry = run.model.geometry
     assert geometry is not None
-    assert {m.geom(g).name for g in range(m.ngeom)} >= {f"block_sphere{i}" for i in range(len(geometry.of("block")))}
+    spheres = {f"block_sphere{i}" for i in range(len(geometry.of("block")))}
+    assert len({m.geom(g).name for g in range(m.ngeom)} & spheres) == (len(spheres) if shapes == "spheres" else 0)
+    colliding = m.geom_contype[m.geom_bodyid == m.body("block").id] != 0
+    assert (colliding.sum() == 1) == (shapes == "nominal")
     assert environment.task.collidable.all()
 
 

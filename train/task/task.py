@@ -17,7 +17,7 @@ from concent_warp.simulate.engine import Variants
 from concent_warp.simulate.inputs import compile_model
 from concent_warp.simulate.mujoco_engine import MujocoEngine
 from concent_warp.simulate.replay import commands, initial_state, step_count
-from concent_warp.train.cfg import ALL, EnvironmentCfg
+from concent_warp.train.cfg import ALL, LAST, EnvironmentCfg
 from concent_warp.train.task.edges import with_edge_spheres
 from concent_warp.train.task.movable_fixtures import with_movable_fixtures
 from concent_warp.train.task.robot import Robot
@@ -166,8 +166,10 @@ def _chain(events: ContactEventSequence, name: str) -> tuple[int, int]:
     names = [stage.name for stage in events.stages]
     if name == ALL and names:
         return 0, len(names) - 1
+    if name == LAST and names:
+        return len(names) - 1, len(names) - 1
     if name not in names:
-        raise TrainError("the demonstration has no such stage", expected=f"one of {[*names, ALL]}", found=name)
+        raise TrainError("the demonstration has no such stage", expected=f"one of {[*names, LAST, ALL]}", found=name)
     return names.index(name), names.index(name)
 
 

@@ -1,8 +1,9 @@
 """The stress test: success of a policy in the model's best physics under worse conditions than in training.
 
 Success in the physics of the training says little about Reality: all policies reach it. What differs is how a policy
-fares where edges catch: sharp edges, stiff contacts and short steps, with friction high or low. The test uses the model
-alone, so that a policy can be chosen by it before any trial.
+fares where edges catch: sharp edges, stiff contacts and short steps, with friction high or low. Objects collide as the
+geoms of the scene do: fitted spheres differ from model to model in how hard they are, so that success among them says
+little about the policy. The test uses the model alone, so that a policy can be chosen by it before any trial.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from concent_warp.train.cfg import EnvironmentCfg, StressCfg, TrainCfg
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
 from concent_warp.train.resets.sample import sample_reset_states
+from concent_warp.train.task.nominal_shapes import with_nominal_shapes
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.episodes import PolicyFunction
 from concent_warp.train.trials.evaluate import Evaluation, run_episodes
@@ -49,8 +51,9 @@ class StressTest:
         self._episodes = cfg.stress.episodes if episodes is None else episodes
         self._cfg = stressed(cfg.environment, cfg.stress)
         self._task = make_task(self._cfg)
+        self._physical = (with_nominal_shapes(self._task) if cfg.stress.shapes == "nominal" else None) or self._task
         self._seed = SEED + cfg.seed if seed is None else OTHER_SEED + seed
-        reset = replace(self._cfg.reset, demonstrated=0.0, free=1.0)
+        reset = replace(self._cfg.reset, demonstrated=0.0, grasp_turn=0.0, free=1.0)  # as in evaluations
         self._states = sample_reset_states(self._task, reset, self._seed, count=self._episodes)
 
     @property
@@ -60,7 +63,7 @@ class StressTest:
             cfg = replace(self._cfg, worlds=self._episodes)
             stress = self._stress
             self._made = make_environment(
-                self._task, cfg, self._states, device=self._device, seed=self._seed, refine=stress.refine,
+                self._physical, cfg, self._states, device=self._device, seed=self._seed, refine=stress.refine,
                 time_constant=stress.time_constant,
             )  # fmt: skip
             self._made.perturbs_trials = True

@@ -49,7 +49,7 @@ class Arguments:
     overwrite: bool = False
     """Replace an earlier run in the folder."""
     stage: str | None = None
-    """Stage to train, or all for the chain of all stages; short for --environment.stage."""
+    """Stage to train; last, the default, for the last one, all for the chain of all; short for --environment.stage."""
     worlds: Worlds | None = None
     """Parallel environments; short for --environment.worlds."""
     reward: Literal["contact", "engineered"] | None = None

@@ -1,8 +1,9 @@
-"""The scripted expert: pick the block, press it beside the hole, slide until it drops in, press it in, release it.
+"""The scripted expert of tasks on the table.
 
-It touches the rim, presses on the box while it slides, and keeps pressing until the far wall of the hole
-stops the block, so that contacts guide the block and not the arm alone. Forces are exerted through the stiffness of the
-position control: the command lies beyond the surface.
+For an insertion: pick the object, press it beside the hole, slide until it drops in, press it in, release it. It
+touches the rim, presses on it while it slides, and keeps pressing until the far wall of the hole stops the object, so
+that contacts guide the object and not the arm alone. For a stack: pick the object, set it down on the other, press,
+release it. Forces are exerted through the stiffness of the position control: the command lies beyond the surface.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ from typing import Annotated
 import numpy as np
 
 from concent_warp.checks import Bounds, Rate
+from concent_warp.scene.round_peg import RoundPegCfg
 from concent_warp.scene.shape_sorter import ShapeSorterCfg
+from concent_warp.scene.stacking import StackingCfg
+
+Task = ShapeSorterCfg | RoundPegCfg | StackingCfg
+"""A task that the expert can do."""
+Waypoint = tuple[float, np.ndarray, np.ndarray, float, float]
+"""Duration of the way to it [s], tool centre point [m], force [N], yaw [rad], opening [m]."""
 
 
 @dataclass(frozen=True)
@@ -57,33 +65,72 @@ class Path:
     """Commanded opening of each finger [m], shape (T,)."""
 
 
-def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: float, rng: np.random.Generator) -> Path:
-    """Return the expert's path for the objects where `scene` has them.
+@dataclass(frozen=True)
+class Insertion:
+    """Places and heights of an object and a hole."""
+
+    start: tuple[float, float]
+    """Object on the table [m]."""
+    start_yaw: float
+    """Its rotation about the vertical [rad]."""
+    half: float
+    """Half its height [m]."""
+    hole: tuple[float, float]
+    """Hole on the table [m]."""
+    rim: float
+    """Height of the rim [m]."""
+    floor: float
+    """Height of the floor of the hole [m]."""
+    hole_yaw: float = 0.0
+    """Rotation of the hole [rad]."""
+    round: bool = False
+    """Whether the object fits the hole in any rotation, otherwise in four."""
+
+
+def plan(task: Task, cfg: ExpertCfg, start: np.ndarray, open_width: float, rng: np.random.Generator) -> Path:
+    """Return the expert's path for the objects where `task` has them.
 
     Args:
-        scene: Places and sizes of the objects.
+        task: Places and sizes of the objects.
         cfg: The script.
         start: Tool centre point at time 0 [m], shape (3,).
         open_width: Control value of the open gripper [m].
         rng: Generator of the sampled offsets.
     """
-    half = scene.block_size / 2
-    block = np.array([*scene.block_position, half + cfg.grip_height])
-    seat = np.array([*scene.box_position, half + cfg.grip_height])
+    if isinstance(task, StackingCfg):
+        return _follow(_stack(task, cfg, start, open_width, rng), cfg)
+    if isinstance(task, RoundPegCfg):
+        insertion = Insertion(
+            task.peg_position, task.peg_yaw, task.peg_length / 2, task.holder_position, task.holder_height, task.floor,
+            round=True,
+        )  # fmt: skip
+    else:
+        insertion = Insertion(
+            task.block_position, task.block_yaw, task.block_size / 2, task.box_position, task.box_height, task.floor,
+            task.box_yaw,
+        )  # fmt: skip
+    return _follow(_insert(insertion, cfg, start, open_width, rng), cfg)
+
+
+def _insert(
+    task: Insertion, cfg: ExpertCfg, start: np.ndarray, open_width: float, rng: np.random.Generator
+) -> list[Waypoint]:
+    """Return the waypoints of an insertion, see `plan`."""
+    block = np.array([*task.start, task.half + cfg.grip_height])
+    seat = np.array([*task.hole, task.half + cfg.grip_height])
     angle = rng.uniform(0, 2 * np.pi)
     away = np.array([np.cos(angle), np.sin(angle), 0])
     aside = rng.uniform(*cfg.offset) * away
     yaw = rng.normal(0, cfg.yaw_error)
     # The gripper closes along a face normal of the block; of the two turns that fit the hole, the smaller one is taken.
-    pick = _nearest_turn(scene.block_yaw, 0.0)
-    place = pick + _nearest_turn(scene.box_yaw - pick, 0.0) + yaw
-    up, rim, seated = np.array([0, 0, 1.0]), scene.box_height, scene.floor
+    pick = _nearest_turn(task.start_yaw, 0.0)
+    place = pick + (0.0 if task.round else _nearest_turn(task.hole_yaw - pick, 0.0)) + yaw
+    up, rim, seated = np.array([0, 0, 1.0]), task.rim, task.floor
     free = np.zeros(3)
     lean = -cfg.press * up - 0.5 * cfg.lean * away
     over = -cfg.press * up - cfg.lean * away
     push = -cfg.push * up - cfg.lean * away
-    waypoints: list[tuple[float, np.ndarray, np.ndarray, float, float]] = [
-        # duration [s], tool centre point [m], force [N], yaw [rad], opening [m]
+    return [
         (0.0, start, free, 0.0, open_width),
         (0.9, block + cfg.clearance * up, free, pick, open_width),
         (0.5, block, free, pick, open_width),
@@ -101,6 +148,38 @@ def plan(scene: ShapeSorterCfg, cfg: ExpertCfg, start: np.ndarray, open_width: f
         (0.3, seat + seated * up, free, place, open_width),
         (0.5, seat + cfg.clearance * 1.5 * up, free, place, open_width),
     ]
+
+
+def _stack(
+    task: StackingCfg, cfg: ExpertCfg, start: np.ndarray, open_width: float, rng: np.random.Generator
+) -> list[Waypoint]:
+    """Return the waypoints of a stack, see `plan`."""
+    height = task.block_size / 2 + cfg.grip_height
+    block, base = np.array([*task.block_position, height]), np.array([*task.base_position, height])
+    pick = _nearest_turn(task.block_yaw, 0.0)
+    place = pick + _nearest_turn(task.base_yaw - pick, 0.0) + rng.normal(0, cfg.yaw_error)
+    up, free, top = np.array([0, 0, 1.0]), np.zeros(3), task.base_size[2]
+    press = -cfg.press * up
+    return [
+        (0.0, start, free, 0.0, open_width),
+        (0.9, block + cfg.clearance * up, free, pick, open_width),
+        (0.5, block, free, pick, open_width),
+        (0.3, block, free, pick, open_width),
+        (0.4, block, free, pick, 0.0),
+        (0.5, block + (cfg.clearance + top) * up, free, pick, 0.0),
+        (0.9, base + (cfg.clearance * 0.5 + top) * up, free, place, 0.0),
+        (0.5, base + top * up, free, place, 0.0),
+        (0.3, base + top * up, press, place, 0.0),
+        (0.3, base + top * up, press, place, 0.0),
+        (0.2, base + top * up, free, place, 0.0),
+        (0.3, base + top * up, free, place, open_width),
+        (0.5, base + (cfg.clearance * 1.5 + top) * up, free, place, open_width),
+    ]
+
+
+def _follow(waypoints: list[Waypoint], cfg: ExpertCfg) -> Path:
+    """Return the commands along waypoints, of which the first is the start."""
+    _, start, free, _, open_width = waypoints[0]
     time, position, force, turn, opening = [0.0], [start], [free], [0.0], [open_width]
     for previous, (duration, goal, wrench, yaw_goal, width) in pairwise(waypoints):
         steps = max(1, round(duration / cfg.speed * cfg.rate))

@@ -8,7 +8,7 @@ import numpy as np
 from concent_warp.reality.rigs.rig import Rig, RigTrial, WorldPhysics
 from concent_warp.reality.sliding_friction import apply_sliding_friction, frictionless
 from concent_warp.scene.scene import Scene
-from concent_warp.scene.shape_sorter import yaw_quaternion
+from concent_warp.scene.tabletop import yaw_quaternion
 
 HALF_SIZES = (0.08, 0.06, 0.01)
 """Half sizes of the block [m]."""

@@ -94,20 +94,24 @@ def _noisy_quaternion(quaternion: np.ndarray, std: float, rng: np.random.Generat
 
 
 def _surface_points(scene: Scene, body: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return points on the boxes and meshes of a body, body frame [m], shape (count, 3), by area."""
+    """Return points on the boxes and cylinders of a body, body frame [m], shape (count, 3), by area."""
     import trimesh
 
     model = scene.model
     parts = []
     for g in np.flatnonzero(model.geom_bodyid == model.body(body).id):
-        if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_BOX:
-            raise ValueError(f"surface points of geom {model.geom(g).name!r}: only boxes are supported here")
-        box = trimesh.creation.box(extents=2 * model.geom_size[g])
+        size = model.geom_size[g]
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX:
+            solid = trimesh.creation.box(extents=2 * size)
+        elif model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            solid = trimesh.creation.cylinder(size[0], 2 * size[1], sections=64)
+        else:
+            raise ValueError(f"surface points of geom {model.geom(g).name!r}: only boxes and cylinders are supported")
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), model.geom_pos[g]
-        parts.append(box.apply_transform(transform))
+        parts.append(solid.apply_transform(transform))
     mesh = trimesh.util.concatenate(parts)
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[0])
 
