@@ -88,7 +88,7 @@ def run(arguments: Arguments) -> Recording | None:
     make_folder(arguments.out.parent)
     with progress_bar("importing") as progress:
         recording = import_log(
-            arguments.source, arguments.model, arguments.mapping, cfg, out=arguments.out, progress=progress
+            arguments.source, arguments.model, cfg, mapping=arguments.mapping, out=arguments.out, progress=progress
         )
     for one in recording.demonstrations:
         kinds = (("commands", one.action), ("sensors", one.measured), ("cameras", one.image))
@@ -122,7 +122,8 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
         RecordingError: Something is wrong.
     """
     wrong: dict[str, list[str]] = {}
-    for k, episode in enumerate(inspect_log(arguments.source, arguments.model, arguments.mapping, cfg)):
+    episodes = inspect_log(arguments.source, arguments.model, cfg, mapping=arguments.mapping)
+    for k, episode in enumerate(episodes):
         name = episode.demonstration.name
         task = f" {episode.demonstration.task!r}" if episode.demonstration.task else ""
         say(f"[bold]{escape(name)}[/bold]{escape(task)}")

@@ -14,19 +14,20 @@ import numpy as np
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.logs.cfg import PlausibilityCfg
+from concent_warp.recording.logs.units import DEPTHS
 from concent_warp.recording.recording import ImageStream
 
-UNITS = {"mm": 1e-3, "m": 1e3, "cm": 1e-2, "100um": 1e-1}
-"""Factor by which depths would have to be multiplied if they were in another unit than they are taken for."""
+FIX = f"set depth_unit in the map (one of {', '.join(DEPTHS)})"
 
 
 def check_camera(
-    stream: ImageStream, m: mujoco.MjModel, qpos: np.ndarray, where: str, cfg: PlausibilityCfg
+    stream: ImageStream, unit: str, m: mujoco.MjModel, qpos: np.ndarray, where: str, cfg: PlausibilityCfg
 ) -> Iterator[RecordingError]:
     """Yield what is wrong with pose and depths of a camera.
 
     Args:
         stream: Some frames.
+        unit: Unit that their depths were taken to be in.
         m: The compiled scene.
         qpos: State of the scene in the first of them, shape (nq,).
         where: For messages.
@@ -46,29 +47,30 @@ def check_camera(
     mujoco.mj_forward(m, data)
     fit = _Fit(stream, m, data, depth, cfg)
     given, seen = fit.of(pose)
+    right = min(math.log(cfg.right_ratio), given / cfg.better)
     low, high = cfg.depth_bounds
     wrong = given > math.log(cfg.wrong_ratio) or seen < cfg.seen_share
     if wrong:
-        for unit, factor in UNITS.items():
+        for other, size in DEPTHS.items():
+            factor = size / DEPTHS[unit]
             ratio, share = fit.of(pose, factor)
-            if ratio < math.log(cfg.right_ratio) and share >= cfg.seen_share:
+            if other != unit and ratio < right and share >= cfg.seen_share:
                 yield RecordingError(
-                    f"the depths look like {unit} taken for another unit", where=where,
+                    f"the depths look like {other} and not {unit}", where=where,
                     expected=f"about {middle * factor:.3g} m, as the scene has it from this pose",
-                    found=f"{middle:.4g} m in the median", fix='set depth_unit in the map ("mm", "m", "100um")',
+                    found=f"{middle:.4g} m in the median", fix=FIX,
                 )  # fmt: skip
                 return
     if not low <= middle <= high:
-        unit = "millimetres" if middle > high else "metres taken for millimetres"
         yield RecordingError(
-            f"the depths look like {unit}", where=where, expected=f"a median of {low:g} to {high:g} m",
-            found=f"{middle:.4g} m", fix='set depth_unit in the map ("mm", "m", "100um")',
+            f"the depths are not in {unit}", where=where, expected=f"a median of {low:g} to {high:g} m",
+            found=f"{middle:.4g} m", fix=FIX,
         )  # fmt: skip
         return
     if wrong:
         for words, other in _mended(pose):
             ratio, share = fit.of(other)
-            if ratio < math.log(cfg.right_ratio) and share >= max(cfg.seen_share, seen):
+            if ratio < right and share >= max(cfg.seen_share, seen):
                 yield RecordingError(
                     f"the camera pose looks {words}", where=where,
                     expected="camera-to-world (or camera-to-body), x right, y down, z forward, row by row",

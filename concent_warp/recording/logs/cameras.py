@@ -57,6 +57,12 @@ class Camera:
         height, width = self.color.size
         return len(self.time) * height * width * 7
 
+    def unit(self) -> str:
+        """Return the unit of the depths, from their type where neither map nor log states it."""
+        if self.depth_unit or self.depth is None:
+            return self.depth_unit or "m"
+        return "mm" if next(iter(self.depth.frames(self.depth_rows[:1]))).dtype.kind in "ui" else "m"
+
     def stream(
         self, start: float, rows: np.ndarray | None = None, tick: Callable[[int], None] | None = None
     ) -> ImageStream:

@@ -34,17 +34,26 @@ class PlausibilityCfg:
     """Medians of depth that RGB-D cameras have [m]."""
     depth_grid: Annotated[int, Bounds(2, 64)] = 12
     """Rows and columns of pixels at which depths are compared with the scene."""
-    wrong_ratio: Factor = 1.6
-    """Median ratio of measured and expected depth above which a pose or unit is in doubt [-]."""
-    right_ratio: Factor = 1.25
-    """Median ratio below which another pose or unit is the right one [-]."""
+    wrong_ratio: Factor = 1.1
+    """Median ratio of measured and expected depth above which a pose or unit is in doubt [-]: calibrated cameras are
+    within 2 % where the scene has what they see."""
+    right_ratio: Factor = 1.15
+    """Median ratio below which another pose or unit may be the right one [-]."""
+    better: Factor = 4.0
+    """Factor by which the logarithm of that ratio must be smaller than as stated [-]."""
     seen_share: Share = 0.5
     """Share of the depths that must be of the scene for this judgement [-]."""
 
 
 @dataclass(frozen=True)
 class ImportCfg:
-    """How a log is read."""
+    """How a log is read.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.ImportCfg(episodes=(0, 3)).episodes
+        (0, 3)
+    """
 
     episodes: tuple[int, ...] = ()
     """Numbers of the episodes; all by default."""

@@ -20,7 +20,7 @@ from concent_warp.recording.logs.readers.log import Episode
 from concent_warp.recording.logs.targets import Target, body_sensors, joint_positions, targets_of
 from concent_warp.recording.logs.units import SI
 from concent_warp.recording.naming import PREFIX
-from concent_warp.recording.recording import Channel, Demonstration
+from concent_warp.recording.recording import Channel, Demonstration, ImageStream
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ReadChannel:
     remark: str = ""
 
 
-@dataclass
+@dataclass(frozen=True)
 class ReadEpisode:
     """What an episode becomes."""
 
@@ -97,18 +97,8 @@ def read_episode(
     problems += list(check_numbers(channels, cfg.plausibility))
     start = min((float(time[0]) for time in times.values()), default=0.0)
     action, measured = _channels(channels, constants, start)
-    demonstration = Demonstration(
-        f"{PREFIX}{episode.number}", episode.task, episode.success, None, None, action, measured
-    )
-    found = ReadEpisode(demonstration, start, _lines(channels, constants), cameras, problems)
-    _check_frames(found, m, cfg)
-    used = {one for entry in (*mapping.action.values(), *mapping.measured.values()) for one in entry.source}
-    used |= {entry.source for entry in mapping.body.values()} | {one.source for one in channels}
-    under = tuple(f"{one}/" for one in used)
-    listed = {part for one in channels for part in one.source.split(", ")} | used
-    pictures = {one for entry in mapping.image.values() for one in (entry.color, entry.depth)}
-    found.unused = [n for n in episode.signals if n not in listed and not n.startswith(under)]
-    found.unused += [name for name in episode.images if name not in pictures]
+    lines = _lines(channels, constants)
+    image = _checked_frames(cameras, start, measured, m, cfg, lines, problems)
     if missing := [m.actuator(i).name for i in range(m.nu) if m.actuator(i).name not in action]:
         problems.append(
             RecordingError(
@@ -117,7 +107,20 @@ def read_episode(
                 fix="map them, write constant = VALUE for one that stays, or remove the actuator from the scene",
             )
         )  # fmt: skip
-    return found
+    name = f"{PREFIX}{episode.number}"
+    made = Demonstration(name, episode.task, episode.success, None, None, action, measured, image=image)
+    return ReadEpisode(made, start, lines, cameras, problems, _unused(episode, mapping, channels))
+
+
+def _unused(episode: Episode, mapping: LogMap, channels: list[Numbers]) -> list[str]:
+    """Return the channels of an episode that the map does not name."""
+    named = {one for entry in (*mapping.action.values(), *mapping.measured.values()) for one in entry.source}
+    named |= {entry.source for entry in mapping.body.values()}
+    named |= {part for one in channels for part in one.source.split(", ")}
+    under = tuple(f"{one}/" for one in named)
+    pictures = {one for entry in mapping.image.values() for one in (entry.color, entry.depth)}
+    unused = [name for name in episode.signals if name not in named and not name.startswith(under)]
+    return unused + [name for name in episode.images if name not in pictures]
 
 
 def _numbers(
@@ -229,33 +232,40 @@ def _rate(time: np.ndarray) -> float:
     return 1 / float(np.median(np.diff(time))) if len(time) > 1 else float("nan")
 
 
-def _check_frames(found: ReadEpisode, m: mujoco.MjModel, cfg: ImportCfg) -> None:
-    """Decode some frames of each camera, compare them with the scene, and add them to the demonstration and table."""
+def _checked_frames(
+    cameras: list[Camera], start: float, measured: Mapping[str, Channel], m: mujoco.MjModel, cfg: ImportCfg,
+    lines: list[ReadChannel], problems: list[RecordingError],
+) -> dict[str, ImageStream]:  # fmt: skip
+    """Return some frames of each camera, compared with the scene; what is found is added to `lines` and `problems`."""
     first = {
         name: float(one.value[np.isfinite(one.value[:, 0]), 0][0])
-        for name, one in found.demonstration.measured.items()
+        for name, one in measured.items()
         if np.isfinite(one.value[:, 0]).any()
     }
     qpos = joint_positions(m, first)
-    image = {}
-    for camera in found.cameras:
+    image: dict[str, ImageStream] = {}
+    for camera in cameras:
         count = len(camera.time)
         rows = np.unique(np.linspace(0, count - 1, min(cfg.checked_frames, count)).round().astype(int))
         try:
-            stream = camera.stream(found.start, rows)
+            stream, unit = camera.stream(start, rows), camera.unit()
         except RecordingError as error:
-            found.problems.append(error)
+            problems.append(error)
             continue
         image[camera.name] = stream
-        found.problems += list(check_camera(stream, m, qpos, camera.where, cfg.plausibility))
+        problems += check_camera(stream, unit, m, qpos, camera.where, cfg.plausibility)
         depths = stream.depth[stream.depth > 0]
+        if camera.depth and not depths.size:
+            problems.append(
+                RecordingError(
+                    "every depth is missing", where=camera.where, expected=f"depths above {cfg.depth_from:g} m",
+                    found=f"none in {len(rows)} frames, taken to be in {unit}", fix="check depth_unit in the map",
+                )
+            )  # fmt: skip
         low, high = (float(depths.min()), float(depths.max())) if depths.size else (float("nan"), float("nan"))
         height, width = camera.color.size
         remark = f"{width} x {height}" + ("" if camera.depth else ", no depth")
-        if camera.depth and not depths.size:
-            remark += ", every depth missing"
         source = camera.color.name + (f", {camera.depth.name}" if camera.depth else "")
-        found.channels.append(
-            ReadChannel(f"image/{camera.name}", source, count, _rate(camera.time), low, high, "m", None, remark)
-        )
-    found.demonstration = replace(found.demonstration, image=image)
+        name = f"image/{camera.name}"
+        lines.append(ReadChannel(name, source, count, _rate(camera.time), low, high, "m", None, remark))
+    return image

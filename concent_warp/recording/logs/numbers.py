@@ -135,6 +135,10 @@ def times_of(stream: Signal | Images, clock: ClockEntry) -> np.ndarray:
     time = np.asarray(given, dtype=float)
     if clock.rate is not None:
         return time / clock.rate + clock.offset
+    if isinstance(stream, Images) and len(time) > 2 and (np.diff(np.sort(time)) == 1).all():
+        fix = f'write [clock] "{stream.name}" = {{ rate = FRAMES_PER_SECOND }} in the map, or timestamps.csv'
+        found = f"{time.min():g} to {time.max():g}, one by one"
+        raise RecordingError("the stamps look like numbers of frames", where=stream.name, found=found, fix=fix)
     time = time * TIMES[clock.unit] + clock.offset
     middle = float(np.median(time)) if len(time) else 0.0
     if middle > LATEST:

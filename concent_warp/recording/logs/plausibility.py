@@ -68,7 +68,7 @@ def check_overlap(times: Mapping[str, np.ndarray]) -> RecordingError | None:
         if start > last or stop < first:
             return RecordingError(
                 "its clock does not overlap with those of the other channels", where=name,
-                expected=f"times from {first:.6g} to {last:.6g} s", found=f"{start:.6g} to {stop:.6g} s",
+                expected=f"times from {first:.3f} to {last:.3f} s", found=f"{start:.3f} to {stop:.3f} s",
                 fix="set its unit or offset in [clock], or take the times of reception with use = \"received\"",
             )  # fmt: skip
     return None

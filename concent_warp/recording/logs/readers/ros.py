@@ -78,17 +78,16 @@ class RosLog:
         return found.episode(number, self.source)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Series:
     """Samples of one number."""
 
     time: array[float] = field(default_factory=lambda: array("d"))
     received: array[float] = field(default_factory=lambda: array("d"))
     value: array[float] = field(default_factory=lambda: array("d"))
-    stamped: bool = False
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Stream:
     """Frames of one topic of images."""
 
@@ -100,7 +99,7 @@ class _Stream:
     received: list[float] = field(default_factory=list)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Contents:
     """What the messages hold so far."""
 
@@ -108,6 +107,8 @@ class _Contents:
     """Series by topic and name."""
     commands: set[str] = field(default_factory=set)
     """Topics of commands."""
+    stamped: set[str] = field(default_factory=set)
+    """Topics whose messages have stamps."""
     streams: dict[str, _Stream] = field(default_factory=dict)
     calibration: dict[str, Calibration] = field(default_factory=dict)
     parents: dict[str, tuple[str, np.ndarray]] = field(default_factory=dict)
@@ -135,6 +136,8 @@ class _Contents:
         """Take note of numbers by their names, `after` [s] later than the stamp."""
         series = self.numbers.setdefault(topic, {})
         time = (received if stamp is None else stamp) + (after or 0.0)
+        if stamp is not None:
+            self.stamped.add(topic)
         for name, value in values.items():
             one = series.setdefault(name, _Series())
             if after is not None:  # a new trajectory replaces what is left of the one before
@@ -144,7 +147,6 @@ class _Contents:
             one.time.append(time)
             one.received.append(received + (after or 0.0))
             one.value.append(value)
-            one.stamped |= stamp is not None
             if len(one.time) > limits().samples:
                 raise RecordingError("too many samples", expected=f"at most {limits().samples}", fix=raising("samples"))
 
@@ -178,7 +180,7 @@ class _Contents:
             for name, one in series.items():
                 time, received = np.array(one.time), np.array(one.received)
                 signals[f"{topic}/{name}"] = Signal(
-                    f"{topic}/{name}", time, np.array(one.value), received if one.stamped else None,
+                    f"{topic}/{name}", time, np.array(one.value), received if topic in self.stamped else None,
                     command=topic in self.commands,
                 )  # fmt: skip
         images = {
