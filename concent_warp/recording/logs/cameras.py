@@ -138,6 +138,8 @@ def find_camera(
             found=f"{depth.size[0]} x {depth.size[1]}", fix=ALIGN,
         )  # fmt: skip
     calibration = _calibration(name, entry, episode, file, where)
+    if calibration.problem:
+        raise RecordingError(calibration.problem.rstrip("."), where=where)
     if calibration.size is not None and calibration.size != color.size:
         raise RecordingError(
             "the intrinsics are of images of another size", where=where, expected=f"{color.size[0]} x {color.size[1]}",
@@ -145,6 +147,9 @@ def find_camera(
         )  # fmt: skip
     if not calibration.intrinsics.any():
         raise RecordingError("the intrinsics are missing: all are 0", where=where, fix="calibrate the camera")
+    if not min(calibration.intrinsics[0, 0], calibration.intrinsics[1, 1]) > 0:
+        found = calibration.intrinsics.diagonal()[:2].tolist()
+        raise RecordingError("a focal length is not right", where=where, expected="fx and fy above 0 px", found=found)
     body = entry.body or calibration.body
     if body is not None and mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, body) < 0:
         known = [m.body(i).name for i in range(1, m.nbody)]
@@ -169,6 +174,8 @@ def _images(source: str, episode: Episode, where: str, *, depth: bool) -> Images
     known = sorted(name for name, one in episode.images.items() if one.depth == depth)
     if not source:
         raise RecordingError(f"the entry names no {kind}", where=where, expected=f"color = one of {known}")
+    if source in episode.unread:
+        raise RecordingError(episode.unread[source].rstrip("."), where=f"{where}, {source}")
     found = episode.images.get(source)
     if found is None or found.depth != depth:
         raise RecordingError(
@@ -201,7 +208,7 @@ def _calibration(
         "the intrinsics of the camera are missing", where=where,
         expected=f"camera {name!r} in calibration.json, or a CameraInfo",
         found=f"those of {sorted(known)}" if known else "none",
-        fix="write calibration.json beside the log (see docs/import.md), or name one with `calibration`",
+        fix=f"write calibration.json beside the log (see docs/import.md), or leave [image.{name}] out of the map",
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from concent_warp.checks import check_settings
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -54,6 +55,7 @@ def import_log(
         True
     """
     cfg = cfg or ImportCfg()
+    check_settings(cfg, RecordingError)
     log = open_log(source)
     scene = scene_of(model)
     read: list[ReadEpisode] = []
@@ -61,8 +63,8 @@ def import_log(
         if episode.problems:
             first, *others = episode.problems
             if others:
-                text = f"{str(first).rstrip('.')}; {len(others)} more (concent import --dry-run lists all)"
-                raise RecordingError(text) from None
+                more = f"{len(others) + 1} things are wrong, which concent import --dry-run lists"
+                raise RecordingError(f"{str(first).rstrip('.')}; {more}")
             raise first
         read.append(episode)
         if progress is not None:

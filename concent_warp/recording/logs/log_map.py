@@ -140,6 +140,8 @@ def read_map(path: Path) -> LogMap:
         RecordingError: It cannot be read, or has entries that are unknown or make no sense.
     """
     path = Path(path)
+    if not path.exists():
+        raise RecordingError("no such map", where=path, fix="check the path, or let concent import --suggest write one")
     document = read_toml(path, RecordingError)
     known = ("calibration", *KINDS)
     if unknown := sorted(set(document) - set(known)):

@@ -79,7 +79,11 @@ def _degrees(one: Numbers, cfg: PlausibilityCfg) -> RecordingError | None:
     if one.target.quantity != "angle":
         return None
     value = one.value[:, 0]
-    fix = 'write unit = "deg" in the map' if one.unit is None else f"check unit = {one.unit!r}, scale and offset"
+    fix = (
+        'write unit = "deg" in the map, or check its scale'
+        if one.unit is None
+        else f"check unit = {one.unit!r}, scale and offset"
+    )
     if one.target.range is not None:
         low, high = one.target.range[0] - cfg.range_margin, one.target.range[1] + cfg.range_margin
         known = value[np.isfinite(value)]

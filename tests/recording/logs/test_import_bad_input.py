@@ -255,6 +255,23 @@ def test_a_calibration_of_zeros_is_refused(tmp_path):
     assert "the intrinsics are missing: all are 0" in spoilt(tmp_path, change)
 
 
+def test_a_fisheye_or_unknown_pixels_matter_only_where_they_are_mapped(tmp_path):
+    camera = {"header": (0.0, "t265"), "height": 4, "width": 4, "k": np.eye(3).ravel(), "d": np.full(4, 0.1)}
+    picture = {"header": (0.1, "t265"), "encoding": "yuv422", "image": np.zeros((4, 4, 2), np.uint8)}
+    more = [
+        ("/t265/camera_info", "sensor_msgs/msg/CameraInfo", 0.2, camera | {"distortion_model": "equidistant"}),
+        ("/t265/image", "sensor_msgs/msg/Image", 0.2, picture),
+    ]
+    write_bag(tmp_path / "bag", sorted([*messages(motion()), *more], key=lambda one: one[2]), "mcap")
+    (tmp_path / "robot.xml").write_text(SCENE)
+    (tmp_path / "robot.toml").write_text(ROS_MAP)
+    assert cw.import_log(tmp_path / "bag", tmp_path / "robot.xml", mapping=tmp_path / "robot.toml")[0].image
+    text = ROS_MAP.replace("/camera/color/image_raw", "/t265/image")
+    assert "an image has an encoding that is not read; expected one of ['rgb8'" in refused(tmp_path, "bag", text)
+    text = ROS_MAP.replace("[image.front]", '[image.front]\ncalibration = "/t265/camera_info"')
+    assert "fisheye lenses are not supported" in refused(tmp_path, "bag", text)
+
+
 def test_missing_transforms_are_named(tmp_path):
     def change(*message):
         return [] if message[0] == "/tf_static" else [message]

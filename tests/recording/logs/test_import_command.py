@@ -61,7 +61,7 @@ def test_a_dry_run_lists_all_that_is_wrong(place, capsys):
     assert "not mapped:" in out
     assert "3 things are wrong" in err
     assert main([*COMMAND, "-o", "demo.h5"]) == 2
-    assert "2 more (concent import --dry-run lists all)" in capsys.readouterr().err
+    assert "; 3 things are wrong, which concent import --dry-run lists." in capsys.readouterr().err
     assert not (place / "demo.h5").exists()
 
 
@@ -72,7 +72,7 @@ def test_a_dry_run_lists_all_that_is_wrong(place, capsys):
         ([], "no file to write is named"),
         (["-o", "demo.h5", "--episodes", "5-3"], "not a number of an episode"),
         (["-o", "demo.h5", "--episodes", "first"], "not a number of an episode"),
-        (["-o", "demo.h5"], "not a TOML file; found nothing of that name"),
+        (["-o", "demo.h5"], "no such map; check the path, or let concent import --suggest write one"),
     ],
 )
 def test_options_that_make_no_sense(place, capsys, options, sentence):

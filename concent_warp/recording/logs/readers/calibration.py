@@ -45,6 +45,8 @@ class Calibration:
     """Body that carries the camera."""
     size: tuple[int, int] | None = None
     """Height and width of the images [px], where known."""
+    problem: str = ""
+    """Why images of the camera cannot be used; empty where they can."""
 
     def undistorter(self, size: tuple[int, int], *, depth: bool) -> Callable[[np.ndarray], np.ndarray]:
         """Return what takes the distortion out of images of a size: colours linear, depths from the nearest pixel.

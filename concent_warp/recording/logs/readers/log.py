@@ -75,6 +75,8 @@ class Episode:
     calibration: Mapping[str, Calibration] = field(default_factory=dict)
     """What the log says of its cameras, by the name of an image stream or its camera."""
     transforms: Transforms = field(default_factory=Transforms)
+    unread: Mapping[str, str] = field(default_factory=dict)
+    """Streams of images that cannot be read, with the reason."""
 
     def find(self, source: str) -> list[Signal]:
         """Return the signal of a name, else all that lie under it (``/pose/position``), else those of a pattern."""

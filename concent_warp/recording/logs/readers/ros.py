@@ -113,6 +113,8 @@ class _Contents:
     calibration: dict[str, Calibration] = field(default_factory=dict)
     parents: dict[str, tuple[str, np.ndarray]] = field(default_factory=dict)
     moving: set[str] = field(default_factory=set)
+    unread: dict[str, str] = field(default_factory=dict)
+    """Topics of images that cannot be read, with the reason."""
 
     def add(self, topic: str, kind: str, message: Any, received: float) -> None:
         """Take note of a message received at a time [s]."""
@@ -152,10 +154,15 @@ class _Contents:
 
     def _add_image(self, topic: str, kind: str, message: Any, received: float) -> None:
         """Take note of a frame."""
+        if topic in self.unread:
+            return
         if topic not in self.streams:
-            height, width = decoded(kind, message).shape[:2]
-            frame = str(message.header.frame_id)
-            self.streams[topic] = _Stream(kind, (height, width), is_depth(kind, message), frame)
+            try:
+                depth, (height, width) = is_depth(kind, message), decoded(kind, message).shape[:2]
+            except RecordingError as error:
+                self.unread[topic] = str(error)
+                return
+            self.streams[topic] = _Stream(kind, (height, width), depth, str(message.header.frame_id))
         stream = self.streams[topic]
         stamp = stamp_of(message)
         stream.time.append(received if stamp is None else stamp)
@@ -191,7 +198,7 @@ class _Contents:
             for topic, s in self.streams.items()
         }  # fmt: skip
         tree = Transforms(dict(self.parents), frozenset(self.moving))
-        return Episode(number, signals, images, calibration=self.calibration, transforms=tree)
+        return Episode(number, signals, images, calibration=self.calibration, transforms=tree, unread=self.unread)
 
 
 @dataclass(frozen=True)
@@ -230,7 +237,10 @@ def _camera(topic: str, message: Any) -> Calibration:
         return Calibration(p.reshape(3, 4)[:, :3], np.zeros(0), size=size)
     if not k.any():
         return Calibration(np.zeros((3, 3)), np.zeros(0), size=size)
-    return Calibration(k.reshape(3, 3), distortion_of(message.distortion_model, d, topic), size=size)
+    try:
+        return Calibration(k.reshape(3, 3), distortion_of(message.distortion_model, d, topic), size=size)
+    except RecordingError as error:  # of no concern where the map does not name this camera
+        return Calibration(k.reshape(3, 3), np.zeros(0), size=size, problem=str(error))
 
 
 @contextmanager
