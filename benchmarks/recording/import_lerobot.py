@@ -55,7 +55,7 @@ pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
 
 def compared(recording: Recording, truth: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the largest differences between an imported data set and what lerobot reads of it."""
-    found = dict.fromkeys(("time", "state", "action", "color", "depth"), 0.0)
+    found: dict[str, float] = dict.fromkeys(("time", "state", "action", "color", "depth"), 0.0)
     wrong_tasks = 0
     for number, one in enumerate(recording.demonstrations):
         rows = truth["episode_index"] == number

@@ -74,7 +74,7 @@ def main() -> None:
         write(folder, seed, tuple(arguments.size), arguments.episodes)
         found = read(folder)
         frames += len(found["timestamp"])
-        np.savez(arguments.folder / f"seed{seed}.npz", **found)
+        np.savez(arguments.folder / f"seed{seed}.npz", **found)  # pyright: ignore[reportArgumentType]
     print(json.dumps({"lerobot": version("lerobot"), "frames": frames, "seconds": time.perf_counter() - begun}))
 
 
