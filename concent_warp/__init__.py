@@ -47,6 +47,8 @@ _HOMES = {
     "model": ("Model", "load_model"),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
+    "recording.logs.cfg": ("ImportCfg",),
+    "recording.logs.import_log": ("import_log",),
     "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
@@ -104,6 +106,8 @@ if TYPE_CHECKING:
     from concent_warp.model import Model, load_model
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
+    from concent_warp.recording.logs.cfg import ImportCfg
+    from concent_warp.recording.logs.import_log import import_log
     from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report

@@ -13,6 +13,8 @@ import pytest
 
 INDIRECT = {"onnxscript": "torch.onnx"}
 """Declared packages that another one imports for a function that is used, with the name of that function's module."""
+OPTIONAL = ("logs",)
+"""Extras that the package imports where they are needed, with a sentence that names them where they are missing."""
 
 
 def normalised(name: str) -> str:
@@ -22,9 +24,10 @@ def normalised(name: str) -> str:
 
 @pytest.fixture(scope="module")
 def declared(root: Path) -> set[str]:
-    """Return the distributions that an installation brings."""
+    """Return the distributions that an installation brings, with those of the extras."""
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
-    return {normalised(re.split(r"[\[<>=~! ]", line)[0]) for line in project["dependencies"]}
+    lines = [line for extra in OPTIONAL for line in project["optional-dependencies"][extra]]
+    return {normalised(re.split(r"[\[<>=~! ]", line)[0]) for line in (*project["dependencies"], *lines)}
 
 
 @pytest.fixture(scope="module")

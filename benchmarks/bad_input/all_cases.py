@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from benchmarks.bad_input import (
     hdf5_recordings,
+    logs,
     models,
     options,
     other_recordings,
@@ -14,7 +15,7 @@ from benchmarks.bad_input import (
 )
 from benchmarks.bad_input.case import Case
 
-MODULES = (hdf5_recordings, other_recordings, scenes, models, policies, options, surroundings, sound_cases)
+MODULES = (hdf5_recordings, other_recordings, logs, scenes, models, policies, options, surroundings, sound_cases)
 """Modules with a function `cases`."""
 
 

@@ -28,6 +28,7 @@ NEEDED = {
     "render": "--recording recording.h5 -o out",
     "demo": "-o out",
     "record": "-o out.h5",
+    "import": "log --model scene.xml --map map.toml -o out.h5",
 }
 """What each command needs besides the option that is wrong."""
 SIGNED = (
@@ -97,6 +98,10 @@ WRONG = {
     "record": (
         "--seeds -1", "--robot gone.xml", "--robot.tcp-site gone", "--robot.gripper-actuators gone",
         "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1",
+    ),
+    "import": (
+        "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",
+        "-o scene.xml", "--suggest", "--model gone.xml", "--map gone.toml",
     ),
 }  # fmt: skip
 """Options that are wrong in other ways."""

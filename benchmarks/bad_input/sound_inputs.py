@@ -95,6 +95,37 @@ def write_csv_folder(folder: Path) -> None:
     (folder / "action_elbow.csv").write_text(csv_text("time,command", ANGLE))
 
 
+LOG_CAMERA = {"fx": 8.0, "fy": 8.0, "ppx": 3.5, "ppy": 2.5, "width": 8, "height": 6}
+"""Intrinsics of the camera of the folder of images."""
+LOG_MAP = """
+[action.elbow]
+source = "command/angle"
+[measured.elbow_angle]
+source = "joints/angle"
+unit = "rad"
+[image.wrist]
+color = "color"
+depth = "depth"
+pose = [[1, 0, 0, 0.4], [0, -1, 0, 0.6], [0, 0, -1, 0.5], [0, 0, 0, 1]]
+"""
+"""Map from the folder of images to the scene: the camera looks down on the table."""
+
+
+def write_log(folder: Path) -> None:
+    """Write a folder of images with tables, and its map beside it."""
+    import cv2
+
+    for kind, image in (("color", np.full((6, 8, 3), 90, np.uint8)), ("depth", np.full((6, 8), 500, np.uint16))):
+        (folder / "log" / kind).mkdir(parents=True)
+        for time in TIME[:30:10]:
+            cv2.imwrite(str(folder / "log" / kind / f"{1_764_000_000_000 + round(1000 * time)}.png"), image)
+    (folder / "log" / "intrinsics.json").write_text(json.dumps(LOG_CAMERA))
+    rows = "\n".join(f"{1_764_000_000 + t:.3f},{a:.9g}" for t, a in zip(TIME, ANGLE, strict=True))
+    for name in ("joints", "command"):
+        (folder / "log" / f"{name}.csv").write_text(f"time,angle\n{rows}\n")
+    (folder / "map.toml").write_text(LOG_MAP)
+
+
 def servo_log() -> dict[str, object]:
     """Return the log of a servo that swings a payload."""
     entries = [
@@ -119,6 +150,7 @@ def write_all(folder: Path) -> None:
 
     write_recording_and_model(folder)
     write_csv_folder(folder / "csv")
+    write_log(folder)
     (folder / "scene.xml").write_text(SCENE)
     (folder / "servo.json").write_text(json.dumps(servo_log()))
     torch.save(torch.from_numpy(toss_rows()).float(), folder / "toss.pt")

@@ -20,6 +20,7 @@ GROUPS = {
     "start": {
         "demo": "record in Reality, a simulated world, then fit, compare and report",
         "record": "record demonstrations in Reality",
+        "import": "read the log of another system: LeRobot, MCAP, ROS bag, images",
     },
     "from a recording to a model": {
         "geometry": "place contact spheres on the objects of a scene; export MJCF",
@@ -50,6 +51,7 @@ COMMANDS = {name: text for group in GROUPS.values() for name, text in group.item
 EXAMPLES = {
     "demo": "concent demo --out runs/demo",
     "record": "concent record --seeds 0 1 -o demo.h5",
+    "import": "concent import bag.mcap --model robot.xml --map robot.toml -o demo.h5",
     "geometry": "concent geometry scene.xml -o model.toml",
     "fit": "concent fit demo.h5 -o runs/demo",
     "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",

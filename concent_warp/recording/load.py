@@ -9,6 +9,7 @@ from concent_warp.recording.formats.bam import read_bam
 from concent_warp.recording.formats.contactnets import read_contactnets
 from concent_warp.recording.formats.csv import read_csv
 from concent_warp.recording.formats.hdf5 import read_hdf5
+from concent_warp.recording.logs.readers.kinds import log_kind
 from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 
@@ -16,6 +17,8 @@ KINDS = (
     "an HDF5 file (.h5, .hdf5), a folder of CSV files with a scene.xml, a .pt toss or a folder of tosses, a .json log "
     "of a servo or a folder of logs"
 )
+
+LOGS = {"lerobot": "a LeRobot data set", "ros": "a ROS bag or MCAP file", "images": "a folder of images"}
 
 
 def load_recording(path: Path | str) -> Recording:
@@ -34,6 +37,9 @@ def load_recording(path: Path | str) -> Recording:
         4
     """
     path = Path(path)
+    if (kind := log_kind(path)) is not None and not (path / "scene.xml").exists():
+        fix = f"read it with `concent import {path} --model robot.xml --map robot.toml -o demo.h5`"
+        raise RecordingError(f"this is {LOGS[kind]}, not yet a recording", where=path, fix=fix)
     if path.is_dir():
         if any(path.glob("*.pt")):
             return read_contactnets(path)

@@ -1,0 +1,1 @@
+"""Logs of other systems, written by their own packages, read back."""

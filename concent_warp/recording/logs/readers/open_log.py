@@ -1,0 +1,34 @@
+"""Opening of a log of any kind; the kind is determined from the path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from concent_warp.errors import RecordingError
+from concent_warp.recording.logs.readers.image_folder import ImageFolder
+from concent_warp.recording.logs.readers.kinds import KINDS, log_kind
+from concent_warp.recording.logs.readers.lerobot import LeRobotLog
+from concent_warp.recording.logs.readers.log import Log
+from concent_warp.recording.logs.readers.ros import RosLog
+
+
+def open_log(path: Path | str) -> Log:
+    """Open a LeRobot data set, an MCAP file, a ROS bag or a folder of images.
+
+    Raises:
+        RecordingError: There is none of them, or its description cannot be read.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError("no such log", where=path, expected=KINDS, fix="check the path")
+    kind = log_kind(path)
+    if kind == "lerobot":
+        return LeRobotLog(path)
+    if kind == "ros":
+        return RosLog(path)
+    if kind == "images":
+        return ImageFolder(path)
+    if path.suffix in (".h5", ".hdf5", ".pt"):
+        raise RecordingError("this is no log to import", where=path, fix="every command reads it as it is")
+    found = path.suffix or ("another folder" if path.is_dir() else "no suffix")
+    raise RecordingError("unknown kind of log", where=path, expected=KINDS, found=found)

@@ -1,0 +1,220 @@
+"""A first map from a log to a scene, by names and, where numbers of channels are equal, by order."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from concent_warp.recording.logs.import_log import scene_of
+from concent_warp.recording.logs.readers.log import Episode, Images, Signal
+from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
+from concent_warp.scene.scene import Scene
+
+WORDS = {
+    "position": ("pos", "position", "positions", "qpos", "angle", "state"),
+    "velocity": ("vel", "velocity", "velocities", "qvel", "speed"),
+    "effort": ("effort", "torque", "current", "load", "force"),
+}
+"""Words that name a quantity and not a joint."""
+FILLERS = ("observation", "action", "joint", "joints", "states", "command", "commands", "cmd", "goal", "data", "motor",
+           "main", "follower", "leader", "actuator", "sensor", "measured", "servo")  # fmt: skip
+"""Words that do not tell one joint from another."""
+MAX_DEGREES = 720.0
+"""Largest value that is guessed to be an angle in degrees [deg]."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A channel for an actuator or sensor."""
+
+    target: Target
+    signal: Signal
+    guess: str = ""
+    """Why it may be wrong; empty where the names agree."""
+
+
+def suggest_map(source: Path | str, model: Path | str | Scene, episode: int | None = None) -> str:
+    """Return a map for a log and a scene as TOML, to be read and corrected by its user; guesses are marked.
+
+    Args:
+        source: See `import_log`.
+        model: See `import_log`.
+        episode: Episode that is looked at; the first by default.
+
+    Raises:
+        RecordingError: The log cannot be read.
+        SceneError: The scene cannot be read.
+    """
+    log = open_log(source)
+    m = scene_of(model).model
+    found = log.episode(log.numbers[0] if episode is None else episode)
+    actuators, sensors = targets_of(m)
+    commands = [one for one in found.signals.values() if one.command]
+    readings = [one for one in found.signals.values() if not one.command]
+    lines = [f"# Map from {Path(source).name} ({log.kind}): check every line, above all units and signs.", ""]
+    chosen = _matched(list(actuators.values()), commands)
+    lines += _section("action", list(actuators.values()), chosen)
+    joints = [one for one in sensors.values() if one.size == 1]
+    measured = _matched([one for one in joints if one.position], _of(readings, "position"))
+    measured += _matched([one for one in joints if one.velocity], _of(readings, "velocity"))
+    lines += _section("measured", [one for one in joints if one.position], measured)
+    bodies = [m.body(i).name for i in range(1, m.nbody) if all(body_sensors(m, m.body(i).name))]
+    poses = sorted({n.removesuffix("/orientation/w") for n in found.signals if n.endswith("/orientation/w")})
+    poses = [one for one in poses if f"{one}/position/x" in found.signals]
+    lines += _bodies(bodies, poses)
+    lines += _images(found)
+    used = {one.signal.name for one in (*chosen, *measured)} | {
+        name for name in found.signals if name.startswith(tuple(f"{pose}/" for pose in poses))
+    }
+    if left := [name for name in found.signals if name not in used]:
+        lines += ["# Channels of the log that are not mapped:", *(f"#   {name}" for name in left)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _of(signals: Sequence[Signal], quantity: str) -> list[Signal]:
+    """Return the channels of a quantity; those whose name says none count as positions."""
+    found = []
+    for one in signals:
+        words = _words(one.name)
+        said = [q for q, known in WORDS.items() if any(word in known for word in words if word != "state")]
+        if (said[-1] if said else "position") == quantity and not one.name.endswith(("/x", "/y", "/z", "/w")):
+            found.append(one)
+    return found
+
+
+def _matched(targets: Sequence[Target], signals: Sequence[Signal]) -> list[_Choice]:
+    """Return a channel for each target that has one: by name first, what is left by order if the counts are equal."""
+    positions = _of(signals, "position") if len(signals) != len(targets) else list(signals)
+    found: dict[str, _Choice] = {}
+    free = list(positions or signals)
+    for target in targets:
+        keys = {_key(target.name), _key(target.joint)} - {""}
+        hit = next((one for one in free if _key(one.name.rpartition("/")[2]) in keys or _key(one.name) in keys), None)
+        if hit is not None:
+            free.remove(hit)
+            found[target.name] = _Choice(target, hit)
+    left = [target for target in targets if target.name not in found]
+    if left and len(left) == len(free):
+        pairs = zip(left, free, strict=True)
+        found |= {target.name: _Choice(target, one, "by order") for target, one in pairs}
+    return [found[target.name] for target in targets if target.name in found]
+
+
+def _section(kind: str, targets: Sequence[Target], choices: Sequence[_Choice]) -> list[str]:
+    """Return the lines of commands or measurements."""
+    lines = []
+    for choice in choices:
+        unit, why = _unit(choice)
+        guess = ", ".join(filter(None, (choice.guess, why)))
+        lines += [f"[{kind}.{_quoted(choice.target.name)}]" + (f"  # guess: {guess}" if guess else "")]
+        lines += [f"source = {_text(choice.signal.name)}"]
+        lines += [f"unit = {_text(unit)}"] if unit else []
+        lines += [""]
+    matched = {choice.target.name for choice in choices}
+    for target in targets:
+        if target.name not in matched:
+            what = "source = ?" + (", or constant = ?" if kind == "action" else "")
+            lines += [f"# [{kind}.{_quoted(target.name)}]  # no channel found", f"# {what}", ""]
+    return lines
+
+
+def _unit(choice: _Choice) -> tuple[str, str]:
+    """Return the unit that the values suggest, and why; empty where SI fits."""
+    value = choice.signal.value[np.isfinite(choice.signal.value)]
+    target = choice.target
+    if not value.size or not target.position:
+        return "", ""
+    low, high = float(value.min()), float(value.max())
+    span = target.range
+    if target.quantity == "angle":
+        inside = span is None or (low >= span[0] - 0.35 and high <= span[1] + 0.35)
+        if inside and max(abs(low), abs(high)) <= 4 * math.pi:
+            return "", ""
+        factor = math.pi / 180
+        if max(abs(low), abs(high)) <= MAX_DEGREES and (
+            span is None or (low * factor >= span[0] - 0.35 and high * factor <= span[1] + 0.35)
+        ):
+            percent = ", may be a percentage" if low >= -100 and high <= 100 else ""
+            return "deg", f"values from {low:.4g} to {high:.4g}{percent}"
+    elif target.quantity == "length" and span is not None:
+        if high <= 1.5 * max(abs(span[0]), abs(span[1])):
+            return "", ""
+        if 1e-3 * high <= 1.5 * max(abs(span[0]), abs(span[1])) and not 0 <= low <= high <= 100:
+            return "mm", f"values from {low:.4g} to {high:.4g}"
+    if span is not None and low >= -100 and high <= 100:
+        return ("percent" if low >= 0 else "signed_percent"), f"values from {low:.4g} to {high:.4g}"
+    return "", f"values from {low:.4g} to {high:.4g} fit no unit"
+
+
+def _bodies(bodies: Sequence[str], poses: Sequence[str]) -> list[str]:
+    """Return the lines of tracked bodies."""
+    lines, free = [], list(poses)
+    for body in bodies:
+        hit = next((one for one in free if _key(body) and _key(body) in _key(one)), None)
+        guess = ""
+        if hit is None and len(bodies) == len(poses) == 1:
+            hit, guess = free[0], "  # guess: the only pose"
+        if hit is not None:
+            free.remove(hit)
+            lines += [f"[body.{_quoted(body)}]{guess}", f"source = {_text(hit)}", ""]
+    return lines
+
+
+def _images(episode: Episode) -> list[str]:
+    """Return the lines of cameras: each colour stream with the depths of its size whose name is most alike."""
+    lines = []
+    depths = [one for one in episode.images.values() if one.depth]
+    for color in (one for one in episode.images.values() if not one.depth):
+        fitting = [one for one in depths if one.size == color.size] or depths
+        depth = max(fitting, key=lambda one: _alike(one, color), default=None)
+        lines += [f"[image.{_quoted(_camera_name(color.name))}]", f"color = {_text(color.name)}"]
+        if depth is not None:
+            remark = "" if depth.size == color.size else "  # of another size: not registered to colour"
+            lines += [f"depth = {_text(depth.name)}{remark}"]
+        if color.frame:
+            lines += [f"# frame = {_text(color.frame)}", '# reference = "world"  # frame of the scene\'s world']
+        lines += [""]
+    return lines
+
+
+def _alike(one: Images, other: Images) -> int:
+    """Return how many words two names share."""
+    return len(set(_words(one.name)) & set(_words(other.name)))
+
+
+def _camera_name(name: str) -> str:
+    """Return a short name of a camera."""
+    generic = ("color", "colour", "rgb", "image", "images", "raw", "rect", "compressed", "observation")
+    words = [word for word in _words(name) if word not in generic]
+    return "_".join(words) or "camera"
+
+
+def _words(name: str) -> list[str]:
+    """Return the words of a name in lower case; camelCase is parted."""
+    parted = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
+    return [word for word in re.split(r"[^a-z0-9]+", parted.lower()) if word]
+
+
+def _key(name: str) -> str:
+    """Return what tells one joint from another in a name."""
+    quantities = {word for words in WORDS.values() for word in words}
+    kept = [word for word in _words(name) if word not in quantities and word not in FILLERS]
+    return "_".join(kept)
+
+
+def _text(value: str) -> str:
+    """Return a text as TOML."""
+    import json
+
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _quoted(name: str) -> str:
+    """Return a key of TOML."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
