@@ -1,0 +1,2 @@
+def calibrate_by_robot(footage, cfg, progress):
+    raise NotImplementedError
