@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from concent_warp.checks import Angle, Bounds, Count, Duration, Length, Positive, PositiveDuration, Share
+from concent_warp.checks import Angle, Bounds, Count, Duration, Length, Positive, PositiveDuration, Share, Signed
 
-FreeInterval = Annotated[int, Bounds(0, 100)]
+BoardEdge = Annotated[int, Bounds(0, 100)]
+"""Columns or rows of a board."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class TargetCfg:
     """Edge of a tag's black square [m]."""
     ids: tuple[int, ...] = ()
     """Numbers of the tags that are used; all that are found by default."""
-    board: tuple[FreeInterval, FreeInterval] = (0, 0)
+    board: tuple[BoardEdge, BoardEdge] = (0, 0)
     """Columns and rows of a board: squares of a ChArUco board, tags of a grid."""
     spacing: Annotated[float, Bounds(0, 1000)] = 0.0
     """Edge of a square of a ChArUco board, or gap between the tags of a grid [m]."""
@@ -37,17 +38,23 @@ class RobotViewCfg:
 
     frames: Count = 16
     """Frames that are used, evenly spread over the recording."""
-    pixels: Count = 1500
-    """Pixels a frame in which the robot is rendered."""
+    pixels: Count = 10_000
+    """Pixels of a grid over the image in which the robot is rendered."""
     capture_distance: Length = 0.25
     """Distance within which a measured point is paired with the robot at first [m]."""
     final_distance: Length = 0.015
-    """The same at the end [m]."""
-    min_agreement: Share = 0.7
-    """Share of the robot's rendered pixels whose depth must agree within `final_distance` [-]; below it nothing is
-    returned. Unmodelled cables and covers cost some of it."""
-    max_shift: Length = 0.01
-    """Largest distance between the results of two halves of the frames [m]."""
+    """Difference of depth up to which a pixel agrees with the robot at the end [m]."""
+    moving_depth: Length = 0.03
+    """How much nearer than in other frames a pixel must be to show a moving thing [m]."""
+    min_agreement: Share = 0.75
+    """Share of the robot's rendered pixels whose depth must agree [-]; below it nothing is returned. Cables and covers that
+    the scene lacks, and things in front of the robot, cost some of it."""
+    min_contrast: Positive = 12.0
+    """Change of brightness across the robot's outline from which on its place is measured [1/255]."""
+    coarse_rounds: Count = 25
+    """Rounds of alignment to what moves."""
+    fine_rounds: Count = 12
+    """Rounds of alignment to depth and outline."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,7 @@ class CalibrateCfg:
     """Whether the offset between the clocks of camera and robot is fitted."""
     max_offset: PositiveDuration = 0.5
     """Largest offset between the clocks that is searched [s]."""
-    start: tuple[float, ...] = ()
+    start: tuple[Signed, ...] = ()
     """Start of the camera's pose for the alignment of the robot: x, y, z [m] and the quaternion w, x, y, z; the pose in
     the recording by default."""
     max_gap: Duration = 0.1

@@ -80,7 +80,8 @@ class RobotSurface:
             mujoco.mj_kinematics(self.model, self.data)
             frames.append((self.data.geom_xpos.copy(), self.data.geom_xmat.reshape(-1, 3, 3).copy()))
         step = max(np.sqrt(size[0] * size[1] / count), 1.0)
-        columns, rows = (np.arange(step / 2, n - 1, step) for n in size)
+        # At the centres of pixels, where depth is measured.
+        columns, rows = (np.unique(np.arange(step / 2, n - 1, step).round()) for n in size)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1)
         inverse = np.linalg.inv(intrinsics)
         hit, normal, geom = (a.reshape(*grid.shape[:2], -1) for a in self._cast(grid.reshape(-1, 2), pose, inverse))
