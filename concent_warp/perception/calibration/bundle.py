@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -21,6 +22,8 @@ from concent_warp.perception.calibration.targets import TargetView
 
 ROUNDS = 7
 """Rounds of least squares and estimated variances."""
+MOST_STEPS = 30
+"""Steps of a round of least squares at most."""
 ANGLE_STEP = 1e-4
 """Step of the derivatives by joint angles [rad or m]."""
 CAMERA, CLOCK, SIZE, INTRINSICS = "camera", "clock", "size", "intrinsics"
@@ -97,6 +100,26 @@ class BundleFit:
 
 
 @dataclass(frozen=True)
+class Corners:
+    """Corners of targets in all frames, n of them in v views."""
+
+    points: np.ndarray
+    """In the frames of the targets [m], shape (n, 3)."""
+    pixels: np.ndarray
+    """In the images [px], shape (n, 2)."""
+    view: np.ndarray
+    """View of each corner, shape (n,)."""
+    frame_of_view: np.ndarray
+    """Shape (v,)."""
+    names: list[str]
+    """Names of the targets."""
+    target_of_view: np.ndarray
+    """Shape (v,)."""
+    ends: np.ndarray
+    """Corners after which a new frame begins, shape (frames - 1,)."""
+
+
+@dataclass(frozen=True)
 class Problem:
     """Frames, the bodies that carry camera and targets, and which groups of parameters are free."""
 
@@ -152,15 +175,35 @@ class Problem:
         """Return the poses of the targets' body in the frame of the camera's body at positions (n, nq), (n, 4, 4)."""
         return np.linalg.inv(motion.poses(qpos, self.camera_body)) @ motion.poses(qpos, self.target_body)
 
+    @cached_property
+    def corners(self) -> Corners:
+        """All corners of all frames, one after the other."""
+        views = [(i, v) for i, f in enumerate(self.frames) for v in f.views]
+        names = sorted({v.target for _, v in views})
+        counts = [len(v.points) for _, v in views]
+        return Corners(
+            np.concatenate([v.points for _, v in views]),
+            np.concatenate([v.pixels for _, v in views]),
+            np.repeat(np.arange(len(views)), counts),
+            np.array([i for i, _ in views]),
+            names,
+            np.array([names.index(v.target) for _, v in views]),
+            np.cumsum([sum(len(v.points) for v in f.views) for f in self.frames])[:-1],
+        )
+
     def residuals(self, estimate: Estimate, relative: np.ndarray | None = None) -> list[np.ndarray]:
         """Return the reprojection errors, projected minus detected, by frame [px], shape (corners, 2) each."""
         relative = self.relative(estimate.offset) if relative is None else relative
-        to_camera = np.linalg.inv(estimate.camera) @ relative
-        return [self._frame_residual(f, to_camera[i], estimate) for i, f in enumerate(self.frames)]
+        c = self.corners
+        targets = np.array([estimate.targets[name] for name in c.names])
+        pose = (np.linalg.inv(estimate.camera) @ relative)[c.frame_of_view] @ targets[c.target_of_view]
+        pose = pose[c.view]
+        local = estimate.size * np.einsum("nij,nj->ni", pose[:, :3, :3], c.points) + pose[:, :3, 3]
+        return np.split(_imaged(local, estimate.intrinsics, estimate.radial) - c.pixels, c.ends)
 
     @staticmethod
-    def _frame_residual(frame: Frame, to_camera: np.ndarray, estimate: Estimate) -> np.ndarray:
-        """Return the reprojection errors of a frame [px], shape (corners, 2)."""
+    def frame_residual(frame: Frame, to_camera: np.ndarray, estimate: Estimate) -> np.ndarray:
+        """Return the reprojection errors of a frame [px], shape (corners, 2); `to_camera` is body to camera (4, 4)."""
         parts = []
         for view in frame.views:
             pose = to_camera @ estimate.targets[view.target]
@@ -173,7 +216,11 @@ def project(pose: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, radial
 
     Radial distortion after OpenCV: r' = r (1 + k1 r^2 + k2 r^4).
     """
-    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return _imaged(points @ pose[:3, :3].T + pose[:3, 3], intrinsics, radial)
+
+
+def _imaged(local: np.ndarray, intrinsics: np.ndarray, radial: np.ndarray) -> np.ndarray:
+    """Return the pixels, shape (n, 2), of points (n, 3) [m] in the camera's frame."""
     plane = local[:, :2] / np.maximum(local[:, 2:], 1e-3)
     square = (plane**2).sum(axis=1, keepdims=True)
     plane = plane * (1 + radial[0] * square + radial[1] * square**2)
@@ -191,15 +238,18 @@ def fit(problem: Problem, start: Estimate) -> BundleFit:
     for turn in range(ROUNDS):
         by_joints = _joint_covariances(problem, estimate)
         roots = [np.linalg.cholesky(_frame_covariance(n, by_joints[i], variances)) for i, n in enumerate(sizes)]
+        whiten = [np.sqrt(w) * np.linalg.inv(root) for root, w in zip(roots, weights, strict=True)]
 
-        def whitened(step: np.ndarray, estimate=estimate, roots=roots, weights=weights) -> np.ndarray:
+        def whitened(step: np.ndarray, estimate=estimate, whiten=whiten) -> np.ndarray:
             moved = problem.moved(estimate, step)
             parts = problem.residuals(moved)
             known = np.log([moved.size]) / problem.size_std
-            rows = [np.sqrt(w) * np.linalg.solve(root, r.ravel()) for r, root, w in zip(parts, roots, weights, strict=True)]
+            rows = [white @ r.ravel() for r, white in zip(parts, whiten, strict=True)]
             return np.concatenate([*rows, known])
 
-        solved = least_squares(whitened, np.zeros(count), x_scale="jac", method="lm", xtol=1e-10, ftol=1e-10)
+        solved = least_squares(
+            whitened, np.zeros(count), x_scale="jac", method="lm", xtol=1e-9, ftol=1e-9, max_nfev=MOST_STEPS
+        )
         estimate = problem.moved(estimate, solved.x)
         parts = problem.residuals(estimate)
         # Back from whitened derivatives to pixels.
@@ -245,7 +295,7 @@ def _joint_covariances(problem: Problem, estimate: Estimate) -> list[np.ndarray]
             moved.append(qpos[0].copy())
             moved[-1][motion.model.jnt_qposadr[joint]] += ANGLE_STEP
         relative = camera @ problem.between(motion, np.array(moved))
-        pixels = [problem._frame_residual(frame, pose, estimate).ravel() for pose in relative]
+        pixels = [problem.frame_residual(frame, pose, estimate).ravel() for pose in relative]
         noise = np.array([reading.noise_std for reading in motion.readings.values()])
         derivative = (np.array(pixels[1:]) - pixels[0]).T / ANGLE_STEP * noise
         result.append(derivative @ derivative.T)

@@ -98,7 +98,7 @@ def calibrate_by_robot(
         equations = [_coarse(shot, footage, cfg, pose, offset, float(gate)) for shot in shots]
         free = [*range(POSE), CLOCK] if cfg.fit_clock and k > len(gates) // 2 else list(range(POSE))
         pose, offset, scale = _moved(pose, offset, scale, _solve(equations, free))
-        offset = float(np.clip(offset, -cfg.max_offset, cfg.max_offset))
+        offset = float(np.clip(offset, -cfg.limits.max_offset, cfg.limits.max_offset))
         progress((k + 1) / rounds)
     free = [*range(POSE), CLOCK] if cfg.fit_clock else list(range(POSE))
     equations: list[Equations] = []
@@ -156,18 +156,18 @@ def _shots(footage: Footage, cfg: CalibrateCfg) -> list[Shot]:
     for name, stream in footage.streams.items():
         motion = footage.motions[name]
         robot = RobotSurface(motion)
-        rows = np.flatnonzero(motion.covered(list(motion.readings), stream.time, cfg.max_gap))
+        rows = np.flatnonzero(motion.covered(list(motion.readings), stream.time, cfg.limits.max_gap))
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, share).astype(int))] if len(rows) else rows
         far = np.where(stream.depth[rows] > 0, stream.depth[rows], np.inf)
         background = far.max(axis=0) if len(rows) else far
         for k, row in enumerate(rows):
             nearer = np.isfinite(far[k]) & (far[k] < background - cfg.robot.moving_depth)
             shots.append(_shot(footage, name, int(row), nearer, robot))
-    if len(shots) < cfg.min_views:
+    if len(shots) < cfg.limits.min_views:
         raise RecordingError(
             "too few frames lie where the joints have readings",
             where=footage.where,
-            expected=f"{cfg.min_views} and more",
+            expected=f"{cfg.limits.min_views} and more",
             found=len(shots),
             fix="record more frames, or check the clocks",
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from concent_warp.perception.calibration.checks import (
     remarks_on,
     size_check,
 )
-from concent_warp.perception.calibration.clock import clock_offset
+from concent_warp.perception.calibration.clock import ClockSearch
 from concent_warp.perception.calibration.footage import Footage
 from concent_warp.perception.calibration.hand_eye import (
     HandEye,
@@ -51,6 +51,10 @@ MAX_OUTLIERS = 0.35
 """Share of frames without weight above which a fit is refused."""
 KNOWN_POSITION, KNOWN_ANGLE = 0.03, np.radians(3.0)
 """Half widths of intervals above which a pose is not determined [m, rad]."""
+UNKNOWN_SIZE = 1.0
+"""Standard deviation of the size of a target where it is not what was stated [-]."""
+CLEARLY_BETTER = 0.8
+"""Residual with fitted intrinsics over that with another size, below which intrinsics are wrong, and not the size [-]."""
 MIN_TURN = np.radians(2.0)
 """Rotation of the bodies against one another below which the arm stands still [rad]."""
 
@@ -95,24 +99,27 @@ def calibrate_by_targets(
     views = _large_enough(footage, views, cfg)
     main = _most_frequent(views)
     runs = [_run(name, footage, v, main) for name, v in views.items() if any(one.target == main for one in v)]
-    bodies, offset, start = _carriers(footage, runs, cfg)
+    bodies, offset, start = _carriers(footage, views, runs, cfg)
     progress(0.2)
     frames = _frames(footage, views, bodies, offset, cfg)
     _check_spread(footage, frames, bodies, offset, cfg)
     estimate = _start(footage, frames, bodies, offset, start, main)
     free = (SIZE, CLOCK) if cfg.fit_clock else (SIZE,)
-    problem = Problem(frames, *bodies, free, cfg.robust_width)
+    problem = Problem(frames, *bodies, free, cfg.limits.robust_width)
     remarks: list[str] = []
     fitted = fit(problem, estimate)
-    if cfg.fit_clock and fitted.std(CLOCK)[0] * 2 > 0.25 * cfg.max_offset:
+    if cfg.fit_clock and fitted.std(CLOCK)[0] * 2 > 0.25 * cfg.limits.max_offset:
         remarks.append("the clock offset cannot be seen, since the arm stands still in the views; it is taken as 0")
-        problem = Problem(frames, *bodies, (SIZE,), cfg.robust_width)
+        problem = Problem(frames, *bodies, (SIZE,), cfg.limits.robust_width)
         fitted = fit(problem, Estimate(estimate.camera, estimate.targets, estimate.intrinsics))
+    if abs(np.log(fitted.estimate.size)) > 2 * problem.size_std:
+        problem = replace(problem, size_std=UNKNOWN_SIZE)
+        fitted = fit(problem, fitted.estimate)
+    _check_agreement(footage, problem, fitted, cfg)
     progress(0.6)
-    wide_problem = Problem(frames, *bodies, (*problem.free, INTRINSICS), cfg.robust_width)
+    wide_problem = replace(problem, free=(*problem.free, INTRINSICS))
     wide = fit(wide_problem, fitted.estimate)
     progress(0.9)
-    _check_agreement(footage, problem, fitted, cfg)
     stated = np.asarray(footage.first.intrinsics, float)
     checks = intrinsic_checks(wide, stated)
     unknown = max(c.high - c.low for c in checks[:2]) / 2 > UNKNOWN_FOCAL
@@ -129,12 +136,19 @@ def calibrate_by_targets(
         problem, fitted = wide_problem, wide
     radial = radial_check(wide, wide_problem)
     checks = [] if unknown else [*checks, radial]
-    size = size_check(wide if any(c.off for c in checks) else fitted)
-    depth = depth_check(fitted, problem, footage)
+    wrong = any(c.off for c in checks)
+    size = size_check(wide if wrong and wide.rms < CLEARLY_BETTER * fitted.rms else fitted)
+    depth = depth_check(wide if wrong else fitted, wide_problem if wrong else problem, footage)
     _check_size(footage, size, cfg)
     _check_determined(footage, fitted)
     checks += [size] + ([] if depth is None else [depth])
     remarks += remarks_on(checks, fitted=cfg.fit_intrinsics)
+    if wrong and not cfg.fit_intrinsics:
+        shift = float(np.linalg.norm(wide.estimate.camera[:3, 3] - fitted.estimate.camera[:3, 3]))
+        remarks.append(
+            "the intervals of the pose assume that the recorded intrinsics are right, which they seem not to be: with "
+            f"fitted ones the position is {1e3 * shift:.1f} mm aside"
+        )
     remarks += _pose_remarks(footage, fitted)
     estimate = fitted.estimate
     factor = quantile(fitted)
@@ -142,7 +156,7 @@ def calibrate_by_targets(
     has_clock = CLOCK in problem.free
     return CameraCalibration(
         name=footage.name,
-        method=cfg.target.kind if cfg.target.kind != "auto" else "tags",
+        method=cfg.target.method if cfg.target.method != "auto" else "tags",
         pose=estimate.camera,
         body=footage.first.body,
         recorded_pose=np.asarray(footage.first.pose, float),
@@ -170,7 +184,7 @@ def _large_enough(
     Raises:
         RecordingError: There is no target, all are too small, or there are too few frames.
     """
-    kept = {name: [v for v in some if v.edge >= cfg.min_edge] for name, some in views.items()}
+    kept = {name: [v for v in some if v.edge >= cfg.limits.min_edge] for name, some in views.items()}
     found = [v for some in views.values() for v in some]
     if not found:
         raise no_target_error(footage.first, cfg, footage.where)
@@ -179,17 +193,17 @@ def _large_enough(
         raise RecordingError(
             "the tags are too small in the images",
             where=footage.where,
-            expected=f"edges of {cfg.min_edge:g} px and more",
+            expected=f"edges of {cfg.limits.min_edge:g} px and more",
             found=f"{max(v.edge for v in found):.1f} px in images of {footage.size[0]} x {footage.size[1]} px",
             fix="record larger images, print larger tags, or move them nearer",
         )
-    if len(frames) < cfg.min_views:
+    if len(frames) < cfg.limits.min_views:
         raise RecordingError(
             "too few frames show a target",
             where=footage.where,
-            expected=f"{cfg.min_views} and more, with the hand turned to all sides",
+            expected=f"{cfg.limits.min_views} and more, with the hand turned to all sides",
             found=len(frames),
-            fix="record more views, or give --min-views",
+            fix="record more views, or give --limits.min-views",
         )
     return kept
 
@@ -210,7 +224,9 @@ def _run(name: str, footage: Footage, views: list[TargetView], target: str) -> R
     return Run(name, stream.time[[row for row, _ in sure]], np.array([pose for _, pose in sure]))
 
 
-def _carriers(footage: Footage, runs: list[Run], cfg: CalibrateCfg) -> tuple[tuple[str, str], float, HandEye]:
+def _carriers(
+    footage: Footage, views: dict[str, list[TargetView]], runs: list[Run], cfg: CalibrateCfg
+) -> tuple[tuple[str, str], float, HandEye]:
     """Return the bodies that carry camera and target, the clock offset [s] and the closed-form solution.
 
     Raises:
@@ -224,7 +240,9 @@ def _carriers(footage: Footage, runs: list[Run], cfg: CalibrateCfg) -> tuple[tup
     else:
         candidates = [*(["world"] if footage.body != "world" else []), *moving]
     motion.joints(*(b for b in (footage.body, *candidates[:1]) if b != "world"))
-    tried = [(body, *_closed_form(footage, runs, (footage.body, body), cfg)) for body in candidates]
+    data = [(footage.motions[r.demonstration], r.time, r.seen) for r in runs]
+    clock = ClockSearch(data, cfg.limits.max_offset, fixed=not cfg.fit_clock)
+    tried = [(body, *_closed_form(footage, runs, (footage.body, body), clock)) for body in candidates]
     tried = [one for one in tried if one[2] is not None]
     if not tried:
         raise RecordingError(
@@ -232,16 +250,17 @@ def _carriers(footage: Footage, runs: list[Run], cfg: CalibrateCfg) -> tuple[tup
             where=footage.where,
             expected="a hand that carries one of the two and turns to all sides while the other one is fixed",
             found="joints that stand still",
-            fix="move the arm, or name the body that carries the target with --target.body",
+            fix="move the arm, or name the body that carries the target with --target-body",
         )
     body, offset, start = min(tried, key=lambda one: _disagreement(one[2]))
     assert start is not None
     if start.angle_error < FITTING_ANGLE and start.position_error < FITTING_DISTANCE:
         return (footage.body, body), offset, start
+    _frames(footage, views, (footage.body, body), offset, cfg)  # gaps in the readings come first
     for camera in ["world", *moving]:
         for target in ["world", *moving]:
             if camera not in (target, footage.body):
-                other = _closed_form(footage, runs, (camera, target), cfg)[1]
+                other = _closed_form(footage, runs, (camera, target), clock)[1]
                 if other is not None and _disagreement(other) < SURE_SHARE * min(_disagreement(start), 1.0):
                     raise RecordingError(
                         f"the camera is not on {footage.body}",
@@ -270,7 +289,7 @@ def _check_body(footage: Footage, body: str) -> None:
             where=footage.where,
             expected=f"one of {names}, or auto",
             found=body,
-            fix="give --target.body",
+            fix="give --target-body",
         )
 
 
@@ -280,11 +299,10 @@ def _disagreement(start: HandEye) -> float:
 
 
 def _closed_form(
-    footage: Footage, runs: list[Run], bodies: tuple[str, str], cfg: CalibrateCfg
+    footage: Footage, runs: list[Run], bodies: tuple[str, str], clock: ClockSearch
 ) -> tuple[float, HandEye | None]:
     """Return the clock offset [s] and the closed-form solution; None where the bodies do not turn."""
-    data = [(footage.motions[r.demonstration], r.time, r.seen) for r in runs]
-    offset = clock_offset(data, bodies, cfg.max_offset) if cfg.fit_clock else 0.0
+    offset = clock.offset(bodies)
     relative = np.concatenate([_relative(footage, r.demonstration, r.time + offset, bodies) for r in runs])
     seen = np.concatenate([r.seen for r in runs])
     if len(relative) < 3 or rotation_spread(relative)[0][0] < MIN_TURN:
@@ -312,22 +330,22 @@ def _frames(
         motion, stream = footage.motions[name], footage.streams[name]
         joints = motion.joints(*(b for b in bodies if b != "world"))
         rows = sorted({v.frame for v in some})
-        covered = motion.covered(joints, stream.time[rows] + offset, cfg.max_gap)
+        covered = motion.covered(joints, stream.time[rows] + offset, cfg.limits.max_gap)
         frames += [
             Frame(motion, name, float(stream.time[row]), tuple(v for v in some if v.frame == row), row)
             for row, ok in zip(rows, covered, strict=True)
             if ok
         ]
-    if len(frames) < cfg.min_views:
+    if len(frames) < cfg.limits.min_views:
         raise RecordingError(
             "too few frames lie where the joints have readings",
             where=footage.where,
-            expected=f"{cfg.min_views} frames with gaps of at most {cfg.max_gap:g} s between readings",
+            expected=f"{cfg.limits.min_views} frames with gaps of at most {cfg.limits.max_gap:g} s between readings",
             found=f"{len(frames)} of {sum(len({v.frame for v in some}) for some in views.values())} with a target",
-            fix="check the clocks and gaps of the joint sensors, or give --max-gap",
+            fix="check the clocks and gaps of the joint sensors, or give --limits.max-gap",
         )
-    step = len(frames) / min(len(frames), cfg.max_frames)
-    return [frames[int(i * step)] for i in range(min(len(frames), cfg.max_frames))]
+    step = len(frames) / min(len(frames), cfg.limits.max_frames)
+    return [frames[int(i * step)] for i in range(min(len(frames), cfg.limits.max_frames))]
 
 
 def _check_spread(
@@ -336,7 +354,7 @@ def _check_spread(
     """Raise an error where the bodies turn about one axis only."""
     relative = np.concatenate([_relative(footage, f.demonstration, np.array([f.time + offset]), bodies) for f in frames])
     size, axes = rotation_spread(relative)
-    if np.degrees(size[1]) >= cfg.min_rotation:
+    if np.degrees(size[1]) >= cfg.limits.min_rotation:
         return
     carrier = bodies[0] if bodies[0] != "world" else bodies[1]
     if bodies[0] == "world":
@@ -346,7 +364,7 @@ def _check_spread(
         f"the motion does not determine the camera's pose: {carrier} turns about one axis only, ({axis}) in its frame, "
         "and positions along it cannot be told apart",
         where=footage.where,
-        expected=f"rotations of {cfg.min_rotation:g} deg about a second axis",
+        expected=f"rotations of {cfg.limits.min_rotation:g} deg about a second axis",
         found=f"{np.degrees(size[0]):.1f} deg about this axis and {np.degrees(size[1]):.1f} deg about others",
         fix="tilt the hand to several sides while the target is in view",
     )
@@ -380,11 +398,11 @@ def _check_agreement(footage: Footage, problem: Problem, fitted: BundleFit, cfg:
             found=f"{share:.0%}, from {first:.1f} to {last:.1f} s",
             fix="fix tag and camera, or cut the recording there",
         )
-    if fitted.rms > cfg.max_residual:
+    if fitted.rms > cfg.limits.max_residual:
         raise RecordingError(
             "the views do not agree with one pose of the camera",
             where=footage.where,
-            expected=f"reprojection errors of {cfg.max_residual:g} px at most",
+            expected=f"reprojection errors of {cfg.limits.max_residual:g} px at most",
             found=f"{fitted.rms:.1f} px",
             fix="check joint readings, the body of the camera and that nothing was moved",
         )
@@ -392,7 +410,7 @@ def _check_agreement(footage: Footage, problem: Problem, fitted: BundleFit, cfg:
 
 def _check_size(footage: Footage, check: Check, cfg: CalibrateCfg) -> None:
     """Raise an error where the targets have another size than stated."""
-    if not check.off or abs(check.value) < 100 * cfg.size_tolerance:
+    if not check.off or abs(check.value) < 100 * cfg.limits.size_tolerance:
         return
     size = cfg.target.tag_size * (1 + check.value / 100)
     low, high = (cfg.target.tag_size * (1 + v / 100) for v in (check.low, check.high))
@@ -401,7 +419,7 @@ def _check_size(footage: Footage, check: Check, cfg: CalibrateCfg) -> None:
         where=footage.where,
         expected=f"edges of {size:.4f} m (95 %: {low:.4f} to {high:.4f}), as the robot's motion says",
         found=f"{cfg.target.tag_size:g} m",
-        fix="measure the black square and give --target.tag-size in metres",
+        fix="measure the black square and give --tag-size in metres",
     )
 
 

@@ -73,7 +73,7 @@ def calibrate(
     motions = {d.name: JointMotion(scene, d, recording.source) for d in filmed}
     cameras = {}
     for k, name in enumerate(chosen):
-        footage = footage_of(recording, name, scene, motions, cfg.max_offset)
+        footage = footage_of(recording, name, scene, motions, cfg.limits.max_offset)
         cameras[name] = _calibrated(footage, cfg, lambda share, k=k: report((k + share) / len(chosen)))
     result = Calibration(recording, cameras)
     if out is not None:
@@ -94,10 +94,10 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
 
 def _calibrated(footage: Footage, cfg: CalibrateCfg, progress: Callable[[float], None]) -> CameraCalibration:
     """Return the calibration of one camera by what is to be seen."""
-    if cfg.target.kind == "robot":
+    if cfg.target.method == "robot":
         return calibrate_by_robot(footage, cfg, progress)
     views = find_views(footage, cfg, lambda share: progress(0.4 * share))
-    if any(views.values()) or cfg.target.kind != "auto":
+    if any(views.values()) or cfg.target.method != "auto":
         return calibrate_by_targets(footage, views, cfg, lambda share: progress(0.4 + 0.6 * share))
     # Another dictionary or mirrored tags are a mistake; a view of the robot without any tag is none.
     mistake = mistaken_target(footage.first, cfg, footage.where)

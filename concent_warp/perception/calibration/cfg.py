@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from concent_warp.checks import Angle, Bounds, Count, Duration, Length, Positive, PositiveDuration, Share, Signed
@@ -12,10 +12,17 @@ BoardEdge = Annotated[int, Bounds(0, 100)]
 
 
 @dataclass(frozen=True)
-class TargetCfg:
-    """What a camera is calibrated against."""
+class CalibrationTargetCfg:
+    """What a camera is calibrated against.
 
-    kind: Literal["auto", "tags", "charuco", "grid", "robot"] = "auto"
+    Example:
+        >>> import concent_warp as cw
+        >>> board = cw.CalibrationTargetCfg("charuco", "4X4_50", tag_size=0.0225, board=(6, 4), spacing=0.03)
+        >>> board.body
+        'auto'
+    """
+
+    method: Literal["auto", "tags", "charuco", "grid", "robot"] = "auto"
     """Single tags at unknown places, a ChArUco or a grid board, or the robot itself; auto takes tags where any are
     found, else the robot."""
     dictionary: str = "DICT_APRILTAG_36h11"
@@ -58,22 +65,11 @@ class RobotViewCfg:
 
 
 @dataclass(frozen=True)
-class CalibrateCfg:
-    """Settings of `calibrate`."""
+class CalibrationLimitsCfg:
+    """What is searched, used and refused."""
 
-    target: TargetCfg = TargetCfg()
-    """What the camera is calibrated against."""
-    cameras: tuple[str, ...] = ()
-    """Cameras that are calibrated; all by default."""
-    fit_intrinsics: bool = False
-    """Whether focal lengths, principal point and two radial distortion coefficients are fitted as well."""
-    fit_clock: bool = True
-    """Whether the offset between the clocks of camera and robot is fitted."""
     max_offset: PositiveDuration = 0.5
-    """Largest offset between the clocks that is searched [s]."""
-    start: tuple[Signed, ...] = ()
-    """Start of the camera's pose for the alignment of the robot: x, y, z [m] and the quaternion w, x, y, z; the pose in
-    the recording by default."""
+    """Largest offset between the clocks of camera and robot that is searched [s]."""
     max_gap: Duration = 0.1
     """Largest gap of an encoder's readings across which angles are interpolated [s]."""
     max_frames: Annotated[int, Bounds(3, 10_000)] = 120
@@ -85,10 +81,36 @@ class CalibrateCfg:
     min_rotation: Angle = 10.0
     """Rotation about a second axis, root mean square over pairs of views, below which the motion is degenerate [deg]."""
     robust_width: Positive = 3.0
-    """Residual of a view, over its expected size, beyond which its weight falls [-]."""
+    """Residual of a frame over the median one beyond which its weight falls [-]."""
     size_tolerance: Share = 0.03
     """Difference of the tag size from the stated one beyond which nothing is returned [-]."""
     max_residual: Positive = 5.0
     """Root mean square reprojection error beyond which nothing is returned [px]."""
-    robot: RobotViewCfg = RobotViewCfg()
+
+
+@dataclass(frozen=True)
+class CalibrateCfg:
+    """Settings of `calibrate`.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cfg = cw.CalibrateCfg(cw.CalibrationTargetCfg(tag_size=0.06), fit_intrinsics=True)
+        >>> cfg.target.dictionary
+        'DICT_APRILTAG_36h11'
+    """
+
+    target: CalibrationTargetCfg = field(default_factory=CalibrationTargetCfg)
+    """What the camera is calibrated against."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that are calibrated; all by default."""
+    fit_intrinsics: bool = False
+    """Whether focal lengths, principal point and two radial distortion coefficients are fitted as well."""
+    fit_clock: bool = True
+    """Whether the offset between the clocks of camera and robot is fitted."""
+    start: tuple[Signed, ...] = ()
+    """Start of the camera's pose for the alignment of the robot: x, y, z [m] and the quaternion w, x, y, z; the pose in
+    the recording by default."""
+    limits: CalibrationLimitsCfg = field(default_factory=CalibrationLimitsCfg)
+    """What is searched, used and refused."""
+    robot: RobotViewCfg = field(default_factory=RobotViewCfg)
     """Alignment of the robot's own shape."""

@@ -124,8 +124,8 @@ def remarks_on(checks: list[Check], *, fitted: bool) -> list[str]:
     for check in checks:
         if not check.off:
             continue
-        bounds = f"95 %: {abs(check.low):.2f} to {abs(check.high):.2f}" if check.low * check.high > 0 else ""
-        size = f"{abs(check.value):.2f} {check.unit} ({bounds})"
+        low, high = sorted((abs(check.low), abs(check.high)))
+        size = f"{abs(check.value):.2f} {check.unit} (95 %: {low:.2f} to {high:.2f})"
         cure = "the fitted value is written" if fitted else "--fit-intrinsics fits it"
         if check.name == "depth":
             lines.append(f"depth reads {size} too {'long' if check.value > 0 else 'short'}")

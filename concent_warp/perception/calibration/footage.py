@@ -89,6 +89,6 @@ def footage_of(
                 where=where,
                 expected=f"frames within {low:.3f} to {high:.3f} s, when the joints were read",
                 found=found,
-                fix="shift the camera's times, or give --max-offset",
+                fix="shift the camera's times, or give --limits.max-offset",
             )
     return Footage(camera, where, scene, streams, motions)

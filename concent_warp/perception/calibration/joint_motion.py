@@ -133,6 +133,15 @@ class JointMotion:
             poses[t, :3, 3] = self.data.xpos[row]
         return poses
 
+    def orientations(self, qpos: np.ndarray) -> np.ndarray:
+        """Return the orientations of all bodies at generalised positions (T, nq), shape (T, nbody, 3, 3)."""
+        result = np.empty((len(qpos), self.model.nbody, 3, 3))
+        for t, state in enumerate(qpos):
+            self.data.qpos[:] = state
+            mujoco.mj_kinematics(self.model, self.data)
+            result[t] = self.data.xmat.reshape(-1, 3, 3)
+        return result
+
     def moving_bodies(self) -> list[str]:
         """Return one body of each group that moves alike, all joints of which have readings; the outermost first."""
         groups: dict[tuple[int, ...], str] = {}

@@ -34,7 +34,7 @@ class Check:
     @property
     def off(self) -> bool:
         """Whether the interval excludes 0, and the deviation matters."""
-        return self.low * self.high > 0 and abs(self.value) > self.least
+        return bool(self.low * self.high > 0 and abs(self.value) > self.least)
 
 
 @dataclass(frozen=True)

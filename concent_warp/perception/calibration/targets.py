@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.errors import RecordingError
-from concent_warp.perception.calibration.cfg import CalibrateCfg, TargetCfg
+from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
 from concent_warp.perception.calibration.tag_edges import refine_corners
 from concent_warp.recording.recording import ImageStream
 
@@ -70,7 +70,7 @@ def dictionary_name(name: str) -> str:
 
 
 def detect(
-    stream: ImageStream, cfg: TargetCfg, progress: Callable[[float], None] | None = None
+    stream: ImageStream, cfg: CalibrationTargetCfg, progress: Callable[[float], None] | None = None
 ) -> list[TargetView]:
     """Return all views of targets in the frames of a camera; tags smaller than any limit included.
 
@@ -99,10 +99,10 @@ def no_target_error(stream: ImageStream, cfg: CalibrateCfg, where: str) -> Recor
     height, width = stream.rgb.shape[1:3]
     if width < SMALL_IMAGE:
         return RecordingError(
-            _not_found(cfg), where=where, expected=f"tags with edges of {cfg.min_edge:g} px",
+            _not_found(cfg), where=where, expected=f"tags with edges of {cfg.limits.min_edge:g} px",
             found=f"images of {width} x {height} px", fix="record larger images",
         )  # fmt: skip
-    fix = "check the dictionary, focus and light, or align the robot itself by --target.kind robot"
+    fix = "check the dictionary, focus and light, or align the robot itself by --method robot"
     return RecordingError(_not_found(cfg), where=where, fix=fix)
 
 
@@ -120,7 +120,7 @@ def mistaken_target(stream: ImageStream, cfg: CalibrateCfg, where: str) -> Recor
         other = f"tag {present[1]} in {present[2]:.0%} of the frames tried"
         if cfg.target.ids:
             expected = f"one of the ids {', '.join(map(str, cfg.target.ids))}"
-            return RecordingError(what, where=where, expected=expected, found=other, fix="give other --target.ids")
+            return RecordingError(what, where=where, expected=expected, found=other, fix="give other --ids")
         fix = "check kind, columns, rows and sizes of the board"
         return RecordingError(what, where=where, found=f"single tags, such as {other}", fix=fix)
     other = _best_dictionary(frames, [one for one in FAMILIES if one != name])
@@ -128,7 +128,7 @@ def mistaken_target(stream: ImageStream, cfg: CalibrateCfg, where: str) -> Recor
         found, number, share = other
         return RecordingError(
             what, where=where, found=f"tag {number} of {found} in {share:.0%} of the frames tried",
-            fix=f"give --target.dictionary {found.removeprefix('DICT_')}",
+            fix=f"give --dictionary {found.removeprefix('DICT_')}",
         )  # fmt: skip
     if _best_dictionary([np.ascontiguousarray(frame[:, ::-1]) for frame in frames], [name]) is not None:
         return RecordingError(
@@ -139,7 +139,7 @@ def mistaken_target(stream: ImageStream, cfg: CalibrateCfg, where: str) -> Recor
 
 def _not_found(cfg: CalibrateCfg) -> str:
     """Return what was not found."""
-    kind = "board" if cfg.target.kind in ("charuco", "grid") else "tag"
+    kind = "board" if cfg.target.method in ("charuco", "grid") else "tag"
     return f"no {kind} of dictionary {dictionary_name(cfg.target.dictionary)} is seen in any frame"
 
 
@@ -176,11 +176,11 @@ def _dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary_name(name)))
 
 
-def _finder(cfg: TargetCfg) -> Callable[[np.ndarray], list[tuple[str, np.ndarray, np.ndarray]]]:
+def _finder(cfg: CalibrationTargetCfg) -> Callable[[np.ndarray], list[tuple[str, np.ndarray, np.ndarray]]]:
     """Return a function from an image to the names, corners [m] and pixels of the targets in it."""
     import cv2
 
-    if cfg.kind == "charuco":
+    if cfg.method == "charuco":
         _check_board(cfg)
         board = cv2.aruco.CharucoBoard(cfg.board, cfg.spacing, cfg.tag_size, _dictionary(cfg.dictionary))
         detector, points = cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners(), float)
@@ -195,7 +195,7 @@ def _finder(cfg: TargetCfg) -> Callable[[np.ndarray], list[tuple[str, np.ndarray
     tags = _detector(cfg.dictionary)
     cells = _dictionary(cfg.dictionary).markerSize + 2
     layout: dict[int, np.ndarray] = {}
-    if cfg.kind == "grid":
+    if cfg.method == "grid":
         _check_board(cfg)
         grid = cv2.aruco.GridBoard(cfg.board, cfg.tag_size, cfg.spacing, _dictionary(cfg.dictionary))
         ids = np.ravel(grid.getIds())
@@ -221,21 +221,21 @@ def _finder(cfg: TargetCfg) -> Callable[[np.ndarray], list[tuple[str, np.ndarray
     return tag_corners
 
 
-def _check_board(cfg: TargetCfg) -> None:
+def _check_board(cfg: CalibrationTargetCfg) -> None:
     """Raise an error unless a board has columns, rows and a spacing."""
     if min(cfg.board) < 2 or cfg.spacing <= 0:
         raise RecordingError(
-            f"the size of the {cfg.kind} board is not stated",
+            f"the size of the {cfg.method} board is not stated",
             expected="columns and rows, and the edge of a square (charuco) or the gap between tags (grid) in metres",
             found=f"{cfg.board} and {cfg.spacing}",
-            fix="give --target.board COLUMNS ROWS --target.spacing METRES",
+            fix="give --board COLUMNS ROWS --spacing METRES",
         )
-    if cfg.kind == "charuco" and cfg.tag_size >= cfg.spacing:
+    if cfg.method == "charuco" and cfg.tag_size >= cfg.spacing:
         raise RecordingError(
             "a tag of a ChArUco board is smaller than its square",
             expected=f"a tag size below {cfg.spacing:g} m",
             found=f"{cfg.tag_size:g} m",
-            fix="give --target.tag-size and --target.spacing in metres",
+            fix="give --tag-size and --spacing in metres",
         )
 
 
