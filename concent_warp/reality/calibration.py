@@ -137,7 +137,11 @@ def nominal_scene() -> Scene:
     spec = panda()
     spec.modelname = "calibration"
     spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0.4, 0, -0.02], size=[0.6, 0.6, 0.02], rgba=[0.6, 0.5, 0.4, 1]
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0.4, 0, -0.02],
+        size=[0.6, 0.6, 0.02],
+        rgba=[0.6, 0.5, 0.4, 1],
     )
     spec.worldbody.add_light(pos=[0.6, -0.4, 1.6], dir=[-0.1, 0.3, -1.0], castshadow=False)
     spec.worldbody.add_light(pos=[0.3, 0.6, 1.4], dir=[0.1, -0.4, -1.0], castshadow=False, diffuse=[0.4] * 3)
@@ -151,7 +155,9 @@ def pinhole_matrix(cfg: CalibrationSceneCfg) -> np.ndarray:
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
 
-def looking(position: np.ndarray, target: np.ndarray, roll: float = 0.0, up: tuple[float, ...] = (0, 0, 1)) -> np.ndarray:
+def looking(
+    position: np.ndarray, target: np.ndarray, roll: float = 0.0, up: tuple[float, ...] = (0, 0, 1)
+) -> np.ndarray:
     """Return the pose of a camera at a place that looks at another one, turned about its axis [rad], shape (4, 4)."""
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, up)
@@ -167,7 +173,9 @@ def _camera_pose(cfg: CalibrationSceneCfg, rng: np.random.Generator) -> np.ndarr
     """Return the true pose of the camera in the frame of what carries it, shape (4, 4)."""
     spread = rng.uniform(-1, 1, 3)
     if cfg.camera == "hand":
-        return looking(np.array([0.07, 0, 0.01]) + 0.01 * spread, np.array([0.03, 0.02 * spread[1], 0.3]), 0.1, (1, 0, 0))
+        return looking(
+            np.array([0.07, 0, 0.01]) + 0.01 * spread, np.array([0.03, 0.02 * spread[1], 0.3]), 0.1, (1, 0, 0)
+        )
     aim = np.array([0.45, 0.0, 0.25]) if cfg.target != "none" else np.array([0.3, 0.0, 0.4])
     return looking(np.array([1.05, -0.35, 0.65]) + 0.08 * spread, aim + 0.05 * spread[::-1])
 
@@ -297,7 +305,9 @@ def _photograph(
         warp_model, warp_data = mjw.put_model(model), mjw.put_data(model, data)
         fine = {"cam_res": (2 * width, 2 * height), "cam_active": [CAMERA], "use_shadows": False}
         colour = mjw.create_render_context(model, render_rgb=True, render_depth=False, **fine)
-        ranging = mjw.create_render_context(model, render_rgb=False, render_depth=True, **{**fine, "cam_res": (width, height)})
+        ranging = mjw.create_render_context(
+            model, render_rgb=False, render_depth=True, **{**fine, "cam_res": (width, height)}
+        )
         seen: Any = wp.zeros((1, 2 * height, 2 * width), dtype=wp.vec3)
         for t, instant in enumerate(time):
             light = np.zeros((2 * height, 2 * width, 3))

@@ -83,7 +83,9 @@ def run(arguments: Arguments) -> Calibration:
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     if arguments.picture is not None and arguments.picture.suffix not in PICTURES:
         expected = f"one of {', '.join(PICTURES)}"
-        raise ConcentError("unknown kind of picture", where=arguments.picture, expected=expected, fix="change its suffix")
+        raise ConcentError(
+            "unknown kind of picture", where=arguments.picture, expected=expected, fix="change its suffix"
+        )
     beside = None if arguments.out is None else arguments.out.parent / JSON_NAME
     for path in (arguments.out, beside, arguments.picture):
         if path is not None:

@@ -259,7 +259,10 @@ def fit(problem: Problem, start: Estimate) -> BundleFit:
         variances = _variances([r.ravel() for r in parts], raw, by_joints, weights, variances)
         covariances = [_frame_covariance(n, by_joints[i], variances) for i, n in enumerate(sizes)]
         size = np.array(
-            [np.sqrt(r.ravel() @ np.linalg.solve(v, r.ravel()) / r.size) for r, v in zip(parts, covariances, strict=True)]
+            [
+                np.sqrt(r.ravel() @ np.linalg.solve(v, r.ravel()) / r.size)
+                for r, v in zip(parts, covariances, strict=True)
+            ]
         )
         if turn < ROUNDS - 1:  # over the median: gross errors are in the first variances
             limit = problem.robust_width * float(np.median(size))
@@ -272,7 +275,14 @@ def fit(problem: Problem, start: Estimate) -> BundleFit:
     covariance = _inverse(information)
     free = float(sum(min(6, n) * w for n, w in zip(sizes, weights, strict=True)) - count)
     return BundleFit(
-        estimate, covariance, names, tuple(parts), weights, float(np.sqrt(variances[0])), float(variances[1]), max(free, 1)
+        estimate,
+        covariance,
+        names,
+        tuple(parts),
+        weights,
+        float(np.sqrt(variances[0])),
+        float(variances[1]),
+        max(free, 1),
     )
 
 
@@ -318,7 +328,9 @@ def _variances(
     good = [i for i, w in enumerate(weights) if w > 0.5]
     # The eigenvectors of a frame's joint covariance are those of its covariance, whatever the two variances.
     spectra = [np.linalg.eigh(by_joints[i]) for i in good]
-    turned = [(vectors.T @ residuals[i], vectors.T @ jacobians[i]) for i, (_, vectors) in zip(good, spectra, strict=True)]
+    turned = [
+        (vectors.T @ residuals[i], vectors.T @ jacobians[i]) for i, (_, vectors) in zip(good, spectra, strict=True)
+    ]
 
     def cost(log: np.ndarray) -> float:
         corner, joint = np.exp(np.clip(log, -30, 15))

@@ -13,10 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student
 
 from concent_warp.errors import RecordingError
 from concent_warp.perception.calibration.cfg import CalibrateCfg
@@ -24,20 +22,35 @@ from concent_warp.perception.calibration.checks import NOTEWORTHY_DEPTH, remarks
 from concent_warp.perception.calibration.footage import Footage
 from concent_warp.perception.calibration.result import CameraCalibration, Check, FrameError
 from concent_warp.perception.calibration.robot_surface import RobotSurface, Surface
+from concent_warp.perception.calibration.robot_terms import (
+    CLOCK,
+    COUNT,
+    EDGE,
+    KNOWN,
+    POSE,
+    SCALE,
+    Equations,
+    State,
+    depth_terms,
+    half_widths,
+    normal_equations,
+    outline_terms,
+    solve,
+    spread,
+)
 from concent_warp.perception.pinhole import Pinhole
 
-POSE, CLOCK, SCALE = 6, 6, 7
-"""Number of a pose's parameters, and the places of clock offset and scale of depth."""
-TUKEY = 4.685
-"""Width of Tukey's weight over the standard deviation: 95 % as efficient as least squares with normal errors."""
-PROFILE = np.arange(-4.0, 4.01, 0.5)
-"""Places across the outline at which brightness is read [px]."""
+UNKNOWN_SCALE = 0.1
+"""Standard deviation of the scale of depth where it is checked [-]."""
 MOST_POINTS = 1500
 """Moving points of a frame that are used."""
 FEWEST_PIXELS = 60
 """Pixels of the robot in a frame from which on it is used."""
-OUTLINE_STD = 0.3
-"""Standard deviation of the place of an outline that is taken at least [px]."""
+DEPTH_STD, OUTLINE_STD = 5e-4, 2.0
+"""Standard deviations of depth [m] and of the place of an outline [px] that are taken at least: shading near an outline
+shifts its edge by 0.2 px and more, along all of it alike, so that its many points count for less than as many depths."""
+MAX_SLANT = 0.25
+"""Cosine of the angle of view and normal up to which depth of a pixel is not used: it falls on the robot's rim [-]."""
 KNOWN_POSITION, KNOWN_ANGLE = 0.03, np.radians(3.0)
 """Half widths of intervals above which a pose is not determined [m, rad]."""
 
@@ -59,19 +72,7 @@ class Shot:
     robot: RobotSurface
 
 
-@dataclass(frozen=True)
-class Equations:
-    """Normal equations of one frame."""
-
-    matrix: np.ndarray
-    """Shape (8, 8)."""
-    vector: np.ndarray
-    """Shape (8,)."""
-
-
-def calibrate_by_robot(
-    footage: Footage, cfg: CalibrateCfg, progress: Callable[[float], None]
-) -> CameraCalibration:
+def calibrate_by_robot(footage: Footage, cfg: CalibrateCfg, progress: Callable[[float], None]) -> CameraCalibration:
     """Return the calibration of a fixed camera that sees the robot.
 
     Args:
@@ -91,23 +92,29 @@ def calibrate_by_robot(
             fix="show it a tag that is fixed in the world",
         )
     shots = _shots(footage, cfg)
-    pose, offset, scale = _first_pose(footage, cfg), 0.0, 1.0
+    state = State(_first_pose(footage, cfg))
     rounds = cfg.robot.coarse_rounds + cfg.robot.fine_rounds
+    clock = [CLOCK] if cfg.fit_clock else []
     gates = np.geomspace(cfg.robot.capture_distance, 2 * cfg.robot.final_distance, cfg.robot.coarse_rounds)
     for k, gate in enumerate(gates):
-        equations = [_coarse(shot, footage, cfg, pose, offset, float(gate)) for shot in shots]
-        free = [*range(POSE), CLOCK] if cfg.fit_clock and k > len(gates) // 2 else list(range(POSE))
-        pose, offset, scale = _moved(pose, offset, scale, _solve(equations, free))
-        offset = float(np.clip(offset, -cfg.limits.max_offset, cfg.limits.max_offset))
+        equations = [_coarse(shot, footage, cfg, state, float(gate)) for shot in shots]
+        free = [*range(POSE), *(clock if k > len(gates) // 2 else [])]
+        state = state.moved(solve(equations, free, state, {CLOCK: cfg.limits.max_offset}))
         progress((k + 1) / rounds)
-    free = [*range(POSE), CLOCK] if cfg.fit_clock else list(range(POSE))
+    free = [*range(POSE), *clock, EDGE]
     equations: list[Equations] = []
     for k in range(cfg.robot.fine_rounds):
         gate = max(4 * cfg.robot.final_distance * 0.7**k, cfg.robot.final_distance)
-        equations = _fine(shots, footage, cfg, pose, offset, scale, gate)
-        pose, offset, scale = _moved(pose, offset, scale, _solve(equations, free))
+        equations = _fine(shots, footage, cfg, state, gate)
+        state = state.moved(solve(equations, free, state, KNOWN))
         progress((len(gates) + k + 1) / rounds)
-    agreement, frames = _agreement(shots, footage, cfg, pose, offset)
+    check, scaled, scaled_half = _depth_check(shots, footage, cfg, state, [*free, SCALE])
+    half = half_widths(equations, free, state, KNOWN)
+    remarks = remarks_on([check], fitted=False)
+    if check.off:
+        state, half = scaled, scaled_half
+        remarks.append("the pose is that of a fit in which the scale of depth is free")
+    agreement, frames = _agreement(shots, footage, cfg, state)
     if not agreement >= cfg.robot.min_agreement:
         raise RecordingError(
             "the robot does not come to agree with what the camera sees",
@@ -116,14 +123,12 @@ def calibrate_by_robot(
             found=f"{agreement:.0%}",
             fix="give a nearer --start, check the scene's robot and joint readings, or use a tag",
         )
-    half = _half_widths(equations, free)
     _check_determined(footage, half)
-    check = _depth_check(shots, footage, cfg, pose, offset)
     errors = np.concatenate([f.errors.ravel() for f in frames])
     return CameraCalibration(
         name=footage.name,
         method="robot",
-        pose=pose,
+        pose=state.pose,
         body=None,
         recorded_pose=np.asarray(footage.first.pose, float),
         position_interval=half[3:6],
@@ -131,12 +136,12 @@ def calibrate_by_robot(
         intrinsics=np.asarray(footage.first.intrinsics, float),
         distortion=(),
         size=footage.size,
-        clock_offset=offset,
+        clock_offset=state.offset,
         clock_interval=float(half[CLOCK]) if CLOCK in free else None,
         residual=float(np.sqrt(np.mean(errors**2))),
         frames=frames,
         checks=(check,),
-        remarks=tuple(remarks_on([check], fitted=False)),
+        remarks=tuple(remarks),
     )
 
 
@@ -204,166 +209,65 @@ def _first_pose(footage: Footage, cfg: CalibrateCfg) -> np.ndarray:
     return pose
 
 
-def _coarse(
-    shot: Shot, footage: Footage, cfg: CalibrateCfg, pose: np.ndarray, offset: float, gate: float
-) -> Equations:
+def _coarse(shot: Shot, footage: Footage, cfg: CalibrateCfg, state: State, gate: float) -> Equations:
     """Return the equations that bring what moves in a frame onto the visible surface within a distance [m]."""
-    surface = _rendered(shot, footage, cfg, pose, offset)[0]
+    surface = _rendered(shot, footage, cfg, state)[0]
     if len(surface.points) < FEWEST_PIXELS or len(shot.moving) < FEWEST_PIXELS:
-        return Equations(np.zeros((8, 8)), np.zeros(8))
-    world = shot.moving @ pose[:3, :3].T + pose[:3, 3]
+        return Equations(np.zeros((COUNT, COUNT)), np.zeros(COUNT))
+    world = shot.moving @ state.pose[:3, :3].T + state.pose[:3, 3]
     distance, near = KDTree(surface.points).query(world, distance_upper_bound=gate)
     good = np.isfinite(distance)
-    near = near[good]
-    chosen = Surface(
-        surface.pixels[near], surface.points[near], surface.normals[near], surface.velocities[near]
-    )
-    residual, jacobian = _depth_terms(shot.moving[good], chosen, pose)
-    return _normal(residual, jacobian, max(gate / 3, 0.003))
+    residual, jacobian = depth_terms(shot.moving[good], surface.only(near[good]), state.pose)
+    return normal_equations(residual, jacobian, max(gate / 3, 0.003))
 
 
-def _fine(
-    shots: list[Shot], footage: Footage, cfg: CalibrateCfg, pose: np.ndarray, offset: float, scale: float, gate: float
-) -> list[Equations]:
+def _fine(shots: list[Shot], footage: Footage, cfg: CalibrateCfg, state: State, gate: float) -> list[Equations]:
     """Return the equations of depth and outline of each frame; a pixel counts within a distance [m]."""
-    terms = []
+    intrinsics = np.asarray(footage.first.intrinsics, float)
+    camera, depths, edges = Pinhole(intrinsics, np.eye(4)), [], []
     for shot in shots:
-        surface, outline = _rendered(shot, footage, cfg, pose, offset)
-        depth = _at(shot.depth, surface.pixels)
-        expected = (surface.points - pose[:3, 3]) @ pose[:3, 2]
-        good = (depth > 0) & (np.abs(depth / scale - expected) < gate)
-        chosen = Surface(surface.pixels[good], surface.points[good], surface.normals[good], surface.velocities[good])
-        camera = Pinhole(np.asarray(footage.first.intrinsics, float), np.eye(4))
-        measured = camera.lift(chosen.pixels, depth[good] / scale)
-        terms.append((_depth_terms(measured, chosen, pose), _outline_terms(shot, footage, cfg, outline, pose)))
-    spread = [_spread(np.concatenate([pair[k][0] for pair in terms])) for k in (0, 1)]
-    stds = max(spread[0], 5e-4), max(spread[1], OUTLINE_STD)
+        surface, outline = _rendered(shot, footage, cfg, state)
+        depth = state.true_depth(_at(shot.depth, surface.pixels))
+        expected = (surface.points - state.pose[:3, 3]) @ state.pose[:3, 2]
+        good = (depth > 0) & (np.abs(depth - expected) < gate) & (surface.facing(state.pose) > MAX_SLANT)
+        measured = camera.lift(surface.pixels[good], depth[good])
+        depths.append(depth_terms(measured, surface.only(good), state.pose))
+        edges.append(outline_terms(shot.brightness, outline, intrinsics, state, cfg.robot.min_contrast))
+    stds = [
+        max(spread(np.concatenate([residual for residual, _ in terms])), least)
+        for terms, least in ((depths, DEPTH_STD), (edges, OUTLINE_STD))
+    ]
     equations = []
-    for (depth_residual, depth_jacobian), (edge_residual, edge_jacobian) in terms:
-        one = _normal(depth_residual, depth_jacobian, stds[0])
-        two = _normal(edge_residual, edge_jacobian, stds[1])
+    for pair in zip(depths, edges, strict=True):
+        one, two = (normal_equations(*terms, std) for terms, std in zip(pair, stds, strict=True))
         equations.append(Equations(one.matrix + two.matrix, one.vector + two.vector))
     return equations
 
 
-def _rendered(
-    shot: Shot, footage: Footage, cfg: CalibrateCfg, pose: np.ndarray, offset: float
-) -> tuple[Surface, Surface]:
+def _rendered(shot: Shot, footage: Footage, cfg: CalibrateCfg, state: State) -> tuple[Surface, Surface]:
     """Return the visible surface of the robot and its outline in a frame."""
     low, high = shot.robot.motion.span
-    time = float(np.clip(shot.time + offset, low, high))
+    time = float(np.clip(shot.time + state.offset, low, high))
     intrinsics = np.asarray(footage.first.intrinsics, float)
-    return shot.robot.seen(time, pose, intrinsics, footage.size, cfg.robot.pixels)
-
-
-def _depth_terms(measured: np.ndarray, surface: Surface, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances of measured points from the surface's planes [m], shape (n,), and their derivatives (n, 8).
-
-    Args:
-        measured: Points, camera frame [m], shape (n, 3).
-        surface: The points that they belong to.
-        pose: Camera-to-world, shape (4, 4).
-    """
-    world = measured @ pose[:3, :3].T + pose[:3, 3]
-    residual = np.einsum("ni,ni->n", surface.normals, world - surface.points)
-    in_camera = surface.normals @ pose[:3, :3]
-    turn = np.cross(measured, in_camera)
-    slide = -np.einsum("ni,ni->n", surface.normals, surface.velocities)
-    stretch = -np.einsum("ni,ni->n", in_camera, measured)
-    return residual, np.column_stack([turn, surface.normals, slide, stretch])
-
-
-def _outline_terms(
-    shot: Shot, footage: Footage, cfg: CalibrateCfg, outline: Surface, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances of edges of brightness from the robot's outline [px], shape (n,), and their derivatives (n, 8)."""
-    intrinsics = np.asarray(footage.first.intrinsics, float)
-    local = (outline.points - pose[:3, 3]) @ pose[:3, :3]
-    # At the outline, normals are perpendicular to the view, so that they point across it in the image.
-    across = (outline.normals @ pose[:3, :3])[:, :2]
-    length = np.linalg.norm(across, axis=1)
-    across = across / np.maximum(length, 1e-9)[:, None]
-    place = outline.pixels[:, None] + PROFILE[None, :, None] * across[:, None]
-    height, width = shot.brightness.shape
-    inside = ((place >= 0) & (place <= [width - 1, height - 1])).all(axis=(1, 2))
-    profile = map_coordinates(shot.brightness, [place[..., 1].ravel(), place[..., 0].ravel()], order=1, mode="nearest")
-    slope = np.abs(np.diff(profile.reshape(place.shape[:2]), axis=1))
-    best = np.argmax(slope, axis=1)
-    within = (best > 0) & (best < slope.shape[1] - 1)
-    rise = np.take_along_axis(slope, np.clip(best[:, None] + np.array([-1, 0, 1]), 0, slope.shape[1] - 1), axis=1)
-    good = inside & within & (rise.sum(axis=1) > cfg.robot.min_contrast) & (length > 0.5)
-    shift = (rise[:, 2] - rise[:, 0]) / np.maximum(rise.sum(axis=1), 1e-9) * 0.5
-    found = PROFILE[best] + 0.25 + shift
-    x, y, z = local.T
-    focal = intrinsics[[0, 1], [0, 1]]
-    gradient = np.column_stack(
-        [across[:, 0] * focal[0] / z, across[:, 1] * focal[1] / z, -(across * focal * local[:, :2]).sum(axis=1) / z**2]
-    )
-    turn = np.cross(gradient, local)
-    slide = np.einsum("ni,ni->n", gradient, outline.velocities @ pose[:3, :3])
-    moved = np.column_stack([turn, -gradient @ pose[:3, :3].T, slide, np.zeros(len(x))])
-    return found[good], -moved[good]
-
-
-def _normal(residual: np.ndarray, jacobian: np.ndarray, std: float) -> Equations:
-    """Return the normal equations of residuals with Tukey's weights for their standard deviation."""
-    share = np.clip(np.abs(residual) / (TUKEY * std), 0, 1)
-    weight = (1 - share**2) ** 2 / std**2
-    return Equations((jacobian.T * weight) @ jacobian, (jacobian.T * weight) @ residual)
-
-
-def _spread(residual: np.ndarray) -> float:
-    """Return a robust standard deviation about 0."""
-    return 1.4826 * float(np.median(np.abs(residual))) if len(residual) else 0.0
-
-
-def _solve(equations: list[Equations], free: list[int], without: int | None = None) -> np.ndarray:
-    """Return the step of the parameters (8,) that the equations of all frames give, one of them left out if wanted."""
-    used = [e for k, e in enumerate(equations) if k != without]
-    matrix = sum((e.matrix for e in used), np.zeros((8, 8)))[np.ix_(free, free)]
-    vector = sum((e.vector for e in used), np.zeros(8))[free]
-    step = np.zeros(8)
-    # A little of a prior keeps directions still that no frame determines; they are found by their interval.
-    damping = 1e-9 * np.trace(matrix) * np.eye(len(free)) + 1e-12 * np.eye(len(free))
-    step[free] = np.linalg.solve(matrix + damping, -vector)
-    step[:3] *= min(1.0, 0.1 / max(float(np.linalg.norm(step[:3])), 1e-12))
-    step[3:6] *= min(1.0, 0.1 / max(float(np.linalg.norm(step[3:6])), 1e-12))
-    step[CLOCK] = np.clip(step[CLOCK], -0.05, 0.05)
-    return step
-
-
-def _moved(pose: np.ndarray, offset: float, scale: float, step: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Return pose, clock offset and scale of depth after a step (8,)."""
-    moved = pose.copy()
-    moved[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
-    moved[:3, 3] += step[3:6]
-    return moved, offset + float(step[CLOCK]), scale * (1 + float(step[SCALE]))
-
-
-def _half_widths(equations: list[Equations], free: list[int]) -> np.ndarray:
-    """Return half widths of the 95 % intervals (8,) by a jackknife over frames."""
-    count = len(equations)
-    steps = np.array([_solve(equations, free, without=k) for k in range(count)])
-    variance = (count - 1) / count * ((steps - steps.mean(axis=0)) ** 2).sum(axis=0)
-    return float(student.ppf(0.975, count - 1)) * np.sqrt(variance)
+    return shot.robot.seen(time, state.pose, intrinsics, footage.size, cfg.robot.pixels)
 
 
 def _agreement(
-    shots: list[Shot], footage: Footage, cfg: CalibrateCfg, pose: np.ndarray, offset: float
+    shots: list[Shot], footage: Footage, cfg: CalibrateCfg, state: State
 ) -> tuple[float, tuple[FrameError, ...]]:
     """Return the share of the robot's pixels whose depth agrees, and the errors of the frames."""
     seen, agree, frames = 0, 0, []
     for shot in shots:
-        surface, outline = _rendered(shot, footage, cfg, pose, offset)
-        depth = _at(shot.depth, surface.pixels)
-        error = (surface.points - pose[:3, 3]) @ pose[:3, 2] - depth
+        surface, outline = _rendered(shot, footage, cfg, state)
+        depth = state.true_depth(_at(shot.depth, surface.pixels))
+        error = (surface.points - state.pose[:3, 3]) @ state.pose[:3, 2] - depth
         good = (depth > 0) & (np.abs(error) < cfg.robot.final_distance)
         seen, agree = seen + int((depth > 0).sum()), agree + int(good.sum())
         weight = float(good.sum() / max((depth > 0).sum(), 1))
         frames.append(
             FrameError(
-                shot.demonstration, shot.row, shot.time + offset, surface.pixels[good], error[good][:, None], weight,
-                (outline.pixels,),
+                shot.demonstration, shot.row, shot.time + state.offset, surface.pixels[good], error[good][:, None],
+                weight, (outline.pixels,),
             )
         )  # fmt: skip
     if seen < FEWEST_PIXELS * len(shots) / 4:
@@ -372,17 +276,20 @@ def _agreement(
 
 
 def _depth_check(
-    shots: list[Shot], footage: Footage, cfg: CalibrateCfg, pose: np.ndarray, offset: float
-) -> Check:
-    """Return by how much depth reads too long [%], from a fit in which its scale is free."""
-    free, scale = [*range(POSE), CLOCK, SCALE] if cfg.fit_clock else [*range(POSE), SCALE], 1.0
+    shots: list[Shot], footage: Footage, cfg: CalibrateCfg, state: State, free: list[int]
+) -> tuple[Check, State, np.ndarray]:
+    """Return by how much depth reads too long [%], from a fit in which nothing is known of its scale.
+
+    Its state and half widths of its intervals (10,) come with it.
+    """
+    known = {**KNOWN, SCALE: UNKNOWN_SCALE}
     equations: list[Equations] = []
     for _ in range(cfg.robot.fine_rounds // 2 + 1):
-        equations = _fine(shots, footage, cfg, pose, offset, scale, 2 * cfg.robot.final_distance)
-        pose, offset, scale = _moved(pose, offset, scale, _solve(equations, free))
-    half = 100 * float(_half_widths(equations, free)[SCALE])
-    value = 100 * (scale - 1)
-    return Check("depth", value, value - half, value + half, "%", NOTEWORTHY_DEPTH)
+        equations = _fine(shots, footage, cfg, state, 2 * cfg.robot.final_distance)
+        state = state.moved(solve(equations, free, state, known))
+    half = half_widths(equations, free, state, known)
+    value, width = 100 * (state.scale - 1), 100 * float(half[SCALE])
+    return Check("depth", value, value - width, value + width, "%", NOTEWORTHY_DEPTH), state, half
 
 
 def _check_determined(footage: Footage, half: np.ndarray) -> None:

@@ -70,9 +70,7 @@ class Run:
     """Poses of the target in the camera's frame, shape (n, 4, 4)."""
 
 
-def find_views(
-    footage: Footage, cfg: CalibrateCfg, progress: Callable[[float], None]
-) -> dict[str, list[TargetView]]:
+def find_views(footage: Footage, cfg: CalibrateCfg, progress: Callable[[float], None]) -> dict[str, list[TargetView]]:
     """Return the views of targets that are large enough, by demonstration; none at all where there is no target."""
     views, done = {}, 0.0
     for name, stream in footage.streams.items():
@@ -352,7 +350,9 @@ def _check_spread(
     footage: Footage, frames: list[Frame], bodies: tuple[str, str], offset: float, cfg: CalibrateCfg
 ) -> None:
     """Raise an error where the bodies turn about one axis only."""
-    relative = np.concatenate([_relative(footage, f.demonstration, np.array([f.time + offset]), bodies) for f in frames])
+    relative = np.concatenate(
+        [_relative(footage, f.demonstration, np.array([f.time + offset]), bodies) for f in frames]
+    )
     size, axes = rotation_spread(relative)
     if np.degrees(size[1]) >= cfg.limits.min_rotation:
         return
@@ -454,7 +454,9 @@ def _pose_remarks(footage: Footage, fitted: BundleFit) -> list[str]:
     remarks = []
     if angle(recorded) > np.radians(30):
         if angle(recorded @ np.diag([1.0, -1, -1, 1])) < np.radians(15):
-            remarks.append("the recorded pose has y up and z backwards, as in OpenGL; recordings have y down, z forward")
+            remarks.append(
+                "the recorded pose has y up and z backwards, as in OpenGL; recordings have y down, z forward"
+            )
         elif angle(np.linalg.inv(recorded)) < np.radians(15):
             remarks.append("the recorded pose is the inverse one; recordings have camera-to-world, or camera-to-body")
     return remarks
@@ -474,7 +476,5 @@ def _frame_errors(problem: Problem, fitted: BundleFit) -> tuple[FrameError, ...]
             outlines.append(project(placed, estimate.size * corners, estimate.intrinsics, estimate.radial))
         pixels = np.concatenate([v.pixels for v in frame.views])
         time = frame.time + estimate.offset
-        result.append(
-            FrameError(frame.demonstration, frame.row, time, pixels, errors, float(weight), tuple(outlines))
-        )
+        result.append(FrameError(frame.demonstration, frame.row, time, pixels, errors, float(weight), tuple(outlines)))
     return tuple(result)

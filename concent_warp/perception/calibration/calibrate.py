@@ -66,7 +66,9 @@ def calibrate(
             found="no images",
         )
     if unknown := sorted(set(cfg.cameras) - set(names)):
-        raise RecordingError("there is no such camera", where=recording.source, expected=f"some of {names}", found=unknown)
+        raise RecordingError(
+            "there is no such camera", where=recording.source, expected=f"some of {names}", found=unknown
+        )
     chosen = [name for name in names if not cfg.cameras or name in cfg.cameras]
     scene = Scene(recording.scene, recording.source)
     filmed = [d for d in recording.demonstrations if d.image]
@@ -101,6 +103,10 @@ def _calibrated(footage: Footage, cfg: CalibrateCfg, progress: Callable[[float],
         return calibrate_by_targets(footage, views, cfg, lambda share: progress(0.4 + 0.6 * share))
     # Another dictionary or mirrored tags are a mistake; a view of the robot without any tag is none.
     mistake = mistaken_target(footage.first, cfg, footage.where)
-    if mistake is not None or footage.first.body is not None or not any(s.depth.any() for s in footage.streams.values()):
+    if (
+        mistake is not None
+        or footage.first.body is not None
+        or not any(s.depth.any() for s in footage.streams.values())
+    ):
         raise mistake or no_target_error(footage.first, cfg, footage.where)
     return calibrate_by_robot(footage, cfg, progress)

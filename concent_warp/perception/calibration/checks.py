@@ -134,7 +134,9 @@ def remarks_on(checks: list[Check], *, fitted: bool) -> list[str]:
         elif check.name == "radial distortion":
             lines.append(f"residuals grow with the radius, as by a distortion of {size} at its largest; {cure}")
         elif check.name.startswith("focal"):
-            lines.append(f"{check.name} in the recording is {size} too {'long' if check.value > 0 else 'short'}; {cure}")
+            lines.append(
+                f"{check.name} in the recording is {size} too {'long' if check.value > 0 else 'short'}; {cure}"
+            )
         else:
             lines.append(f"{check.name} in the recording is {size} off; {cure}")
     return lines

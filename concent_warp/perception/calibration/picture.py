@@ -65,7 +65,9 @@ def _draw_frame(axes: Any, calibration: Calibration, camera: CameraCalibration, 
         for outline in frame.outlines:
             axes.plot(*np.vstack([outline, outline[:1]]).T, color=FOUND, linewidth=1.2)
         scale = ARROW_PIXELS / max(_size(frame), 1e-6)
-        axes.quiver(*frame.pixels.T, *frame.errors.T * scale, color=ERROR, angles="xy", scale_units="xy", scale=1, width=0.004)
+        axes.quiver(
+            *frame.pixels.T, *frame.errors.T * scale, color=ERROR, angles="xy", scale_units="xy", scale=1, width=0.004
+        )
         middle, reach = frame.pixels.mean(axis=0), max(float(np.ptp(frame.pixels, axis=0).max()), 60.0)
         axes.set_xlim(max(middle[0] - reach, 0), min(middle[0] + reach, camera.size[0]))
         axes.set_ylim(min(middle[1] + reach, camera.size[1]), max(middle[1] - reach, 0))

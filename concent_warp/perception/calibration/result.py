@@ -123,7 +123,8 @@ class CameraCalibration:
             "target_body": self.target_body,
             "targets": {name: pose.tolist() for name, pose in self.targets.items()},
             "checks": {
-                c.name: {"value": c.value, "low": c.low, "high": c.high, "unit": c.unit, "off": c.off} for c in self.checks
+                c.name: {"value": c.value, "low": c.low, "high": c.high, "unit": c.unit, "off": c.off}
+                for c in self.checks
             },
             "remarks": list(self.remarks),
         }
@@ -184,7 +185,9 @@ class Calibration:
             for i, axis in enumerate("xyz"):
                 position, half = 1e3 * c.pose[i, 3], 1e3 * c.position_interval[i]
                 old = f"{1e3 * c.recorded_pose[i, 3]:.1f} mm"
-                table.add_row(name if i == 0 else where if i == 1 else "", axis, f"{position:.2f} mm", f"± {half:.2f}", old)
+                table.add_row(
+                    name if i == 0 else where if i == 1 else "", axis, f"{position:.2f} mm", f"± {half:.2f}", old
+                )
             for i, axis in enumerate("xyz"):
                 half = np.degrees(c.rotation_interval[i])
                 table.add_row("", f"turn about {axis}", f"{np.degrees(turn[i]):+.3f} deg", f"± {half:.3f}", "0")

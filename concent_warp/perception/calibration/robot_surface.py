@@ -33,6 +33,15 @@ class Surface:
     velocities: np.ndarray
     """World frame [m/s], shape (n, 3)."""
 
+    def facing(self, pose: np.ndarray) -> np.ndarray:
+        """Return the cosine of the angle between normal and view from a camera pose (4, 4), shape (n,)."""
+        view = pose[:3, 3] - self.points
+        return np.einsum("ni,ni->n", self.normals, view) / np.linalg.norm(view, axis=1)
+
+    def only(self, rows: np.ndarray) -> Surface:
+        """Return some of the points, by rows or by a mask."""
+        return Surface(self.pixels[rows], self.points[rows], self.normals[rows], self.velocities[rows])
+
 
 class RobotSurface:
     """Casts rays at those bodies of a scene whose joints have readings, and at what carries them."""
@@ -48,7 +57,9 @@ class RobotSurface:
             while at:
                 chain.append(at)
                 at = int(model.body_parentid[at])
-            joints = [j for b in chain for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])]
+            joints = [
+                j for b in chain for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])
+            ]
             if joints and all(j in motion.readings for j in joints):
                 bodies.update(chain)
         self.own = np.isin(model.geom_bodyid, list(bodies))

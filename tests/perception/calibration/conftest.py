@@ -93,11 +93,17 @@ def film(how: Filming) -> Recording:
             placed[0, 3] += 0.06
         seen = np.linalg.inv(hand @ camera) @ placed if how.camera_on_hand else np.linalg.inv(camera) @ hand @ placed
         pixels, _ = cv2.projectPoints(
-            corners, Rotation.from_matrix(seen[:3, :3]).as_rotvec(), seen[:3, 3], MATRIX, np.array([how.radial, 0, 0, 0])
+            corners,
+            Rotation.from_matrix(seen[:3, :3]).as_rotvec(),
+            seen[:3, 3],
+            MATRIX,
+            np.array([how.radial, 0, 0, 0]),
         )
         # Four times as fine, so that edges are soft.
         fine = cv2.getPerspectiveTransform(source.astype(np.float32), (4 * pixels[:, 0] + 1.5).astype(np.float32))
-        image = cv2.warpPerspective(picture, fine, (4 * WIDTH, 4 * HEIGHT), borderValue=(120.0,), flags=cv2.INTER_LINEAR)
+        image = cv2.warpPerspective(
+            picture, fine, (4 * WIDTH, 4 * HEIGHT), borderValue=(120.0,), flags=cv2.INTER_LINEAR
+        )
         image = cv2.resize(cv2.GaussianBlur(image, (0, 0), 2.0), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
         image = np.clip(0.7 * image + 20 + rng.normal(0, 2, image.shape), 0, 255)
         rgb[t] = (image[:, ::-1] if how.mirrored else image)[..., None]
@@ -112,7 +118,9 @@ def film(how: Filming) -> Recording:
         value[rng.random(len(reading)) < 0.03] = np.nan
         measured[name] = Channel(reading, value)
     wrong = pose_of(Rotation.from_euler("xyz", [0.03, -0.04, 0.05]), [0.01, 0.02, -0.015])
-    image = ImageStream(time - how.offset, rgb, depth, how.matrix, wrong @ camera, "hand" if how.camera_on_hand else None)
+    image = ImageStream(
+        time - how.offset, rgb, depth, how.matrix, wrong @ camera, "hand" if how.camera_on_hand else None
+    )
     return Recording(scene(), (Demonstration("demo_0", measured=measured, image={"eye": image}),), source="film.h5")
 
 

@@ -79,7 +79,10 @@ def test_a_wrong_focal_length_is_named_and_fitted_on_demand(cfg):
     assert any("focal length x" in r and "too long" in r for r in found.remarks)
     assert any("assume" in r for r in found.remarks)
     fitted = calibrate(recording, replace(cfg, fit_intrinsics=True))
-    assert np.abs(fitted.cameras["eye"].intrinsics[:2, :2] / np.where(MATRIX == 0, 1, MATRIX)[:2, :2] - np.eye(2)).max() < 6e-3
+    assert (
+        np.abs(fitted.cameras["eye"].intrinsics[:2, :2] / np.where(MATRIX == 0, 1, MATRIX)[:2, :2] - np.eye(2)).max()
+        < 6e-3
+    )
     assert np.linalg.norm(fitted.cameras["eye"].pose[:3, 3] - CAMERA_ON_HAND[:3, 3]) < 1e-3
     assert np.allclose(fitted.recording[0].image["eye"].intrinsics, fitted.cameras["eye"].intrinsics)
 
@@ -117,7 +120,9 @@ def test_the_calibrated_recording_is_written_with_its_json(on_hand, cfg, tmp_pat
 def test_a_pose_in_the_axes_of_opengl_is_recognised(on_hand, cfg):
     found = calibrate(with_stream(on_hand, pose=CAMERA_ON_HAND @ np.diag([1.0, -1, -1, 1])), cfg).cameras["eye"]
     assert any("OpenGL" in remark for remark in found.remarks)
-    inverted = calibrate(with_stream(film(Filming(camera_on_hand=False, seed=1)), pose=np.linalg.inv(CAMERA_IN_WORLD)), cfg)
+    inverted = calibrate(
+        with_stream(film(Filming(camera_on_hand=False, seed=1)), pose=np.linalg.inv(CAMERA_IN_WORLD)), cfg
+    )
     assert any("inverse" in remark for remark in inverted.cameras["eye"].remarks)
 
 

@@ -94,7 +94,9 @@ def test_missing_intrinsics_are_refused(on_hand):
 
 
 def test_a_camera_on_another_body_than_recorded_is_named(on_hand):
-    assert "the camera is not on world; expected" in (said := refused(with_stream(on_hand, body=None)).split(": ", 2)[2])
+    assert "the camera is not on world; expected" in (
+        said := refused(with_stream(on_hand, body=None)).split(": ", 2)[2]
+    )
     assert "a camera on hand" in said
 
 
