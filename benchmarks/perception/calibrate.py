@@ -4,17 +4,18 @@
     python -m benchmarks.perception.calibrate --seconds 280       begin nothing after that time
     python -m benchmarks.perception.calibrate --table             the page from the stored data
 
-The arm passes through 12 poses in 24 s, of which a camera of 640 x 480 px takes 16 frames: on the hand over a tag of 60 mm, over three tags or
-over a ChArUco board, or fixed in the world with a tag on the hand, or without any. Frames have noise, blur of the lens and
-of an exposure of 6 ms, depth has noise and holes; encoders have a noise of 0.7 mrad and lose readings; the recorded pose is
-off by up to 30 mm and 4 degrees an axis, the clock by up to 60 ms. *within* is the share of the components (three of the
-position, three of the orientation, one clock) of all recordings that lie in their 95 % intervals. A row counts every seed
-that was begun; a calibration that is refused counts as refused, and in no error.
+The arm passes through 12 poses in 24 s, of which a camera of 640 x 480 px takes 16 frames: on the hand over a tag of
+60 mm, over three tags or over a ChArUco board, or fixed in the world with a tag on the hand, or without any. Frames
+have noise, blur of the lens and of an exposure of 6 ms, depth has noise and holes; encoders have a noise of 0.7 mrad
+and lose readings; the recorded pose is off by up to 30 mm and 4 degrees an axis, the clock by up to 60 ms. *within*
+is the share of the components (three of the position, three of the orientation, one clock) of all recordings that lie
+in their 95 % intervals. A row counts every seed that was begun; a calibration that is refused counts as refused, and
+in no error.
 
-The bars are 2 mm, 0.3 degrees and 3 ms. Rows below the first five break an assumption: encoders with a constant error of
-their own (standard deviation 1 mrad a joint, about 1 mm at the hand), which no camera can tell from its own pose; a focal
-length that is recorded 2 % too long, with `--fit-intrinsics`; depth that reads 1.8 % too long. The figures do not show real
-lenses, printed tags that are bent, rolling shutters, or a robot whose cables its model lacks.
+The bars are 2 mm, 0.3 degrees and 3 ms. Rows below the first five break an assumption: encoders with a constant error
+of their own (standard deviation 1 mrad a joint, about 1 mm at the hand), which no camera can tell from its own pose;
+a focal length that is recorded 2 % too long, with `--fit-intrinsics`; depth that reads 1.8 % too long. The figures do
+not show real lenses, printed tags that are bent, rolling shutters, or a robot whose cables its model lacks.
 """
 
 from __future__ import annotations

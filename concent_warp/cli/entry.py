@@ -21,6 +21,9 @@ GROUPS = {
         "demo": "record in Reality, a simulated world, then fit, compare and report",
         "record": "record demonstrations in Reality",
     },
+    "from a video to a recording": {
+        "calibrate": "find camera poses and clock offset from tags or the robot in view",
+    },
     "from a recording to a model": {
         "geometry": "place contact spheres on the objects of a scene; export MJCF",
         "fit": "fit the contact geometry; extract contact events; report",
@@ -50,6 +53,7 @@ COMMANDS = {name: text for group in GROUPS.values() for name, text in group.item
 EXAMPLES = {
     "demo": "concent demo --out runs/demo",
     "record": "concent record --seeds 0 1 -o demo.h5",
+    "calibrate": "concent calibrate demo.h5 --tag-size 0.04 -o calibrated.h5 --picture calibration.png",
     "geometry": "concent geometry scene.xml -o model.toml",
     "fit": "concent fit demo.h5 -o runs/demo",
     "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",

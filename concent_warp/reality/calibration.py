@@ -224,13 +224,10 @@ def _waypoints(
     model = spec.compile()
     found: list[np.ndarray] = []
     yaw0 = 0.0
-    for attempt in range(60 * cfg.views):
+    for _ in range(60 * cfg.views):
         if len(found) == cfg.views:
             break
-        if cfg.camera == "hand":
-            wanted = _view_of(target, cfg, rng, yaw0)
-        else:
-            wanted = _shown_to(pose, cfg, rng)
+        wanted = _view_of(target, cfg, rng, yaw0) if cfg.camera == "hand" else _shown_to(pose, cfg, rng)
         try:
             solved = solve_path(model, AIM, list(range(7)), start, wanted[None, :3, 3], wanted[None, :3, :3])
         except SceneError:

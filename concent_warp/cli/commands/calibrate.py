@@ -33,9 +33,9 @@ PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Find the poses of a recording's cameras, on the hand or fixed in the world, with 95 % intervals, and the offset of
-    their clock: from tags or a board, else from the robot itself in view of a fixed camera; and say whether intrinsics,
-    depth and tag size are right.
+    """Find the poses of a recording's cameras, on the hand or fixed in the world, with 95 % intervals, and the offset
+    of their clock: from tags or a board, else from the robot itself in view of a fixed camera; and say whether
+    intrinsics, depth and tag size are right.
     """
 
     recording: tyro.conf.Positional[Path]

@@ -135,7 +135,7 @@ class Problem:
 
     def names(self, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the parameters."""
-        groups = {CAMERA: 6} | {name: 6 for name in estimate.targets}
+        groups = {CAMERA: 6} | dict.fromkeys(estimate.targets, 6)
         groups |= {name: {CLOCK: 1, SIZE: 1, INTRINSICS: 6}[name] for name in self.free}
         return tuple(f"{name}.{i}" for name, count in groups.items() for i in range(count))
 
@@ -235,6 +235,9 @@ def fit(problem: Problem, start: Estimate) -> BundleFit:
     first = np.array([np.sqrt(np.mean(r**2)) for r in problem.residuals(estimate)])
     variances = np.array([max(float(np.median(first)), 0.05) ** 2, 1.0])
     weights = np.minimum(1.0, (problem.robust_width * np.median(first) / np.maximum(first, 1e-9)) ** 2)
+    parts: list[np.ndarray] = []
+    raw: list[np.ndarray] = []
+    covariances: list[np.ndarray] = []
     for turn in range(ROUNDS):
         by_joints = _joint_covariances(problem, estimate)
         roots = [np.linalg.cholesky(_frame_covariance(n, by_joints[i], variances)) for i, n in enumerate(sizes)]
@@ -349,7 +352,9 @@ def _variances(
 
 
 def _stepped(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return a pose turned by a rotation vector in its own frame [rad] and moved in its body's [m], step of shape (6,)."""
+    """Return a pose turned by a rotation vector in its own frame [rad] and moved in its body's [m], step of shape
+    (6,).
+    """
     moved = pose.copy()
     moved[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
     moved[:3, 3] += step[3:]

@@ -1,10 +1,10 @@
 """Calibration of a fixed camera by the robot itself: its shape at its measured joint angles against depth and outline.
 
 From a rough start, points that move are first brought onto the rendered surface (point-to-plane: Chen and Medioni,
-"Object modelling by registration of multiple range images", Image and Vision Computing 10(3), 1992), then all pixels in
-which the robot is rendered, and edges of brightness along its outline, are aligned in all frames together. Weights are
-Tukey's. The intervals are those of a jackknife over frames (Efron and Stein, Annals of Statistics 9(3), 1981), since errors
-within a frame, as of its joint angles, are not independent.
+"Object modelling by registration of multiple range images", Image and Vision Computing 10(3), 1992), then all pixels
+in which the robot is rendered, and edges of brightness along its outline, are aligned in all frames together. Weights
+are Tukey's. The intervals are those of a jackknife over frames (Efron and Stein, Annals of Statistics 9(3), 1981),
+since errors within a frame, as of its joint angles, are not independent.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ MOST_POINTS = 1500
 FEWEST_PIXELS = 60
 """Pixels of the robot in a frame from which on it is used."""
 DEPTH_STD, OUTLINE_STD = 5e-4, 2.0
-"""Standard deviations of depth [m] and of the place of an outline [px] that are taken at least: shading near an outline
-shifts its edge by 0.2 px and more, along all of it alike, so that its many points count for less than as many depths."""
+"""Standard deviations of depth [m] and of the place of an outline [px] that are taken at least: shading near an
+outline shifts its edge by 0.2 px and more, along all of it alike, so that its many points count for less than as many
+depths."""
 MAX_SLANT = 0.25
 """Cosine of the angle of view and normal up to which depth of a pixel is not used: it falls on the robot's rim [-]."""
 KNOWN_POSITION, KNOWN_ANGLE = 0.03, np.radians(3.0)
@@ -217,7 +218,7 @@ def _coarse(shot: Shot, footage: Footage, cfg: CalibrateCfg, state: State, gate:
     world = shot.moving @ state.pose[:3, :3].T + state.pose[:3, 3]
     distance, near = KDTree(surface.points).query(world, distance_upper_bound=gate)
     good = np.isfinite(distance)
-    residual, jacobian = depth_terms(shot.moving[good], surface.only(near[good]), state.pose)
+    residual, jacobian = depth_terms(shot.moving[good], surface.only(np.asarray(near)[good]), state.pose)
     return normal_equations(residual, jacobian, max(gate / 3, 0.003))
 
 
@@ -238,8 +239,8 @@ def _fine(shots: list[Shot], footage: Footage, cfg: CalibrateCfg, state: State, 
         for terms, least in ((depths, DEPTH_STD), (edges, OUTLINE_STD))
     ]
     equations = []
-    for pair in zip(depths, edges, strict=True):
-        one, two = (normal_equations(*terms, std) for terms, std in zip(pair, stds, strict=True))
+    for (error, slope), (edge, edge_slope) in zip(depths, edges, strict=True):
+        one, two = normal_equations(error, slope, stds[0]), normal_equations(edge, edge_slope, stds[1])
         equations.append(Equations(one.matrix + two.matrix, one.vector + two.vector))
     return equations
 

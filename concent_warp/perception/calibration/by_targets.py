@@ -53,8 +53,11 @@ KNOWN_POSITION, KNOWN_ANGLE = 0.03, np.radians(3.0)
 """Half widths of intervals above which a pose is not determined [m, rad]."""
 UNKNOWN_SIZE = 1.0
 """Standard deviation of the size of a target where it is not what was stated [-]."""
+SUSPICIOUS_RESIDUAL, SUSPICIOUS_SIZE = 1.0, 0.05
+"""Residual [px], and logarithm of the size in the closed form, above which the stated size is not held to."""
 CLEARLY_BETTER = 0.8
-"""Residual with fitted intrinsics over that with another size, below which intrinsics are wrong, and not the size [-]."""
+"""Residual with fitted intrinsics over that with another size, below which intrinsics are wrong, and not the size
+[-]."""
 MIN_TURN = np.radians(2.0)
 """Rotation of the bodies against one another below which the arm stands still [rad]."""
 
@@ -110,7 +113,10 @@ def calibrate_by_targets(
         remarks.append("the clock offset cannot be seen, since the arm stands still in the views; it is taken as 0")
         problem = Problem(frames, *bodies, (SIZE,), cfg.limits.robust_width)
         fitted = fit(problem, Estimate(estimate.camera, estimate.targets, estimate.intrinsics))
-    if abs(np.log(fitted.estimate.size)) > 2 * problem.size_std:
+    if fitted.rms > SUSPICIOUS_RESIDUAL and abs(np.log(start.size)) > SUSPICIOUS_SIZE:
+        problem = replace(problem, size_std=UNKNOWN_SIZE)
+        fitted = fit(problem, estimate)
+    elif abs(np.log(fitted.estimate.size)) > 2 * problem.size_std:
         problem = replace(problem, size_std=UNKNOWN_SIZE)
         fitted = fit(problem, fitted.estimate)
     _check_agreement(footage, problem, fitted, cfg)
@@ -241,8 +247,7 @@ def _carriers(
     data = [(footage.motions[r.demonstration], r.time, r.seen) for r in runs]
     clock = ClockSearch(data, cfg.limits.max_offset, fixed=not cfg.fit_clock)
     tried = [(body, *_closed_form(footage, runs, (footage.body, body), clock)) for body in candidates]
-    tried = [one for one in tried if one[2] is not None]
-    if not tried:
+    if all(start is None for _, _, start in tried):
         raise RecordingError(
             "camera and target do not move against one another, so nothing can be calibrated",
             where=footage.where,
@@ -250,8 +255,7 @@ def _carriers(
             found="joints that stand still",
             fix="move the arm, or name the body that carries the target with --target-body",
         )
-    body, offset, start = min(tried, key=lambda one: _disagreement(one[2]))
-    assert start is not None
+    body, offset, start = min(((b, o, s) for b, o, s in tried if s is not None), key=lambda one: _disagreement(one[2]))
     if start.angle_error < FITTING_ANGLE and start.position_error < FITTING_DISTANCE:
         return (footage.body, body), offset, start
     _frames(footage, views, (footage.body, body), offset, cfg)  # gaps in the readings come first
@@ -271,9 +275,9 @@ def _carriers(
         f"no pose of the camera on {footage.body} agrees with the views",
         where=footage.where,
         expected="a target that is fixed to the world or to a body of the robot",
-        found=f"views that differ by {np.degrees(start.angle_error):.1f} deg and {1e3 * start.position_error:.0f} mm in "
-        f"the middle, with a target on {body}",
-        fix="check that the tag is not moved, that joint readings belong to this robot, and signs and units of the joints",
+        found=f"views that differ by {np.degrees(start.angle_error):.1f} deg and {1e3 * start.position_error:.0f} mm "
+        f"in the middle, with a target on {body}",
+        fix="check that the tag is not moved, that joint readings belong to this robot, and their signs and units",
     )
 
 

@@ -39,7 +39,8 @@ def calibrate(
     Args:
         recording: Frames and joint readings; the recorded camera poses matter only without tags, as a rough start.
         cfg: Settings.
-        out: Recording to write with calibrated poses, intrinsics and times of frames; `calibration.json` goes beside it.
+        out: Recording to write, with calibrated poses, intrinsics and times of frames; `calibration.json` goes beside
+            it.
         progress: Called with the share done, 0..1.
 
     Raises:

@@ -54,8 +54,8 @@ class RobotViewCfg:
     moving_depth: Length = 0.03
     """How much nearer than in other frames a pixel must be to show a moving thing [m]."""
     min_agreement: Share = 0.75
-    """Share of the robot's rendered pixels whose depth must agree [-]; below it nothing is returned. Cables and covers that
-    the scene lacks, and things in front of the robot, cost some of it."""
+    """Share of the robot's rendered pixels whose depth must agree [-]; below it nothing is returned. Cables and
+    covers that the scene lacks, and things in front of the robot, cost some of it."""
     min_contrast: Positive = 12.0
     """Change of brightness across the robot's outline from which on its place is measured [1/255]."""
     coarse_rounds: Count = 25
@@ -79,7 +79,8 @@ class CalibrationLimitsCfg:
     min_edge: Positive = 12.0
     """Shortest edge of a tag in the image that is used [px]."""
     min_rotation: Angle = 10.0
-    """Rotation about a second axis, root mean square over pairs of views, below which the motion is degenerate [deg]."""
+    """Rotation about a second axis, root mean square over pairs of views, below which the motion is degenerate
+    [deg]."""
     robust_width: Positive = 3.0
     """Residual of a frame over the median one beyond which its weight falls [-]."""
     size_tolerance: Share = 0.03

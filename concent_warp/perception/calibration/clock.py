@@ -32,8 +32,8 @@ class ClockSearch:
         """Read the orientations of all bodies at all shifts.
 
         Args:
-            runs: Of each demonstration the readings of the joints, times of views [s], shape (n,), increasing, and poses
-                of the target in the camera's frame, shape (n, 4, 4).
+            runs: Of each demonstration the readings of the joints, times of views [s], shape (n,), increasing, and
+                poses of the target in the camera's frame, shape (n, 4, 4).
             max_offset: Largest offset [s].
             fixed: Whether the offset is 0 in any case.
         """

@@ -1,10 +1,10 @@
 """Camera and target pose in closed form from the motion of the bodies that carry them.
 
-With the camera at X on its body, the target at Y on its own, H(t) the pose of the camera's body in that of the target's,
-and C(t) the pose of the target in the camera's frame: H(t) X C(t) = Y, so A X = X B for pairs of frames, with
-A = H_j^-1 H_i and B = C_j C_i^-1. Solved by Park and Martin, "Robot sensor calibration: solving AX = XB on the Euclidean
-group", IEEE Transactions on Robotics and Automation 10(5), 1994. Camera on the hand and target in the world, or the
-reverse, are the same here.
+With the camera at X on its body, the target at Y on its own, H(t) the pose of the camera's body in that of the
+target's, and C(t) the pose of the target in the camera's frame: H(t) X C(t) = Y, so A X = X B for pairs of frames,
+with A = H_j^-1 H_i and B = C_j C_i^-1. Solved by Park and Martin, "Robot sensor calibration: solving AX = XB on the
+Euclidean group", IEEE Transactions on Robotics and Automation 10(5), 1994. Camera on the hand and target in the
+world, or the reverse, are the same here.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def park_martin(relative: np.ndarray, seen: np.ndarray) -> HandEye:
     right = -a[fits, :3, 3].ravel()
     left = np.concatenate([left, [[0, 0, 0, SIZE_WEIGHT * np.sqrt(len(right))]]])
     right = np.append(right, left[-1, 3])
-    weight = np.ones(len(right))
+    weight, solution = np.ones(len(right)), np.zeros(4)
     for _ in range(5):
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(root[:, None] * left, root * right, rcond=None)[0]
@@ -144,7 +144,7 @@ def placed_target(
     centre = middle.mean()
     for _ in range(5):
         off = (centre.inv() * middle).magnitude()
-        centre = middle[np.flatnonzero(off <= np.median(off) + 1e-9)].mean()
+        centre = Rotation.from_matrix(placed[off <= np.median(off) + 1e-9, :3, :3]).mean()
     target[:3, :3], target[:3, 3] = centre.as_matrix(), np.median(placed[:, :3, 3], axis=0)
     angle = float(np.median((centre.inv() * middle).magnitude()))
     distance = float(np.median(np.linalg.norm(placed[:, :3, 3] - target[:3, 3], axis=1)))

@@ -1,8 +1,8 @@
 """Poses of a robot's bodies over time, from the readings of its joint sensors.
 
 Readings of each joint are smoothed by a cubic least-squares spline whose number of knots is chosen by generalised
-cross-validation (Craven and Wahba, "Smoothing noisy data with spline functions", Numerische Mathematik 31, 1979), so that
-the noise of single readings does not enter the poses.
+cross-validation (Craven and Wahba, "Smoothing noisy data with spline functions", Numerische Mathematik 31, 1979), so
+that the noise of single readings does not enter the poses.
 """
 
 from __future__ import annotations

@@ -58,7 +58,13 @@ class FrameError:
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """Calibration of one camera; intervals are half widths at 95 %."""
+    """Calibration of one camera; intervals are half widths at 95 %.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> [field for field in cw.CameraCalibration.__dataclass_fields__ if "interval" in field]
+        ['position_interval', 'rotation_interval', 'clock_interval']
+    """
 
     name: str
     method: str

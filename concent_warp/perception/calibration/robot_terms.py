@@ -13,8 +13,8 @@ from scipy.stats import t as student
 from concent_warp.perception.calibration.robot_surface import Surface
 
 POSE, CLOCK, SCALE, EDGE, SHIFT, COUNT = 6, 6, 7, 8, 9, 10
-"""Number of a pose's parameters, the places of the others, and the number of all: clock offset [s], logarithm of the scale
-of depth, how far edges of brightness lie outside the outline [px], and how much too long depth reads [m]."""
+"""Number of a pose's parameters, the places of the others, and the number of all: clock offset [s], logarithm of the
+scale of depth, how far edges of brightness lie outside the outline [px], and how much too long depth reads [m]."""
 KNOWN = {EDGE: 0.3}
 """Standard deviations of what is known of some in advance."""
 TUKEY = 4.685
@@ -34,7 +34,8 @@ class State:
     pose: np.ndarray
     """Camera-to-world, shape (4, 4)."""
     other: np.ndarray = field(default_factory=lambda: np.zeros(COUNT - POSE))
-    """Clock offset [s], logarithm of the scale of depth [-], outward shift of edges [px], shift of depth [m], shape (4,)."""
+    """Clock offset [s], logarithm of the scale of depth [-], outward shift of edges [px], shift of depth [m], shape
+    (4,)."""
 
     @property
     def offset(self) -> float:

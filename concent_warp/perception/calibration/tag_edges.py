@@ -1,8 +1,8 @@
 """Corners of a tag as the intersections of lines fitted to its four edges.
 
-Refinement of corners by their saddle point, as `cv2.cornerSubPix` does, is right for chessboards; the outer corners of a
-black square it draws inwards, by 0.25 px in images with a blur of 0.6 px, which makes a tag of 90 px 0.5 % too small. The
-edges between the corners have no such bias.
+Refinement of corners by their saddle point, as `cv2.cornerSubPix` does, is right for chessboards; the outer corners
+of a black square it draws inwards, by 0.25 px in images with a blur of 0.6 px, which makes a tag of 90 px 0.5 % too
+small. The edges between the corners have no such bias.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ def refine_corners(image: np.ndarray, corners: np.ndarray, cells: int) -> np.nda
         cells: Cells along an edge of the tag, its border included.
     """
     for _ in range(ROUNDS):
-        lines = [_edge_line(image, corners[i], corners[(i + 1) % 4], cells) for i in range(4)]
-        if any(line is None for line in lines):
+        found = [_edge_line(image, corners[i], corners[(i + 1) % 4], cells) for i in range(4)]
+        lines = np.array([line for line in found if line is not None])
+        if len(lines) < 4:
             return None
         refined = np.cross(np.roll(lines, 1, axis=0), lines)
         if (np.abs(refined[:, 2]) < 1e-9).any():

@@ -189,7 +189,7 @@ def _finder(cfg: CalibrationTargetCfg) -> Callable[[np.ndarray], list[tuple[str,
             corners, ids, _, _ = detector.detectBoard(image)
             if ids is None or len(ids) < FEWEST_CORNERS:
                 return []
-            return [("board", points[np.ravel(ids)], np.reshape(corners, (-1, 2)).astype(float))]
+            return [("board", points[np.ravel(ids).astype(int)], np.reshape(corners, (-1, 2)).astype(float))]
 
         return board_corners
     tags = _detector(cfg.dictionary)

@@ -4,12 +4,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from conftest import CAMERA_IN_WORLD, CAMERA_ON_HAND, MATRIX, SIZE, TAG_ON_HAND, Filming, film, with_stream
 from scipy.spatial.transform import Rotation
 
 import concent_warp as cw
 from concent_warp.perception.calibration.calibrate import calibrate
 from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
+from tests.perception.calibration.filming import (
+    CAMERA_IN_WORLD,
+    CAMERA_ON_HAND,
+    MATRIX,
+    SIZE,
+    TAG_ON_HAND,
+    Filming,
+    film,
+    with_stream,
+)
 
 
 def angle(first, second):
@@ -30,12 +39,15 @@ def test_a_camera_on_the_hand_is_found_from_a_tag_in_the_world(wrist):
     assert np.linalg.norm(found.pose[:3, 3] - CAMERA_ON_HAND[:3, 3]) < 5e-4
     assert angle(found.pose, CAMERA_ON_HAND) < 0.08
     assert abs(found.clock_offset - 0.03) < 1e-3
-    assert found.body == "hand" and found.target_body is None and found.method == "tags"
+    assert found.body == "hand"
+    assert found.target_body is None
+    assert found.method == "tags"
 
 
 def test_intervals_are_small_and_hold_the_truth(wrist):
     found = wrist.cameras["eye"]
-    assert (found.position_interval < 1e-3).all() and (found.rotation_interval < np.radians(0.2)).all()
+    assert (found.position_interval < 1e-3).all()
+    assert (found.rotation_interval < np.radians(0.2)).all()
     shift = np.abs(found.pose[:3, 3] - CAMERA_ON_HAND[:3, 3])
     assert (shift < 2 * found.position_interval).all()
     assert abs(found.clock_offset - 0.03) < 2 * found.clock_interval < 2e-3
@@ -65,7 +77,9 @@ def test_clocks_that_differ_by_a_lot_are_brought_together(offset, cfg):
 def test_depth_that_reads_too_long_is_said_with_an_interval(cfg):
     found = calibrate(film(Filming(depth_scale=1.018)), cfg).cameras["eye"]
     depth = checks(found)["depth"]
-    assert depth.low < 1.8 < depth.high and depth.off and depth.high - depth.low < 0.5
+    assert depth.low < 1.8 < depth.high
+    assert depth.off
+    assert depth.high - depth.low < 0.5
     assert any(r.startswith("depth reads 1.") and "too long" in r for r in found.remarks)
 
 
@@ -75,7 +89,8 @@ def test_a_wrong_focal_length_is_named_and_fitted_on_demand(cfg):
     recording = film(Filming(matrix=wrong, frames=24))
     found = calibrate(recording, cfg).cameras["eye"]
     check = checks(found)["focal length x"]
-    assert check.off and abs(check.value - 3) < 0.7
+    assert check.off
+    assert abs(check.value - 3) < 0.7
     assert any("focal length x" in r and "too long" in r for r in found.remarks)
     assert any("assume" in r for r in found.remarks)
     fitted = calibrate(recording, replace(cfg, fit_intrinsics=True))
@@ -113,8 +128,12 @@ def test_the_calibrated_recording_is_written_with_its_json(on_hand, cfg, tmp_pat
     assert np.allclose(stored.pose, found.cameras["eye"].pose)
     assert np.allclose(stored.time, on_hand[0].image["eye"].time + found.cameras["eye"].clock_offset)
     entry = json.loads((tmp_path / "calibration.json").read_text())["cameras"]["eye"]
-    assert entry["width"] == 320 and entry["height"] == 240 and entry["body"] == "hand" and entry["distortion"] == []
-    assert np.allclose(entry["pose"], stored.pose) and np.allclose(entry["intrinsics"], MATRIX)
+    assert entry["width"] == 320
+    assert entry["height"] == 240
+    assert entry["body"] == "hand"
+    assert entry["distortion"] == []
+    assert np.allclose(entry["pose"], stored.pose)
+    assert np.allclose(entry["intrinsics"], MATRIX)
 
 
 def test_a_pose_in_the_axes_of_opengl_is_recognised(on_hand, cfg):
