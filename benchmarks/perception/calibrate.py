@@ -58,12 +58,12 @@ HAND = CalibrationSceneCfg(frames=16)
 FIXED = replace(HAND, camera="world")
 ROBOT = replace(FIXED, target="none")
 CASES = {
-    "camera on the hand, one tag": Case(HAND, 8),
+    "camera on the hand, one tag": Case(HAND, 12),
     "camera on the hand, three tags": Case(replace(HAND, target="tags"), 4),
     "camera on the hand, ChArUco board": Case(
         replace(HAND, target="charuco", dictionary="DICT_4X4_50"), 4, CalibrateCfg(CHARUCO)
     ),
-    "fixed camera, tag on the hand": Case(FIXED, 8),
+    "fixed camera, tag on the hand": Case(FIXED, 12),
     "fixed camera, robot in view": Case(ROBOT, 8, CalibrateCfg()),
     "on the hand, encoders off by 1 mrad": Case(replace(HAND, joint_bias=1e-3), 4),
     "fixed, tag, encoders off by 1 mrad": Case(replace(FIXED, joint_bias=1e-3), 4),
@@ -150,7 +150,7 @@ def write(rows: dict[str, dict[str, Any]]) -> None:
 
 
 def checks_text(rows: dict[str, dict[str, Any]]) -> str:
-    """Return what the checks of focal length and depth say where these are off."""
+    """Return what the checks of focal length and depth say where these are off, and why recordings were refused."""
     lines = []
     for name, check, truth in (
         ("on the hand, focal length 2 % long", "focal length x", 2.0),
@@ -162,6 +162,9 @@ def checks_text(rows: dict[str, dict[str, Any]]) -> str:
         if found:
             values = ", ".join(f"{v:.2f} ({low:.2f} to {high:.2f})" for v, low, high in found)
             lines.append(f"- *{name}*: {check} found to be off by {values} %; truth {truth} %.")
+    lines += [
+        f"- *{key.replace('/', '*, seed ')}, refused: {row['refused']}" for key, row in rows.items() if "refused" in row
+    ]
     return "\n".join(lines)
 
 
