@@ -143,7 +143,7 @@ def calibrate_by_targets(
     wrong = any(c.off for c in checks)
     size = size_check(wide if wrong and wide.rms < CLEARLY_BETTER * fitted.rms else fitted)
     depth = depth_check(wide if wrong else fitted, wide_problem if wrong else problem, footage)
-    _check_size(footage, size, cfg)
+    _check_size(footage, size, depth, cfg)
     _check_determined(footage, fitted)
     checks += [size] + ([] if depth is None else [depth])
     remarks += remarks_on(checks, fitted=cfg.fit_intrinsics)
@@ -412,16 +412,18 @@ def _check_agreement(footage: Footage, problem: Problem, fitted: BundleFit, cfg:
         )
 
 
-def _check_size(footage: Footage, check: Check, cfg: CalibrateCfg) -> None:
+def _check_size(footage: Footage, check: Check, depth: Check | None, cfg: CalibrateCfg) -> None:
     """Raise an error where the targets have another size than stated."""
     if not check.off or abs(check.value) < 100 * cfg.limits.size_tolerance:
         return
     size = cfg.target.tag_size * (1 + check.value / 100)
     low, high = (cfg.target.tag_size * (1 + v / 100) for v in (check.low, check.high))
+    # Depth was compared with targets of the fitted size.
+    agreed = "and depth say" if depth is not None and abs(depth.value) < abs(check.value) / 2 else "says"
     raise RecordingError(
         "the size of the tags is wrong",
         where=footage.where,
-        expected=f"edges of {size:.4f} m (95 %: {low:.4f} to {high:.4f}), as the robot's motion says",
+        expected=f"edges of {size:.4f} m (95 %: {low:.4f} to {high:.4f}), as the robot's motion {agreed}",
         found=f"{cfg.target.tag_size:g} m",
         fix="measure the black square and give --tag-size in metres",
     )

@@ -50,6 +50,7 @@ def test_other_ids_are_named(on_hand):
 def test_a_wrong_tag_size_is_refused_with_the_right_one(on_hand):
     said = refused(on_hand, CalibrateCfg(replace(TAG, tag_size=0.04)))
     assert "size of the tags is wrong" in said
+    assert "as the robot's motion and depth say" in said
     assert "expected edges of 0.0" in said
     size = float(said.split("expected edges of ")[1].split(" m")[0])
     assert abs(size - SIZE) < 5e-4
