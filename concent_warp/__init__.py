@@ -45,6 +45,9 @@ _HOMES = {
     "fit.geometry.search": ("FitResult",),
     "ground": ("GroundCfg", "Grounded", "ground"),
     "model": ("Model", "load_model"),
+    "perception.calibration.calibrate": ("calibrate",),
+    "perception.calibration.cfg": ("CalibrateCfg", "CalibrationTargetCfg"),
+    "perception.calibration.result": ("Calibration", "CameraCalibration"),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
     "recording.logs.cfg": ("ImportCfg",),
@@ -104,6 +107,9 @@ if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import FitResult
     from concent_warp.ground import GroundCfg, Grounded, ground
     from concent_warp.model import Model, load_model
+    from concent_warp.perception.calibration.calibrate import calibrate
+    from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
+    from concent_warp.perception.calibration.result import Calibration, CameraCalibration
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.logs.cfg import ImportCfg

@@ -22,6 +22,9 @@ GROUPS = {
         "record": "record demonstrations in Reality",
         "import": "read the log of another system: LeRobot, MCAP, ROS bag, images",
     },
+    "from a video to a recording": {
+        "calibrate": "find camera poses and clock offset from tags or the robot in view",
+    },
     "from a recording to a model": {
         "geometry": "place contact spheres on the objects of a scene; export MJCF",
         "fit": "fit the contact geometry; extract contact events; report",
@@ -52,6 +55,7 @@ EXAMPLES = {
     "demo": "concent demo --out runs/demo",
     "record": "concent record --seeds 0 1 -o demo.h5",
     "import": "concent import bag.mcap --model robot.xml --map robot.toml -o demo.h5",
+    "calibrate": "concent calibrate demo.h5 --tag-size 0.04 -o calibrated.h5 --picture calibration.png",
     "geometry": "concent geometry scene.xml -o model.toml",
     "fit": "concent fit demo.h5 -o runs/demo",
     "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",

@@ -63,7 +63,7 @@ def record_depth_images(
                 mjw.render(warp_model, warp_data, context)
             mjw.get_rgb(colour, 0, seen)
             rgb[t] = _noisy_colour(seen.numpy()[0], sensing, rng)
-            depth[t] = _noisy_depth(ranging.depth_data.numpy()[0].reshape(height, width), sensing, rng)
+            depth[t] = noisy_depth(ranging.depth_data.numpy()[0].reshape(height, width), sensing, rng)
     return ImageStream(np.asarray(time, float), rgb, depth, camera.intrinsics, camera.pose)
 
 
@@ -93,7 +93,7 @@ def _noisy_colour(colour: np.ndarray, sensing: SensingCfg, rng: np.random.Genera
     return np.clip(np.round(level), 0, 255).astype(np.uint8)
 
 
-def _noisy_depth(depth: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
+def noisy_depth(depth: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
     """Return what the sensor reports for planar depths [m], shape (H, W), 0 where there is nothing.
 
     The noise grows with the square of the depth, as with all triangulation; near an edge, where one eye sees what the
