@@ -45,6 +45,9 @@ _HOMES = {
     "fit.geometry.search": ("FitResult",),
     "ground": ("GroundCfg", "Grounded", "ground"),
     "model": ("Model", "load_model"),
+    "perception.tracking.cfg": ("TrackCfg",),
+    "perception.tracking.result": ("BodyTrack", "Tracked"),
+    "perception.tracking.track": ("track",),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
     "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
@@ -102,6 +105,9 @@ if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import FitResult
     from concent_warp.ground import GroundCfg, Grounded, ground
     from concent_warp.model import Model, load_model
+    from concent_warp.perception.tracking.cfg import TrackCfg
+    from concent_warp.perception.tracking.result import BodyTrack, Tracked
+    from concent_warp.perception.tracking.track import track
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording

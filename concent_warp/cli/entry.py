@@ -22,6 +22,7 @@ GROUPS = {
         "record": "record demonstrations in Reality",
     },
     "from a recording to a model": {
+        "track": "track the objects in the RGB-D video of a recording",
         "geometry": "place contact spheres on the objects of a scene; export MJCF",
         "fit": "fit the contact geometry; extract contact events; report",
         "replay": "replay a recording in a model and save the prediction",
@@ -50,6 +51,7 @@ COMMANDS = {name: text for group in GROUPS.values() for name, text in group.item
 EXAMPLES = {
     "demo": "concent demo --out runs/demo",
     "record": "concent record --seeds 0 1 -o demo.h5",
+    "track": "concent track video.h5 -o tracked.h5",
     "geometry": "concent geometry scene.xml -o model.toml",
     "fit": "concent fit demo.h5 -o runs/demo",
     "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",

@@ -1,0 +1,281 @@
+"""Linearised residuals of a pose in one frame: depth against the shape's surface, and edges of the image.
+
+The pose's unknowns are a twist (`pose`). Depth is compared along the lines of sight, with the derivative of
+point-to-plane ICP (Chen and Medioni, "Object modelling by registration of multiple range images", IVC 10(3), 1992) and
+the association of projective ICP. Edges are searched along the normal of the projected contour and creases (Harris,
+"Tracking with rigid models", 1992). Both are weighted by Tukey's function of residual over scatter, the scatter being
+that of the frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from concent_warp.perception.tracking.cfg import AlignCfg
+from concent_warp.perception.tracking.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.shape import TrackedShape
+from concent_warp.perception.tracking.view import View
+
+MAD = 1.4826
+"""Standard deviation over median absolute deviation of normal noise."""
+MAX_INFLATION = 30.0
+"""Largest factor by which correlated residuals raise a variance."""
+EDGE_SIDES = 8
+"""Directions of an edge's normal in the image that have an error of their own."""
+BIASES = 1 + EDGE_SIDES
+"""Common errors of a frame: of inverse depth [1/m], and of the edges' places on each side [px]."""
+
+
+@dataclass
+class Normal:
+    """Normal equations of a pose: ``information @ twist = gradient``."""
+
+    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    """Shape (6, 6)."""
+    gradient: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    """Shape (6,)."""
+    bias: np.ndarray = field(default_factory=lambda: np.zeros((6, BIASES)))
+    """Change of the gradient per unit of a common error, shape (6, BIASES)."""
+
+    def __add__(self, other: Normal) -> Normal:
+        """Return the sum of two sets of independent residuals."""
+        return Normal(self.information + other.information, self.gradient + other.gradient, self.bias + other.bias)
+
+
+def weighted(
+    jacobian: np.ndarray, residual: np.ndarray, least: float, cfg: AlignCfg, inflation: float = 1.0
+) -> tuple[Normal, np.ndarray, float]:
+    """Return normal equations, weights (n,) and scatter of residuals (n,) with derivatives (n, 6).
+
+    Args:
+        jacobian: Derivatives of the prediction, shape (n, 6).
+        residual: Measurement minus prediction, shape (n,).
+        least: Least scatter, in the residual's unit.
+        cfg: Settings.
+        inflation: Factor of the variance for correlated residuals.
+    """
+    scatter = max(MAD * float(np.median(np.abs(residual))), least)
+    ratio = residual / (cfg.outlier_factor * scatter)
+    weight = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+    scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
+    return Normal(scaled.T @ jacobian, scaled.T @ residual), weight, scatter
+
+
+def point_jacobian(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the derivative, shape (n, 6), of the points' motion along directions (n, 3), by the body's twist."""
+    return np.concatenate([direction, np.cross(points - origin, direction)], axis=1)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """What a camera should see around a body, on a grid of pixels."""
+
+    rows: np.ndarray
+    """Image rows [px], shape (h,)."""
+    columns: np.ndarray
+    """Image columns [px], shape (w,)."""
+    depth: np.ndarray
+    """Depth of the first surface [m], shape (h, w)."""
+    own: np.ndarray
+    """Whether this is the body, shape (h, w) bool."""
+    normal: np.ndarray
+    """Normals, world frame, shape (h, w, 3)."""
+    rays: np.ndarray
+    """Rays scaled to a depth of 1, world frame, shape (h, w, 3)."""
+    measured: np.ndarray
+    """Measured depth [m], shape (h, w), 0 where there is none."""
+
+
+def rendered_crop(renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.ndarray, most: int) -> Crop | None:
+    """Return the surroundings of a body at a pose, which the renderer is set to; None where it is out of the image.
+
+    Args:
+        renderer: Scene in the state of this frame, the body at `pose`.
+        view: The frame.
+        shape: The body.
+        pose: Its pose, shape (4, 4).
+        most: Largest number of the body's pixels, about.
+    """
+    window = view.window(pose[:3, :3] @ shape.centre + pose[:3, 3], shape.reach)
+    if window is None:
+        return None
+    area = (window[0].stop - window[0].start) * (window[1].stop - window[1].start)
+    stride = max(1, round(np.sqrt(0.4 * area / most)))
+    rows, columns = (
+        np.arange(window[0].start, window[0].stop, stride),
+        np.arange(window[1].start, window[1].stop, stride),
+    )
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
+    hits = renderer.cast(view.camera, grid)
+    size = (len(rows), len(columns))
+    return Crop(
+        rows,
+        columns,
+        hits.depth.reshape(size),
+        (hits.body == shape.row).reshape(size),
+        hits.normal.reshape(*size, 3),
+        hits.rays.reshape(*size, 3),
+        view.depth[np.ix_(rows, columns)].astype(float),
+    )
+
+
+def depth_rows(crop: Crop, view: View, pose: np.ndarray, gate: float, cfg: AlignCfg) -> tuple[Normal, float, int]:
+    """Return the normal equations of depth, its scatter [m] and the number of pixels used."""
+    import cv2
+
+    inner = cv2.erode(crop.own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    mask = inner if inner.sum() > 0.4 * crop.own.sum() else crop.own
+    slope = -np.einsum("hwk,hwk->hw", crop.normal, crop.rays)
+    difference = np.where(mask, crop.measured - np.where(mask, crop.depth, 0.0), 0.0)
+    used = mask & (crop.measured > 0) & (np.abs(difference) < gate)
+    used &= slope > cfg.slant * np.linalg.norm(crop.rays, axis=2)
+    count = int(used.sum())
+    if count < 6:
+        return Normal(), np.nan, count
+    rays, depth = crop.rays[used], crop.depth[used]
+    points = view.camera.position + depth[:, None] * rays
+    direction = -crop.normal[used] / slope[used][:, None]
+    jacobian = point_jacobian(points, pose[:3, 3], direction)
+    residual = difference[used]
+    scatter = max(MAD * float(np.median(np.abs(residual))), cfg.min_depth_std)
+    field = np.where(used & (np.abs(difference) < 4 * scatter), difference, np.nan)
+    inflation = _correlation_inflation(field)
+    normal, weight, scatter = weighted(jacobian, residual, cfg.min_depth_std, cfg, inflation)
+    scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
+    normal.bias[:, 0] = scaled.T @ depth**2
+    return normal, scatter, count
+
+
+def _correlation_inflation(field: np.ndarray, reach: int = 3) -> float:
+    """Return the factor by which the correlation of residuals on a grid, NaN where unused, raises a mean's variance."""
+    known = np.isfinite(field)
+    value = np.where(known, field - np.nanmean(field), 0.0)
+    variance = (value**2).sum() / max(known.sum(), 1)
+    if variance <= 0:
+        return 1.0
+    total, height, width = 1.0, *field.shape
+    for down in range(reach + 1):
+        for across in range(-reach if down else 1, reach + 1):
+            if abs(across) >= width or down >= height:
+                continue
+            a = np.s_[: height - down, max(0, -across) : width - max(0, across)]
+            b = np.s_[down:, max(0, across) : width + min(0, across)]
+            both = known[a] & known[b]
+            if both.sum() > 20:
+                share = both.sum() / known.sum()
+                total += 2 * share * (value[a] * value[b]).sum() / both.sum() / variance
+    return float(np.clip(total, 1.0, MAX_INFLATION))
+
+
+@dataclass(frozen=True)
+class EdgeResult:
+    """Edges found in a frame."""
+
+    normal: Normal
+    scatter: float
+    """Scatter [px]; NaN where too few were found."""
+    found: int
+    """Samples of the contour at which the image has an edge nearby."""
+    searched: int
+    """Samples of the contour that were searched."""
+
+
+def edge_rows(
+    renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.ndarray, reach: float, cfg: AlignCfg
+) -> EdgeResult:
+    """Return the normal equations of the image's edges within `reach` [px] of contour and creases."""
+    edges = shape.edges
+    points = edges.point @ pose[:3, :3].T + pose[:3, 3]
+    sight = points - view.camera.position
+    facing = np.einsum("nfk,nk->nf", edges.normals, sight @ pose[:3, :3]) < 0
+    contour = facing[:, 0] != facing[:, 1]
+    use = np.flatnonzero(contour | (edges.crease & facing.any(axis=1)))
+    if len(use) < 6:
+        return EdgeResult(Normal(), np.nan, 0, 0)
+    if len(use) > cfg.max_edge_samples:
+        use = use[np.linspace(0, len(use) - 1, cfg.max_edge_samples).astype(int)]
+    pixels, depth, projection = view.pixel_rows(points[use])
+    along = np.einsum("nij,nj->ni", projection, edges.direction[use] @ pose[:3, :3].T)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    length = np.linalg.norm(across, axis=1)
+    across /= np.maximum(length, 1e-9)[:, None]
+    # Away from the object: the face that is seen lies on the other side of its contour.
+    front = np.where(facing[use, 0], 0, 1)
+    inward = edges.inward[use, front] @ pose[:3, :3].T
+    sign = np.einsum("ni,nij,nj->n", across, projection, inward)
+    across *= np.where(sign > 0, -1.0, 1.0)[:, None]
+    limit = np.array(view.shape[::-1]) - 1 - reach
+    good = ((pixels >= reach) & (pixels <= limit)).all(axis=1) & (depth > 0) & (length > 1e-6)
+    beyond = pixels + np.where(contour[use], 1.0, 0.0)[:, None] * (reach + 1) * across
+    hits = renderer.cast(view.camera, np.concatenate([pixels - 0.7 * across * contour[use, None], beyond]))
+    here, there = hits.depth[: len(use)], hits.depth[len(use) :]
+    slack = 0.03 * shape.reach
+    body = hits.body[len(use) :]
+    good &= here > depth - slack
+    # Beside a contour that something known covers, the edge found would be that of the cover.
+    good &= ~(contour[use] & (there < depth - slack) & (body != shape.row))
+    return _matched_edges(
+        view, pose, points[use], pixels, across, projection, contour[use], good, edges.edge[use], reach, cfg
+    )
+
+
+def _matched_edges(
+    view: View,
+    pose: np.ndarray,
+    points: np.ndarray,
+    pixels: np.ndarray,
+    across: np.ndarray,
+    projection: np.ndarray,
+    contour: np.ndarray,
+    good: np.ndarray,
+    number: np.ndarray,
+    reach: float,
+    cfg: AlignCfg,
+) -> EdgeResult:
+    """Return the normal equations of samples (n, ...) at which the image has an edge."""
+    searched = int((good & contour).sum())
+    if good.sum() < 6:
+        return EdgeResult(Normal(), np.nan, 0, searched)
+    points, pixels, across, projection = points[good], pixels[good], across[good], projection[good]
+    contour, number = contour[good], number[good]
+    step = 0.5
+    offsets = np.arange(-reach - 2 * step, reach + 2.01 * step, step)
+    profile = view.sample(pixels[:, None] + offsets[:, None] * across[:, None])
+    gradient = np.abs(profile[:, 4:] - profile[:, :-4] + 0.5 * (profile[:, 3:-1] - profile[:, 1:-3]))
+    centre = offsets[2:-2]
+    peak = gradient * np.exp(-0.5 * (centre / (0.6 * reach)) ** 2)
+    best = np.clip(peak.argmax(axis=1), 1, len(centre) - 2)
+    row = np.arange(len(best))
+    left, top, right = (gradient[row, best + k] for k in (-1, 0, 1))
+    bend = left - 2 * top + right
+    shift = np.where(bend < -1e-6, 0.5 * (left - right) / np.where(bend < -1e-6, bend, 1.0), 0.0)
+    offset = centre[best] + step * np.clip(shift, -1, 1)
+    strong = (top > 5 * view.noise) & (top >= left) & (top >= right) & (np.abs(offset) < reach)
+    found = int((strong & contour & (np.abs(offset) < max(2.0, 0.35 * reach))).sum())
+    if strong.sum() < 6:
+        return EdgeResult(Normal(), np.nan, found, searched)
+    direction = np.einsum("ni,nij->nj", across[strong], projection[strong])
+    jacobian = point_jacobian(points[strong], pose[:3, 3], direction)
+    residual = offset[strong]
+    scatter = max(MAD * float(np.median(np.abs(residual))), cfg.min_edge_std)
+    inflation = _chain_inflation(residual, number[strong], scatter)
+    normal, weight, scatter = weighted(jacobian, residual, cfg.min_edge_std, cfg, inflation)
+    scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
+    angle = np.arctan2(across[strong, 1], across[strong, 0])
+    side = np.floor((angle / np.pi + 1) / 2 * EDGE_SIDES).astype(int) % EDGE_SIDES
+    for k in range(EDGE_SIDES):
+        normal.bias[:, 1 + k] = scaled[side == k].sum(axis=0)
+    return EdgeResult(normal, scatter, found, searched)
+
+
+def _chain_inflation(residual: np.ndarray, number: np.ndarray, scatter: float) -> float:
+    """Return the variance factor of residuals that follow one another along the same edges as a Markov chain."""
+    pairs = (number[1:] == number[:-1]) & (np.abs(residual[1:]) < 4 * scatter) & (np.abs(residual[:-1]) < 4 * scatter)
+    if pairs.sum() < 8:
+        return 2.0
+    a, b = residual[1:][pairs], residual[:-1][pairs]
+    share = float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-12))
+    share = float(np.clip(share, 0.0, 0.93))
+    return float(np.clip((1 + share) / (1 - share), 1.0, MAX_INFLATION))
