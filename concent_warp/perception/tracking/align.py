@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,11 @@ class Fit:
     texture_correlation: float = np.nan
     """Mean correlation of the keyframe's patches."""
 
+    def position_std(self) -> float:
+        """Return the standard deviation of the position along the worst direction [m], common errors aside."""
+        information = self.geometry.information + sum(n.information for _, n in self.texture) + 1e-3 * FREE
+        return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]))
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -59,20 +64,23 @@ class Agreement:
     pose does not."""
     depth_std: float = 0.0
     """Scatter of the depth's difference by pixel [m]."""
+    penetration: float = 0.0
+    """How deep it is in other bodies [m]."""
 
     def accepted(self, cfg: AcceptCfg) -> bool:
         """Return whether this is agreement enough."""
         seen = self.pixels >= cfg.min_pixels and self.visible >= cfg.min_visible
         clear = self.behind <= cfg.max_behind and self.unexplained <= cfg.max_unexplained
         smooth = self.misfit <= max(cfg.max_misfit, cfg.max_misfit_share * self.depth_std)
-        return seen and clear and smooth and self.share >= cfg.min_agreement
+        free = self.penetration <= cfg.max_penetration
+        return seen and clear and smooth and free and self.share >= cfg.min_agreement
 
     def text(self) -> str:
         """Return this in words."""
         return (
             f"{self.pixels} pixels agree, {self.share:.0%} of those in view; {self.behind:.0%} see through it; "
             f"{self.unexplained:.0%} of the surroundings are unexplained; {self.visible:.0%} of it in view; "
-            f"its surface is off by {1e3 * self.misfit:.1f} mm"
+            f"its surface is off by {1e3 * self.misfit:.1f} mm and {1e3 * self.penetration:.1f} mm inside others"
         )
 
 
@@ -112,7 +120,18 @@ def refine(
         gate = cfg.depth_gate + share * (cfg.first_depth_gate - cfg.depth_gate)
         reach = cfg.edge_range + share * (cfg.first_edge_range - cfg.edge_range)
         with_texture = texture is not None and (k >= 1 or count == 1) and not (rough and k < count - 3)
-        fit = _linearised(renderer, views, shape, pose, cfg, gate, reach, keyframes if with_texture else (), texture)
+        fit = _linearised(
+            renderer,
+            views,
+            shape,
+            pose,
+            cfg,
+            gate,
+            reach,
+            keyframes if with_texture else (),
+            texture,
+            final=k == count - 1,
+        )
         if fit is None:
             return None
         if k == count - 1:
@@ -146,6 +165,8 @@ def _linearised(
     reach: float,
     keyframes: Sequence[tuple[int, Keyframe] | None],
     texture: TextureCfg | None,
+    *,
+    final: bool,
 ) -> Fit | None:
     """Return all residuals at a pose."""
     renderer.place(shape.row, pose)
@@ -156,7 +177,7 @@ def _linearised(
         if crop is None or not crop.own.any():
             continue
         seen = True
-        normal, scatter, _ = depth_rows(crop, view, pose, gate, cfg)
+        normal, scatter, _ = depth_rows(renderer, crop, view, pose, gate, cfg, final=final)
         edge = edge_rows(renderer, view, shape, pose, reach, cfg)
         total = total + normal + edge.normal
         scatters.append(scatter)
@@ -187,7 +208,9 @@ def agreement(
     renderer.place(shape.row, pose)
     results = [_agreement(renderer, view, shape, pose, depth_std, cfg) for view in views]
     known = [r for r in results if r is not None]
-    return max(known, key=lambda r: r.pixels) if known else Agreement(0, 0.0, 0.0, 0.0, 0.0)
+    if not known:
+        return Agreement(0, 0.0, 0.0, 0.0, 0.0)
+    return replace(max(known, key=lambda r: r.pixels), penetration=renderer.penetration(shape.row))
 
 
 def _agreement(
@@ -196,7 +219,7 @@ def _agreement(
     """Return the agreement in one frame."""
     import cv2
 
-    crop = rendered_crop(renderer, view, shape, pose, 4000)
+    crop = rendered_crop(renderer, view, shape, pose, 1500)
     if crop is None:
         return None
     tolerance = max(cfg.depth_tolerance, 4 * depth_std if np.isfinite(depth_std) else 0.0)

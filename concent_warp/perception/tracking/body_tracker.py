@@ -12,7 +12,7 @@ from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.pose import moved, rotation_angle, twist_between
 from concent_warp.perception.tracking.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.registration import relocated
-from concent_warp.perception.tracking.rows import BIASES, rendered_crop
+from concent_warp.perception.tracking.rows import bias_stds, rendered_crop
 from concent_warp.perception.tracking.search import find_pose
 from concent_warp.perception.tracking.shape import TrackedShape
 from concent_warp.perception.tracking.symmetry import Symmetry
@@ -132,9 +132,7 @@ class BodyTracker:
 
     def certain(self, fit: Fit) -> bool:
         """Return whether a fit's position is known well enough."""
-        information = fit.geometry.information + sum(n.information for _, n in fit.texture) + 1e-3 * FREE
-        covariance = np.linalg.inv(information)
-        return bool(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) < self.cfg.accept.max_translation_std)
+        return fit.position_std() < self.cfg.accept.max_translation_std
 
     def chosen(self, views: Sequence[View], pose: np.ndarray) -> list[tuple[int, Keyframe] | None]:
         """Return number and keyframe for each view, None where none fits."""
@@ -163,7 +161,7 @@ class BodyTracker:
             for k, n in fit.texture
         )
         inverse = np.linalg.inv(information + FREE)
-        std = np.array([self.cfg.align.depth_bias_std] + [self.cfg.align.edge_bias_std] * (BIASES - 1))
+        std = bias_stds(self.cfg.align)
         bias = inverse @ fit.geometry.bias * std
         return inverse + bias @ bias.T
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from concent_warp.perception.tracking.align import Fit
 from concent_warp.perception.tracking.cfg import AlignCfg
-from concent_warp.perception.tracking.rows import BIASES
+from concent_warp.perception.tracking.rows import BIASES, bias_stds
 from concent_warp.perception.tracking.smooth import PoseMeasurement
 
 LOOSE = np.diag([1 / 0.01**2] * 3 + [1 / 0.2**2] * 3)
@@ -55,7 +55,7 @@ def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg) -> Bundle:
                 matrix[rows, 6 * other : 6 * other + 6] -= h_k @ inverse @ h_other
     covariance = np.linalg.inv(matrix) if size else np.zeros((0, 0))
     error, sensitivity = covariance @ right, covariance @ sensitivity
-    std = np.array([cfg.depth_bias_std] + [cfg.edge_bias_std] * (BIASES - 1))
+    std = bias_stds(cfg)
     measurements, common = [], np.zeros((len(fits), 6, 6))
     for t, fit in enumerate(fits):
         if fit is None:

@@ -16,9 +16,9 @@ class AlignCfg:
     """Gauss-Newton iterations of a frame that continues a track."""
     first_iterations: Count = 14
     """Gauss-Newton iterations of a pose that is only roughly known."""
-    max_pixels: Count = 2500
+    max_pixels: Count = 1200
     """Pixels of the object that depth is compared in; where it covers more, a regular grid of them."""
-    max_edge_samples: Count = 200
+    max_edge_samples: Count = 160
     """Points on contour and creases that edges are searched at."""
     edge_range: Positive = 4.0
     """Distance from the predicted edge within which the image's edge is searched [px]."""
@@ -36,6 +36,10 @@ class AlignCfg:
     """Least scatter of texture points that is believed [px]."""
     max_step: Positive = 0.015
     """Largest translation of one iteration [m]; rotations are limited to this over the object's radius [rad]."""
+    depth_tilt_std: float = 1e-4
+    """Standard deviation of the change of that offset across the object's reach, in either direction of the image
+    [1/m]: a sensor's distortion changes slowly over the image (Teichman et al., "Unsupervised intrinsic calibration of
+    depth sensors via SLAM", RSS 2013). It enters the covariance, not the pose."""
     depth_bias_std: float = 3e-4
     """Standard deviation of a common offset of inverse depth [1/m], 0.3 mm at 1 m: calibrated depth cameras state 1 to
     2 % at 1 m or more at delivery and 0.1 % or less after calibration. It enters the covariance, not the pose."""
@@ -67,6 +71,8 @@ class AcceptCfg:
     """The same as a share of the scatter by pixel, where that is more [-]: what averaging leaves of noise."""
     min_texture: Share = 0.5
     """Least mean correlation of a keyframe's patches with the image [-]."""
+    max_penetration: Positive = 0.005
+    """Depth in other bodies above which a pose is impossible [m]: joint readings and shapes are not exact."""
     min_pixels: Count = 30
     """Least number of agreeing pixels."""
     min_visible: Share = 0.12
@@ -120,7 +126,7 @@ class SearchCfg:
     """Measured points of a cluster that are compared with the shape."""
     rounds: Count = 15
     """Iterations of each start."""
-    kept: Count = 8
+    kept: Count = 12
     """Starts, the best ones that differ, that are refined against the image."""
     min_margin: Positive = 0.06
     """Least advantage in score of the best pose over the next that no symmetry of the shape explains [-]."""

@@ -75,6 +75,17 @@ class RayRenderer:
         result[:3, :3], result[:3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
         return result
 
+    def penetration(self, body: int) -> float:
+        """Return how deep a body is in others at most [m], as MuJoCo's collision detection finds it."""
+        mujoco.mj_collision(self.model, self.data)
+        depth = 0.0
+        for k in range(self.data.ncon):
+            contact = self.data.contact[k]
+            first, second = (int(self.model.geom_bodyid[g]) for g in contact.geom)
+            if body in (first, second) and first != second:
+                depth = max(depth, -float(contact.dist))
+        return depth
+
     def cast(self, camera: Pinhole, pixels: np.ndarray) -> Hits:
         """Return what the rays of pixels [px], shape (n, 2), meet."""
         rays = camera.rays(pixels) @ camera.pose[:3, :3].T

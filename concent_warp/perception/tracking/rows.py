@@ -22,10 +22,22 @@ MAD = 1.4826
 """Standard deviation over median absolute deviation of normal noise."""
 MAX_INFLATION = 30.0
 """Largest factor by which correlated residuals raise a variance."""
+DEFAULT_INFLATION = 2.0
+"""The same where there is too little to estimate it from."""
+NOISE_WINDOW = 100
+"""Rows and columns, at most, in which the noise of depth is looked at [px]."""
+CORRELATED = 4
+"""Distance from which on depth noise is independent [px]."""
 EDGE_SIDES = 8
 """Directions of an edge's normal in the image that have an error of their own."""
-BIASES = 1 + EDGE_SIDES
-"""Common errors of a frame: of inverse depth [1/m], and of the edges' places on each side [px]."""
+BIASES = 3 + EDGE_SIDES
+"""Common errors of a frame: of inverse depth [1/m], of its change across the image in either direction [1/m], and of
+the edges' places on each side [px]."""
+
+
+def bias_stds(cfg: AlignCfg) -> np.ndarray:
+    """Return the standard deviations of the common errors, shape (BIASES,)."""
+    return np.array([cfg.depth_bias_std, *[cfg.depth_tilt_std] * 2, *[cfg.edge_bias_std] * EDGE_SIDES])
 
 
 @dataclass
@@ -86,6 +98,10 @@ class Crop:
     """Rays scaled to a depth of 1, world frame, shape (h, w, 3)."""
     measured: np.ndarray
     """Measured depth [m], shape (h, w), 0 where there is none."""
+    centre: np.ndarray
+    """Middle of the body [m], world frame, shape (3,)."""
+    reach: float
+    """The body's reach [m]."""
 
 
 def rendered_crop(renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.ndarray, most: int) -> Crop | None:
@@ -98,7 +114,8 @@ def rendered_crop(renderer: RayRenderer, view: View, shape: TrackedShape, pose: 
         pose: Its pose, shape (4, 4).
         most: Largest number of the body's pixels, about.
     """
-    window = view.window(pose[:3, :3] @ shape.centre + pose[:3, 3], shape.reach)
+    centre = pose[:3, :3] @ shape.centre + pose[:3, 3]
+    window = view.window(centre, shape.reach)
     if window is None:
         return None
     area = (window[0].stop - window[0].start) * (window[1].stop - window[1].start)
@@ -118,11 +135,25 @@ def rendered_crop(renderer: RayRenderer, view: View, shape: TrackedShape, pose: 
         hits.normal.reshape(*size, 3),
         hits.rays.reshape(*size, 3),
         view.depth[np.ix_(rows, columns)].astype(float),
+        centre,
+        shape.reach,
     )
 
 
-def depth_rows(crop: Crop, view: View, pose: np.ndarray, gate: float, cfg: AlignCfg) -> tuple[Normal, float, int]:
-    """Return the normal equations of depth, its scatter [m] and the number of pixels used."""
+def depth_rows(
+    renderer: RayRenderer, crop: Crop, view: View, pose: np.ndarray, gate: float, cfg: AlignCfg, *, final: bool
+) -> tuple[Normal, float, int]:
+    """Return the normal equations of depth, its scatter [m] and the number of pixels used.
+
+    Args:
+        renderer: Scene in the state of this frame.
+        crop: What the camera should see.
+        view: What it sees.
+        pose: Of the body, shape (4, 4).
+        gate: Difference above which a pixel is left out [m].
+        cfg: Settings.
+        final: Whether the covariance counts, so that the correlation of the noise is estimated.
+    """
     import cv2
 
     inner = cv2.erode(crop.own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -139,33 +170,52 @@ def depth_rows(crop: Crop, view: View, pose: np.ndarray, gate: float, cfg: Align
     direction = -crop.normal[used] / slope[used][:, None]
     jacobian = point_jacobian(points, pose[:3, 3], direction)
     residual = difference[used]
-    scatter = max(MAD * float(np.median(np.abs(residual))), cfg.min_depth_std)
-    field = np.where(used & (np.abs(difference) < 4 * scatter), difference, np.nan)
-    inflation = _correlation_inflation(field)
+    inflation = 1.0
+    if final:
+        spread = max(MAD * float(np.median(np.abs(residual))), cfg.min_depth_std)
+        inflation = noise_inflation(renderer, view, crop, spread)
     normal, weight, scatter = weighted(jacobian, residual, cfg.min_depth_std, cfg, inflation)
     scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
     normal.bias[:, 0] = scaled.T @ depth**2
+    place = (points - crop.centre) @ view.camera.pose[:3, :2] / crop.reach
+    normal.bias[:, 1:3] = scaled.T @ (depth[:, None] ** 2 * place)
     return normal, scatter, count
 
 
-def _correlation_inflation(field: np.ndarray, reach: int = 3) -> float:
-    """Return the factor by which the correlation of residuals on a grid, NaN where unused, raises a mean's variance."""
-    known = np.isfinite(field)
-    value = np.where(known, field - np.nanmean(field), 0.0)
-    variance = (value**2).sum() / max(known.sum(), 1)
-    if variance <= 0:
-        return 1.0
-    total, height, width = 1.0, *field.shape
-    for down in range(reach + 1):
-        for across in range(-reach if down else 1, reach + 1):
-            if abs(across) >= width or down >= height:
+def noise_inflation(renderer: RayRenderer, view: View, crop: Crop, scatter: float) -> float:
+    """Return the factor by which the correlation of depth noise raises the variance of a mean over a crop's grid.
+
+    It is estimated in all pixels around the body that show what is rendered, because the body's alone are too few.
+
+    Args:
+        renderer: Scene in the state of this frame.
+        view: The frame.
+        crop: Surroundings of the body.
+        scatter: Scatter of depth [m].
+    """
+    stride = int(crop.rows[1] - crop.rows[0]) if len(crop.rows) > 1 else 1
+    rows = np.arange(crop.rows[0], crop.rows[-1] + 1)[:NOISE_WINDOW]
+    columns = np.arange(crop.columns[0], crop.columns[-1] + 1)[:NOISE_WINDOW]
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
+    expected = renderer.cast(view.camera, grid).depth.reshape(len(rows), len(columns))
+    measured = view.depth[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    difference = measured - np.where(np.isfinite(expected), expected, 0.0)
+    known = (measured > 0) & (np.abs(difference) < 4 * scatter)
+    if known.sum() < 100:
+        return DEFAULT_INFLATION
+    value = np.where(known, difference - difference[known].mean(), 0.0)
+    variance = (value**2).sum() / known.sum()
+    total, count = 1.0, max(1, CORRELATED // stride)
+    for down in range(count + 1):
+        for across in range(-count if down else 1, count + 1):
+            i, j = down * stride, across * stride
+            if i >= len(rows) or abs(j) >= len(columns):
                 continue
-            a = np.s_[: height - down, max(0, -across) : width - max(0, across)]
-            b = np.s_[down:, max(0, across) : width + min(0, across)]
-            both = known[a] & known[b]
-            if both.sum() > 20:
-                share = both.sum() / known.sum()
-                total += 2 * share * (value[a] * value[b]).sum() / both.sum() / variance
+            first = np.s_[: len(rows) - i, max(0, -j) : len(columns) - max(0, j)]
+            second = np.s_[i:, max(0, j) : len(columns) + min(0, j)]
+            pairs = (known[first] & known[second]).sum()
+            if pairs > 50:
+                total += 2 * (value[first] * value[second]).sum() / pairs / variance
     return float(np.clip(total, 1.0, MAX_INFLATION))
 
 
@@ -209,13 +259,15 @@ def edge_rows(
     limit = np.array(view.shape[::-1]) - 1 - reach
     good = ((pixels >= reach) & (pixels <= limit)).all(axis=1) & (depth > 0) & (length > 1e-6)
     beyond = pixels + np.where(contour[use], 1.0, 0.0)[:, None] * (reach + 1) * across
-    hits = renderer.cast(view.camera, np.concatenate([pixels - 0.7 * across * contour[use, None], beyond]))
-    here, there = hits.depth[: len(use)], hits.depth[len(use) :]
+    within = pixels - (reach + 1) * across
+    hits = renderer.cast(view.camera, np.concatenate([pixels - 0.7 * across * contour[use, None], beyond, within]))
+    here, there, inside = hits.depth.reshape(3, -1)
     slack = 0.03 * shape.reach
-    body = hits.body[len(use) :]
+    body, other = hits.body.reshape(3, -1)[1:]
     good &= here > depth - slack
     # Beside a contour that something known covers, the edge found would be that of the cover.
     good &= ~(contour[use] & (there < depth - slack) & (body != shape.row))
+    good &= ~((inside < depth - slack) & (other != shape.row))
     return _matched_edges(
         view, pose, points[use], pixels, across, projection, contour[use], good, edges.edge[use], reach, cfg
     )
@@ -265,8 +317,16 @@ def _matched_edges(
     scaled = jacobian * (weight / (scatter**2 * inflation))[:, None]
     angle = np.arctan2(across[strong, 1], across[strong, 0])
     side = np.floor((angle / np.pi + 1) / 2 * EDGE_SIDES).astype(int) % EDGE_SIDES
+    weight = weight / (scatter**2 * inflation)
     for k in range(EDGE_SIDES):
-        normal.bias[:, 1 + k] = scaled[side == k].sum(axis=0)
+        # What a side has in common in this frame alone (light, aliasing) is an unknown that is eliminated; what it
+        # has in common in all frames is left to the covariance.
+        mine = side == k
+        shared, least = scaled[mine].sum(axis=0), 1 / max(cfg.edge_bias_std, 1e-6) ** 2
+        total = weight[mine].sum() + least
+        normal.information -= np.outer(shared, shared) / total
+        normal.gradient -= shared * (weight[mine] @ residual[mine]) / total
+        normal.bias[:, 3 + k] = shared * least / total
     return EdgeResult(normal, scatter, found, searched)
 
 

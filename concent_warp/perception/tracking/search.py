@@ -77,21 +77,26 @@ def find_pose(
     results: list[tuple[float, Fit, Agreement]] = []
     for _, pose, cluster in starts[: cfg.search.kept]:
         fit = refine(renderer, [view], shape, pose, cfg.align, rough=True, iterations=10)
-        if fit is None:
+        if fit is None or fit.position_std() > cfg.accept.max_translation_std:
             continue
         agreed = agreement(renderer, [view], shape, fit.pose, fit.depth_std, cfg.accept)
         results.append((_score(agreed, fit, shape, cluster, cfg), fit, agreed))
     renderer.place(shape.row, None)
     if not results:
-        return Found(None, 0.0, "no start led to a pose within the image")
+        return Found(None, 0.0, "no start led to a pose that the image determines")
     results.sort(key=lambda r: -r[0])
-    score, best, agreed = results[0]
-    if not agreed.accepted(cfg.accept):
+    if not any(a.accepted(cfg.accept) for _, _, a in results):
+        score, _, agreed = results[0]
         return Found(None, score, f"the best pose does not agree with the image: {agreed.text()}")
-    for other_score, other, other_agreed in results[1:]:
+    results = [r for r in results if r[2].accepted(cfg.accept)]
+    score, best, _ = results[0]
+    settled = refine(renderer, [view], shape, best.pose, cfg.align, iterations=cfg.align.first_iterations)
+    renderer.place(shape.row, None)
+    best = settled or best
+    for other_score, other, _ in results[1:]:
         if _same(best.pose, other.pose, symmetry, cfg.search):
             continue
-        if other_agreed.accepted(cfg.accept) and score - other_score < cfg.search.min_margin:
+        if score - other_score < cfg.search.min_margin:
             near = np.linalg.norm(_middle(other.pose, shape) - _middle(best.pose, shape))
             turn = np.degrees(rotation_angle(other.pose, symmetry.nearest(best.pose, other.pose)))
             reason = (
@@ -175,4 +180,5 @@ def _score(agreed: Agreement, fit: Fit, shape: TrackedShape, cluster: Cluster, c
     )
     edge = fit.edge_share if np.isfinite(fit.edge_share) else 0.0
     fair = max(agreed.share - agreed.behind, 0.0) * (1 - agreed.unexplained)
-    return fair * (0.6 * explained + 0.4 * edge)
+    smooth = 1 / (1 + (agreed.misfit / cfg.accept.max_misfit) ** 2)
+    return fair * (0.6 * explained + 0.4 * edge) * smooth * min(agreed.visible, 1.0)

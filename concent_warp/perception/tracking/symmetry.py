@@ -34,6 +34,8 @@ class Symmetry:
     """Class in words."""
     axis: np.ndarray | None = None
     """Axis about which the shape is round, shape (3,), where there is one."""
+    sphere: bool = False
+    """Whether the shape is round about every axis."""
 
     def equivalents(self, pose: np.ndarray) -> np.ndarray:
         """Return all poses that look like a pose, shape (k, 4, 4)."""
@@ -45,6 +47,10 @@ class Symmetry:
 
     def nearest(self, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return that pose of those which look like `pose` whose orientation is nearest to the target's."""
+        if self.sphere:
+            result = target.copy()
+            result[:3, 3] = pose[:3, 3] + (pose[:3, :3] - target[:3, :3]) @ self.centre
+            return result
         others = self.equivalents(pose)
         cosine = np.einsum("kij,ij->k", others[:, :3, :3], target[:3, :3])
         best = others[int(np.argmax(cosine))]
@@ -81,7 +87,9 @@ def symmetry_of(shape: TrackedShape, tolerance: float) -> Symmetry:
                 turns += [Rotation.from_rotvec(2 * np.pi * k / order * axis).as_matrix() for k in range(1, order)]
     if len(round_axes) >= 2:
         every = Rotation.random(MAX_TURNS, rng=np.random.default_rng(0)).as_matrix()
-        return Symmetry(np.concatenate([np.eye(3)[None], every]), centre, "sphere: no rotation can be observed")
+        return Symmetry(
+            np.concatenate([np.eye(3)[None], every]), centre, "sphere: no rotation can be observed", None, True
+        )
     if round_axes:
         (axis,) = round_axes
         about = [Rotation.from_rotvec(2 * np.pi * k / ROUND_STEPS * axis).as_matrix() for k in range(ROUND_STEPS)]
