@@ -20,13 +20,13 @@ from scipy.stats import chi2
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_page
 from concent_warp.errors import RecordingError
+from concent_warp.perception.tracking.alignment.search import find_pose
 from concent_warp.perception.tracking.cfg import TrackCfg
-from concent_warp.perception.tracking.pose import moved, twist_between
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.pose import moved, twist_between
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import symmetry_of
 from concent_warp.perception.tracking.result import BodyTrack
-from concent_warp.perception.tracking.search import find_pose
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.symmetry import symmetry_of
 from concent_warp.perception.tracking.track import track
 from concent_warp.perception.tracking.video import Video
 from concent_warp.reality.record import RealityCfg, record

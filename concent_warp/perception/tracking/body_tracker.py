@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from concent_warp.perception.tracking.align import FREE, Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.align import FREE, Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.registration import relocated
+from concent_warp.perception.tracking.alignment.rows import bias_stds, rendered_crop
+from concent_warp.perception.tracking.alignment.search import find_pose
+from concent_warp.perception.tracking.alignment.texture import Keyframe, TextureMap
 from concent_warp.perception.tracking.cfg import TrackCfg
-from concent_warp.perception.tracking.pose import moved, rotation_angle, twist_between
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.registration import relocated
-from concent_warp.perception.tracking.rows import bias_stds, rendered_crop
-from concent_warp.perception.tracking.search import find_pose
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.symmetry import Symmetry
-from concent_warp.perception.tracking.texture import Keyframe, TextureMap
-from concent_warp.perception.tracking.view import View
+from concent_warp.perception.tracking.geometry.pose import moved, rotation_angle, twist_between
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry
+from concent_warp.perception.tracking.geometry.view import View
 
 NEARBY = np.diag([1 / 0.015**2] * 3 + [1 / 0.25**2] * 3)
 """Information of a prediction from the frame before [1/m^2, 1/rad^2]: 15 mm and 0.25 rad."""
@@ -25,35 +24,30 @@ MAX_TRIES = 3
 """Renewed attempts at the last pose, in a row, before only searches may find a lost body again."""
 
 
-@dataclass
 class BodyTracker:
     """State of the tracking of one body."""
 
-    shape: TrackedShape
-    symmetry: Symmetry
-    cfg: TrackCfg
-    pose: np.ndarray | None = None
-    """Last pose, shape (4, 4)."""
-    tracked: bool = False
-    """Whether it was seen in the last moment."""
-    speed: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """Twist a second, shape (6,)."""
-    time: float = 0.0
-    """Time of the last pose [s]."""
-    searched: float = -np.inf
-    """Time of the last search [s]."""
-    reason: str = ""
-    """Why it was not found last."""
-    misses: int = 0
-    """Moments since it was seen."""
-    fits: list[Fit | None] = field(default_factory=list)
-    """One for each moment."""
-    textures: TextureMap = field(init=False)
-    """Keyframes."""
-
-    def __post_init__(self) -> None:
-        """Create an empty map of texture."""
-        self.textures = TextureMap(self.cfg.texture)
+    def __init__(self, shape: TrackedShape, symmetry: Symmetry, cfg: TrackCfg) -> None:
+        """Create a tracker of a body that is not found yet."""
+        self.shape, self.symmetry, self.cfg = shape, symmetry, cfg
+        self.pose: np.ndarray | None = None
+        """Last pose, shape (4, 4)."""
+        self.tracked = False
+        """Whether it was seen in the last moment."""
+        self.speed = np.zeros(6)
+        """Twist a second, shape (6,)."""
+        self.time = 0.0
+        """Time of the last pose [s]."""
+        self.searched = -np.inf
+        """Time of the last search [s]."""
+        self.reason = ""
+        """Why it was not found last."""
+        self.misses = 0
+        """Moments since it was seen."""
+        self.fits: list[Fit | None] = []
+        """One for each moment."""
+        self.textures = TextureMap(cfg.texture)
+        """Keyframes."""
 
     def begin(self, renderer: RayRenderer, time: float, views: Sequence[View], pose: np.ndarray) -> Agreement:
         """Take up a given first pose if the first moment agrees with it after a small correction; return the

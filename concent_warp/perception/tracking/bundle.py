@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from concent_warp.perception.tracking.align import Fit
+from concent_warp.perception.tracking.alignment.align import Fit
+from concent_warp.perception.tracking.alignment.rows import BIASES, bias_stds
 from concent_warp.perception.tracking.cfg import AlignCfg
-from concent_warp.perception.tracking.rows import BIASES, bias_stds
 from concent_warp.perception.tracking.smooth import PoseMeasurement
 
 LOOSE = np.diag([1 / 0.01**2] * 3 + [1 / 0.2**2] * 3)

@@ -99,6 +99,8 @@ class TextureCfg:
     """Least normalised correlation of a patch with the keyframe's [-]."""
     max_shift: Positive = 4.0
     """Largest shift of a point from its prediction [px]."""
+    search_range: Positive = 12.0
+    """Largest shift of all points together from their prediction [px]."""
     max_angle: Angle = 25.0
     """Turn of the object, as the camera sees it, from which on another keyframe is taken [deg]."""
     max_keyframes: Count = 40

@@ -10,13 +10,16 @@ from concent_warp.errors import RecordingError
 from concent_warp.perception.tracking.body_tracker import BodyTracker
 from concent_warp.perception.tracking.bundle import bundled
 from concent_warp.perception.tracking.cfg import TrackCfg
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import symmetry_of
 from concent_warp.perception.tracking.result import BodyTrack
-from concent_warp.perception.tracking.shape import TrackedShape
 from concent_warp.perception.tracking.smooth import smooth
-from concent_warp.perception.tracking.symmetry import symmetry_of
 from concent_warp.perception.tracking.video import Video
 from concent_warp.scene.scene import Scene
+
+FIX = 'check the pose and the camera, or search the object with --pose none (pose="none")'
+"""What to do about a wrong first pose."""
 
 
 def track_bodies(
@@ -61,6 +64,8 @@ def track_bodies(
                 if tracker.tracked:
                     continue
             tracker.advance(renderer, float(time), views, rng)
+            if moment == 0 and given is not None and tracker.tracked:
+                _check_correction(tracker, given, where)
         if progress is not None:
             progress(0.9 * (moment + 1) / count)
     for tracker in trackers:
@@ -82,7 +87,6 @@ def _begin(
     """Start at a given pose; where known bodies hide the object there, leave it to the search."""
     agreed = tracker.begin(renderer, time, views, given)
     body = tracker.shape.name
-    fix = 'check the pose and the camera, or search the object with --pose none (pose="none")'
     if not tracker.tracked:
         hidden = agreed.visible < tracker.cfg.accept.min_visible
         if hidden:
@@ -93,9 +97,14 @@ def _begin(
             where=f"{where}, first frame",
             expected=f"at least {tracker.cfg.accept.min_agreement:.0%} of its pixels at the depth of its surface",
             found=agreed.text(),
-            fix=fix,
+            fix=FIX,
         )
-    cfg = tracker.cfg
+    _check_correction(tracker, given, where)
+
+
+def _check_correction(tracker: BodyTracker, given: np.ndarray, where: str) -> None:
+    """Raise an error where the image shows the object far from its given first pose, shape (4, 4)."""
+    cfg, body = tracker.cfg, tracker.shape.name
     shift, turn = tracker.correction(given)
     if shift > cfg.max_first_translation or np.degrees(turn) > cfg.max_first_rotation:
         raise RecordingError(
@@ -103,7 +112,7 @@ def _begin(
             where=f"{where}, first frame",
             expected=f"within {1e3 * cfg.max_first_translation:g} mm and {cfg.max_first_rotation:g} degrees",
             found=f"{1e3 * shift:.1f} mm and {np.degrees(turn):.1f} degrees",
-            fix=fix,
+            fix=FIX,
         )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from concent_warp.documents import is_number, read_json, read_toml
 from concent_warp.errors import RecordingError
-from concent_warp.perception.tracking.pose import pose_of
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.pose import pose_of
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.recording.recording import Demonstration
 from concent_warp.scene.scene import Scene
 

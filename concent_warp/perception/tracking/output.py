@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from concent_warp.perception.tracking.pose import quaternion_of
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.pose import quaternion_of
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.result import BodyTrack
-from concent_warp.perception.tracking.shape import TrackedShape
 from concent_warp.perception.tracking.video import Video
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack
 from concent_warp.scene.scene import Scene

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from concent_warp.perception.tracking.cfg import SmoothCfg
-from concent_warp.perception.tracking.pose import moved, twist_between
+from concent_warp.perception.tracking.geometry.pose import moved, twist_between
 
 START_SPEED = 0.5
 """Standard deviation of the speed before the first measurement [m/s], of rotations over the radius."""
@@ -52,7 +52,7 @@ def smooth(
     return _backward(run)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Run:
     """Results of the forward pass."""
 

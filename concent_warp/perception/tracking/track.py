@@ -14,9 +14,9 @@ from concent_warp.errors import RecordingError, SceneError
 from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.first_pose import first_poses
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.output import with_pose_sensors, written
 from concent_warp.perception.tracking.result import Tracked
-from concent_warp.perception.tracking.shape import TrackedShape
 from concent_warp.perception.tracking.video import Video
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording

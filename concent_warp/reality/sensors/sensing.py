@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.checks import Bounds, OpenAngle, Pixels, PositiveDuration, Rate, Share, Signed
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.visible_region import cast_rays
+from concent_warp.perception.rays import cast_rays
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from concent_warp.perception.tracking.alignment.rows import MAD, Crop, Normal, depth_rows, edge_rows, rendered_crop
+from concent_warp.perception.tracking.alignment.texture import Keyframe, common_shift, texture_rows
 from concent_warp.perception.tracking.cfg import AcceptCfg, AlignCfg, TextureCfg
-from concent_warp.perception.tracking.pose import moved, twist_between
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.rows import MAD, Crop, Normal, depth_rows, edge_rows, rendered_crop
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.texture import Keyframe, texture_rows
-from concent_warp.perception.tracking.view import View
+from concent_warp.perception.tracking.geometry.pose import moved, twist_between
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.view import View
 
 FREE = np.diag([1 / 0.1**2] * 3 + [1 / 1.0**2] * 3)
 """Information on a pose of which nothing is known [1/m^2, 1/rad^2]: 0.1 m and 1 rad, so that equations can be
@@ -22,7 +22,7 @@ SQUARE = 7
 """Edge of the squares over which differences of depth are averaged [px]."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Fit:
     """A pose and what one moment's frames say about it, linearised there."""
 
@@ -113,6 +113,14 @@ def refine(
     """
     start, prior = pose, FREE if prior is None else prior
     count = iterations or (cfg.first_iterations if rough else cfg.iterations)
+    if texture is not None and count > 1:
+        renderer.place(shape.row, pose)
+        for view, chosen in zip(views, keyframes, strict=False):
+            if chosen is not None:
+                pose = pose.copy()
+                pose[:3, 3] += common_shift(renderer, view, shape, pose, chosen[1], texture)
+                start = pose
+                break
     fit = None
     for k in range(count):
         share = 1 - k / max(count - 2, 1) if rough else 0.0

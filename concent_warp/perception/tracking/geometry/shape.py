@@ -8,7 +8,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from concent_warp.perception.tracking.ray_renderer import VISUAL_GROUPS
+from concent_warp.perception.tracking.geometry.ray_renderer import VISUAL_GROUPS
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shapes.surface import Surface
 

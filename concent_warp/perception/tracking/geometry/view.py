@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from concent_warp.perception.optical_flow import grayscale
 from concent_warp.perception.pinhole import Pinhole
 
 NOISE_KERNEL = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
@@ -28,7 +27,9 @@ class View:
     @cached_property
     def grey(self) -> np.ndarray:
         """Brightness, float32, shape (H, W)."""
-        return grayscale(self.rgb).astype(np.float32)
+        import cv2
+
+        return cv2.cvtColor(np.ascontiguousarray(self.rgb), cv2.COLOR_RGB2GRAY).astype(np.float32)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -12,13 +12,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from concent_warp.perception.tracking.alignment.rows import Crop, Normal, point_jacobian, weighted
 from concent_warp.perception.tracking.cfg import AlignCfg, TextureCfg
-from concent_warp.perception.tracking.pose import rotation_angle
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.rows import Crop, Normal, point_jacobian, weighted
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.view import View, sampled
+from concent_warp.perception.tracking.geometry.pose import rotation_angle
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.view import View, sampled
 
+SHIFTED_PATCHES = 12
+"""Patches that a common shift is searched with."""
+SHIFT_STEP = 2.0
+"""Distance of the shifts that are tried [px]: a patch correlates over two pixels or so."""
+SHIFT_GAIN = 0.2
+"""Advantage in median correlation of a shift over none at which it is taken [-]."""
 LOOKED_AT = 0.35
 """Least cosine between normal and line of sight of a texture point [-]."""
 
@@ -45,7 +51,7 @@ class Keyframe:
     """Pose at the keyframe, shape (4, 4)."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class TextureMap:
     """Keyframes of one body."""
 
@@ -215,3 +221,39 @@ def _shifts(image: np.ndarray, places: np.ndarray, patches: np.ndarray, most: fl
         shift = np.clip(shift + np.clip(step, -1.5, 1.5), -most, most)
         brightness = sampled(image, places + shift[:, None])
     return shift, (_standardised(brightness.astype(float)) * patches).sum(axis=1)
+
+
+def common_shift(
+    renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.ndarray, keyframe: Keyframe, cfg: TextureCfg
+) -> np.ndarray:
+    """Return the translation [m], parallel to the image, shape (3,), at which a keyframe's patches match together.
+
+    All shifts up to `cfg.search_range` are tried on some of the visible patches; zero where none is better than none by
+    much, so that a good prediction stays.
+    """
+    points = keyframe.points @ pose[:3, :3].T + pose[:3, 3]
+    pixels, depth, _ = view.pixel_rows(points)
+    sight = points - view.camera.position
+    facing = -np.einsum("nk,nk->n", keyframe.normals @ pose[:3, :3].T, sight) > LOOKED_AT * np.linalg.norm(
+        sight, axis=1
+    )
+    seen = facing & (renderer.cast(view.camera, pixels).body == shape.row)
+    rows = np.flatnonzero(seen)[:: max(1, int(seen.sum()) // SHIFTED_PATCHES)]
+    if len(rows) < 4:
+        return np.zeros(3)
+    edge = 2 * cfg.half_patch + 1
+    some = np.arange(edge**2).reshape(edge, edge)[::2, ::2].ravel()
+    grid = keyframe.grid[rows][:, some] @ pose[:3, :3].T + pose[:3, 3]
+    places = view.pixel_rows(grid.reshape(-1, 3))[0].reshape(*grid.shape[:2], 2)
+    patches = _standardised(keyframe.patches[rows][:, some])
+    step = np.arange(-cfg.search_range, cfg.search_range + 1e-6, SHIFT_STEP)
+    shifts = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    brightness = sampled(view.grey, places[None] + shifts[:, None, None]).astype(float)
+    brightness -= brightness.mean(axis=2, keepdims=True)
+    norm = np.maximum(np.linalg.norm(brightness, axis=2), 1e-6)
+    score = np.median((brightness * patches).sum(axis=2) / norm, axis=1)
+    best = int(score.argmax())
+    if score[best] < np.median(score) + SHIFT_GAIN or score[best] < score[len(score) // 2] + SHIFT_GAIN:
+        return np.zeros(3)
+    inverse = np.linalg.inv(view.camera.intrinsics)[:, :2] @ shifts[best]
+    return float(np.median(depth[rows])) * (view.camera.pose[:3, :3] @ inverse)

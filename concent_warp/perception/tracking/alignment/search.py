@@ -14,14 +14,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from concent_warp.perception.pinhole import pixel_grid
-from concent_warp.perception.tracking.align import Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.align import Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.registration import closest_points
 from concent_warp.perception.tracking.cfg import SearchCfg, TrackCfg
-from concent_warp.perception.tracking.pose import rotation_angle
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.registration import closest_points
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.symmetry import Symmetry
-from concent_warp.perception.tracking.view import View
+from concent_warp.perception.tracking.geometry.pose import rotation_angle
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry
+from concent_warp.perception.tracking.geometry.view import View
 
 
 @dataclass(frozen=True)

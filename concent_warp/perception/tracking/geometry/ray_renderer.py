@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.tracking.pose import pose_of, quaternion_of
+from concent_warp.perception.tracking.geometry.pose import pose_of, quaternion_of
 
 FAR = 1e3
 """Where a body is put that is not to be seen [m below the origin]."""

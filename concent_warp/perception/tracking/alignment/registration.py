@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.perception.pinhole import pixel_grid
 from concent_warp.perception.tracking.cfg import SearchCfg
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.view import View
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.view import View
 
 WIDTHS = (0.01, 0.003)
 """Distances at which a point has half its weight, in the first and in the last iterations [m]."""

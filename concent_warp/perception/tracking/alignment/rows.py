@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from concent_warp.perception.tracking.cfg import AlignCfg
-from concent_warp.perception.tracking.ray_renderer import RayRenderer
-from concent_warp.perception.tracking.shape import TrackedShape
-from concent_warp.perception.tracking.view import View
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.view import View
 
 MAD = 1.4826
 """Standard deviation over median absolute deviation of normal noise."""
@@ -28,6 +28,8 @@ NOISE_WINDOW = 100
 """Rows and columns, at most, in which the noise of depth is looked at [px]."""
 CORRELATED = 4
 """Distance from which on depth noise is independent [px]."""
+PROFILE = (-1.0, -0.6, -0.3, 0.3, 0.6, 1.0)
+"""Places along the line of search, over its half length, where what is rendered is looked up [-]."""
 EDGE_SIDES = 8
 """Directions of an edge's normal in the image that have an error of their own."""
 BIASES = 3 + EDGE_SIDES
@@ -40,7 +42,7 @@ def bias_stds(cfg: AlignCfg) -> np.ndarray:
     return np.array([cfg.depth_bias_std, *[cfg.depth_tilt_std] * 2, *[cfg.edge_bias_std] * EDGE_SIDES])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Normal:
     """Normal equations of a pose: ``information @ twist = gradient``."""
 
@@ -258,16 +260,18 @@ def edge_rows(
     across *= np.where(sign > 0, -1.0, 1.0)[:, None]
     limit = np.array(view.shape[::-1]) - 1 - reach
     good = ((pixels >= reach) & (pixels <= limit)).all(axis=1) & (depth > 0) & (length > 1e-6)
-    beyond = pixels + np.where(contour[use], 1.0, 0.0)[:, None] * (reach + 1) * across
-    within = pixels - (reach + 1) * across
-    hits = renderer.cast(view.camera, np.concatenate([pixels - 0.7 * across * contour[use, None], beyond, within]))
-    here, there, inside = hits.depth.reshape(3, -1)
     slack = 0.03 * shape.reach
-    body, other = hits.body.reshape(3, -1)[1:]
-    good &= here > depth - slack
-    # Beside a contour that something known covers, the edge found would be that of the cover.
-    good &= ~(contour[use] & (there < depth - slack) & (body != shape.row))
-    good &= ~((inside < depth - slack) & (other != shape.row))
+    steps = np.array(PROFILE) * (reach + 1)
+    places = np.concatenate([pixels - 0.7 * across * contour[use, None], *(pixels + step * across for step in steps)])
+    hits = renderer.cast(view.camera, places)
+    good &= hits.depth[: len(use)] > depth - slack
+    label = hits.body[len(use) :].reshape(len(steps), -1)
+    # Other edges that are known to cross the line of search would be taken for this one: those of what covers the body
+    # or stands behind it, and the contour beside a crease.
+    inside, outside = label[steps < 0], label[steps > 0]
+    background = np.where(contour[use], outside[-1], shape.row)
+    good &= ((outside == background) | ((outside == shape.row) & contour[use])).all(axis=0)
+    good &= ((inside == shape.row) | (inside == background)).all(axis=0)
     return _matched_edges(
         view, pose, points[use], pixels, across, projection, contour[use], good, edges.edge[use], reach, cfg
     )
@@ -324,8 +328,8 @@ def _matched_edges(
         mine = side == k
         shared, least = scaled[mine].sum(axis=0), 1 / max(cfg.edge_bias_std, 1e-6) ** 2
         total = weight[mine].sum() + least
-        normal.information -= np.outer(shared, shared) / total
-        normal.gradient -= shared * (weight[mine] @ residual[mine]) / total
+        normal.information[:] -= np.outer(shared, shared) / total
+        normal.gradient[:] -= shared * (weight[mine] @ residual[mine]) / total
         normal.bias[:, 3 + k] = shared * least / total
     return EdgeResult(normal, scatter, found, searched)
 

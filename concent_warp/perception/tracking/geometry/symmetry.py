@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from concent_warp.perception.tracking.pose import rotation_angle
-from concent_warp.perception.tracking.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.pose import rotation_angle
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
 
 ORDERS = (2, 3, 4, 5, 6, 8)
 """Parts of a turn that are tried about each axis."""
@@ -76,29 +76,39 @@ def symmetry_of(shape: TrackedShape, tolerance: float) -> Symmetry:
     slack = tolerance * shape.reach
     # The mean of sampled points is not exact; axes of symmetry pass through the middle of the support along each.
     centre = _middle(shape)
-    turns, round_axes = [np.eye(3)], []
+    about = [axis for axis in axes if _unchanged(shape, centre, _turn(ANY_ANGLE * axis), slack)]
+    if about:
+        return _round(shape, centre, about, slack)
+    turns = [np.eye(3)]
     for axis in axes:
-        if _unchanged(shape, centre, Rotation.from_rotvec(ANY_ANGLE * axis).as_matrix(), slack):
-            round_axes.append(axis)
-            continue
         for order in ORDERS:
-            turn = Rotation.from_rotvec(2 * np.pi / order * axis).as_matrix()
-            if _unchanged(shape, centre, turn, slack):
-                turns += [Rotation.from_rotvec(2 * np.pi * k / order * axis).as_matrix() for k in range(1, order)]
-    if len(round_axes) >= 2:
-        every = Rotation.random(MAX_TURNS, rng=np.random.default_rng(0)).as_matrix()
-        return Symmetry(
-            np.concatenate([np.eye(3)[None], every]), centre, "sphere: no rotation can be observed", None, True
-        )
-    if round_axes:
-        (axis,) = round_axes
-        about = [Rotation.from_rotvec(2 * np.pi * k / ROUND_STEPS * axis).as_matrix() for k in range(ROUND_STEPS)]
-        flips = _group([np.eye(3), *turns])[:2] if len(turns) > 1 else [np.eye(3)]
-        name = f"round about {_axis_text(axis)}" + (", and may be turned over" if len(flips) > 1 else "")
-        return Symmetry(np.array([f @ a for f in flips for a in about]), centre, name, axis)
+            if _unchanged(shape, centre, _turn(2 * np.pi / order * axis), slack):
+                turns += [_turn(2 * np.pi * k / order * axis) for k in range(1, order)]
     group = _group(turns)
     names = {1: "none", 2: "half a turn", 4: "4 rotations", 24: "cube: 24 rotations"}
     return Symmetry(np.array(group), centre, names.get(len(group), f"{len(group)} rotations"))
+
+
+def _round(shape: TrackedShape, centre: np.ndarray, about: list[np.ndarray], slack: float) -> Symmetry:
+    """Return the symmetry of a shape that is round about some axes, each of shape (3,)."""
+    if len(about) > 1:
+        every = Rotation.random(MAX_TURNS, rng=np.random.default_rng(0)).as_matrix()
+        turns = np.concatenate([np.eye(3)[None], every])
+        return Symmetry(turns, centre, "sphere: no rotation can be observed", None, True)
+    axis = about[0]
+    across = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    over = _turn(np.pi * across / np.linalg.norm(across))
+    turns = [_turn(2 * np.pi * k / ROUND_STEPS * axis) for k in range(ROUND_STEPS)]
+    name = f"round about {_axis_text(axis)}"
+    if _unchanged(shape, centre, over, slack):
+        turns += [over @ turn for turn in turns]
+        name += ", and may be turned over"
+    return Symmetry(np.array(turns), centre, name, axis)
+
+
+def _turn(vector: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix of a rotation vector [rad]."""
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def _axis_text(axis: np.ndarray) -> str:
