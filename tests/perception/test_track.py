@@ -45,7 +45,7 @@ def test_an_untextured_block_is_tracked_by_depth_and_edges(plain):
     found = cw.track(plain.recording, pose={"block": plain.poses[0]}).track("block")
     position, rotation = errors(found, plain.poses)
     assert not found.textured
-    assert "open: there is no texture" in found.sentence()
+    assert "open: no texture was found" in found.sentence()
     assert "cube" in found.symmetry
     assert position.mean() < 0.6e-3
     assert rotation.mean() < 1.5

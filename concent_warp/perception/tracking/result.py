@@ -11,7 +11,17 @@ from concent_warp.recording.recording import Recording
 
 @dataclass(frozen=True)
 class BodyTrack:
-    """Poses of one body in one demonstration."""
+    """Poses of one body in one demonstration.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> import numpy as np
+        >>> found, lost = np.eye(4), np.full((4, 4), np.nan)
+        >>> poses, covariances = np.array([found, lost]), np.tile(1e-6 * np.eye(6), (2, 1, 1))
+        >>> track = cw.BodyTrack("demo_0", "block", np.array([0.0, 0.1]), poses, covariances, "none", True)
+        >>> track.lost
+        array([False,  True])
+    """
 
     demonstration: str
     body: str
@@ -43,7 +53,7 @@ class BodyTrack:
         text = f"{self.demonstration}, {self.body}: in {kept.sum()} of {len(kept)} frames"
         text += f", std {position:.2f} mm and {rotation:.2f} degrees"
         if self.symmetry != "none":
-            open_to = "fixed by the texture from the first frame on" if self.textured else "open: there is no texture"
+            open_to = "fixed by the texture from the first frame on" if self.textured else "open: no texture was found"
             text += f"; symmetry of the shape ({self.symmetry}) {open_to}"
         return text
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,13 +30,13 @@ class Fit:
     """Shape (4, 4)."""
     geometry: Normal
     """Depth and edges."""
-    texture: list[tuple[int, Normal]] = field(default_factory=list)
+    texture: list[tuple[int, Normal]]
     """Texture points, each with the number of its keyframe."""
-    depth_std: float = np.nan
+    depth_std: float
     """Scatter of depth [m]."""
-    edge_share: float = np.nan
+    edge_share: float
     """Share of the contour at which the image has an edge."""
-    texture_correlation: float = np.nan
+    texture_correlation: float
     """Mean correlation of the keyframe's patches."""
 
     def position_std(self) -> float:
