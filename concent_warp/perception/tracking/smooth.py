@@ -8,6 +8,7 @@ each stretch of the motion: objects rest for most of the time and are jerked in 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ class PoseMeasurement:
 
 
 def smooth(
-    time: np.ndarray, measurements: list[PoseMeasurement | None], radius: float, cfg: SmoothCfg
+    time: np.ndarray, measurements: Sequence[PoseMeasurement | None], radius: float, cfg: SmoothCfg
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return poses, shape (T, 4, 4), and covariances of their twists, shape (T, 6, 6).
 
@@ -67,7 +68,7 @@ class _Run:
 
 
 def _filtered(
-    time: np.ndarray, measurements: list[PoseMeasurement | None], radius: float, acceleration: np.ndarray
+    time: np.ndarray, measurements: Sequence[PoseMeasurement | None], radius: float, acceleration: np.ndarray
 ) -> _Run:
     """Return the forward pass with a standard deviation of the acceleration for each moment [m/s^2], shape (T,)."""
     first = next(m for m in measurements if m is not None)

@@ -36,9 +36,11 @@ def check_covariance(covariance: np.ndarray, value: np.ndarray, dimension: int, 
     filled = np.where(known[:, None, None], matrix, 0.0)
     slack = ROUNDING * np.abs(filled).max(axis=(1, 2), initial=0.0)
     skew = np.abs(filled - np.swapaxes(filled, 1, 2)).max(axis=(1, 2), initial=0.0)
-    _refuse(skew > slack, place, "a covariance is not symmetric", "a symmetric matrix", matrix)
+    _refuse(np.asarray(skew > slack), place, "a covariance is not symmetric", "a symmetric matrix", matrix)
     least = np.linalg.eigvalsh(filled)[:, 0]
-    _refuse(least < -slack, place, "a covariance has a negative variance", "variances of at least 0", matrix)
+    _refuse(
+        np.asarray(least < -slack), place, "a covariance has a negative variance", "variances of at least 0", matrix
+    )
 
 
 def _refuse(bad: np.ndarray, place: ErrorLocation, what: str, expected: str, matrix: np.ndarray) -> None:
