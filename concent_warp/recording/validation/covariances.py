@@ -29,10 +29,11 @@ def check_covariance(covariance: np.ndarray, value: np.ndarray, dimension: int, 
         raise place.error("wrong shape of covariance", expected=shape, found=f"{matrix.shape} {matrix.dtype}", fix=fix)
     given = np.asarray(np.isfinite(np.asarray(value, float)).all(axis=1))
     known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
-    _refuse(given & ~known, place, "a covariance is missing", "finite numbers where there is a value", matrix)
+    huge = np.asarray((np.abs(matrix) > MAX_MAGNITUDE).any(axis=(1, 2)))
     _refuse(
-        (np.abs(matrix) > MAX_MAGNITUDE).any(axis=(1, 2)), place, "a covariance is absurdly large", "SI units", matrix
+        np.asarray(given & ~known), place, "a covariance is missing", "finite numbers where there is a value", matrix
     )
+    _refuse(huge, place, "a covariance is absurdly large", "SI units", matrix)
     filled = np.where(known[:, None, None], matrix, 0.0)
     slack = ROUNDING * np.abs(filled).max(axis=(1, 2), initial=0.0)
     skew = np.abs(filled - np.swapaxes(filled, 1, 2)).max(axis=(1, 2), initial=0.0)
