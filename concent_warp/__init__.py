@@ -48,6 +48,9 @@ _HOMES = {
     "perception.calibration.calibrate": ("calibrate",),
     "perception.calibration.cfg": ("CalibrateCfg", "CalibrationTargetCfg"),
     "perception.calibration.result": ("Calibration", "CameraCalibration"),
+    "perception.tracking.cfg": ("TrackCfg",),
+    "perception.tracking.result": ("BodyTrack", "Tracked"),
+    "perception.tracking.track": ("track",),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
     "recording.logs.cfg": ("ImportCfg",),
@@ -110,6 +113,9 @@ if TYPE_CHECKING:
     from concent_warp.perception.calibration.calibrate import calibrate
     from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
     from concent_warp.perception.calibration.result import Calibration, CameraCalibration
+    from concent_warp.perception.tracking.cfg import TrackCfg
+    from concent_warp.perception.tracking.result import BodyTrack, Tracked
+    from concent_warp.perception.tracking.track import track
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.logs.cfg import ImportCfg

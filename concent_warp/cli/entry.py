@@ -24,6 +24,7 @@ GROUPS = {
     },
     "from a video to a recording": {
         "calibrate": "find camera poses and clock offset from tags or the robot in view",
+        "track": "track the objects in the RGB-D video of a recording",
     },
     "from a recording to a model": {
         "geometry": "place contact spheres on the objects of a scene; export MJCF",
@@ -56,6 +57,7 @@ EXAMPLES = {
     "record": "concent record --seeds 0 1 -o demo.h5",
     "import": "concent import bag.mcap --model robot.xml --map robot.toml -o demo.h5",
     "calibrate": "concent calibrate demo.h5 --tag-size 0.04 -o calibrated.h5 --picture calibration.png",
+    "track": "concent track video.h5 -o tracked.h5",
     "geometry": "concent geometry scene.xml -o model.toml",
     "fit": "concent fit demo.h5 -o runs/demo",
     "replay": "concent replay demo.h5 --model model.toml -o rollout.npz",

@@ -35,6 +35,9 @@ class Channel:
     """Standard deviation of the measurement noise in the channel's unit, where known."""
     frame: str | None = None
     """Name of the frame the values are expressed in, where it is not the world."""
+    covariance: np.ndarray | None = None
+    """Covariance of each sample's error, shape (T, k, k), where known; NaN where the value is missing. k is the
+    dimension of the value, and 3 for quaternions, whose error is a rotation vector [rad] in the body's frame."""
 
 
 @dataclass(frozen=True)

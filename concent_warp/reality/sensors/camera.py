@@ -6,6 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from concent_warp.reality.appearance.speckle import dress
 from concent_warp.reality.sensors.sensing import SensingCfg
@@ -28,7 +29,7 @@ def record_depth_images(
     Args:
         sensing: The camera.
         world: Reality.
-        bodies: Bodies that carry a pattern.
+        bodies: Bodies that carry a pattern, unless `sensing` says otherwise.
         time: Times of the frames [s], shape (T,).
         qpos: States of the world at these times, shape (T, nq).
         rng: Source of the noise.
@@ -73,7 +74,7 @@ def camera_world(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: Sensing
     States come from the world itself, so what its motion takes is left out, whether the ray tracer's simulator knows it
     or not.
     """
-    spec = dress(world, bodies)
+    spec = dress(world, bodies if sensing.object_pattern else ())
     for elements in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons):
         for element in list(elements):
             spec.delete(element)
@@ -89,6 +90,8 @@ def camera_world(world: mujoco.MjSpec, bodies: tuple[str, ...], sensing: Sensing
 
 def _noisy_colour(colour: np.ndarray, sensing: SensingCfg, rng: np.random.Generator) -> np.ndarray:
     """Return what the sensor reports, uint8, for colours in 0..1, shape (H, W, 3)."""
+    if sensing.rgb_blur > 0:
+        colour = gaussian_filter(colour, (sensing.rgb_blur, sensing.rgb_blur, 0))
     level = 255 * colour + rng.normal(0, sensing.rgb_std, colour.shape)
     return np.clip(np.round(level), 0, 255).astype(np.uint8)
 
@@ -97,9 +100,16 @@ def noisy_depth(depth: np.ndarray, sensing: SensingCfg, rng: np.random.Generator
     """Return what the sensor reports for planar depths [m], shape (H, W), 0 where there is nothing.
 
     The noise grows with the square of the depth, as with all triangulation; near an edge, where one eye sees what the
-    other does not, some pixels report nothing; the rest is rounded to the sensor's step.
+    other does not, some pixels report nothing; the rest is rounded to the sensor's steps of disparity and of depth.
     """
-    noisy = depth + rng.normal(0, 1, depth.shape) * sensing.depth_noise * depth**2
+    noise = rng.normal(0, 1, depth.shape)
+    if sensing.depth_correlation > 0:
+        noise = gaussian_filter(noise, sensing.depth_correlation)
+        noise /= noise.std()
+    noisy = depth + noise * sensing.depth_noise * depth**2
+    if sensing.disparity_step > 0:
+        inverse = np.round(1 / np.maximum(noisy, 1e-3) / sensing.disparity_step) * sensing.disparity_step
+        noisy = 1 / np.maximum(inverse, sensing.disparity_step)
     lost = _edges(depth, sensing.depth_jump) & (rng.random(depth.shape) < sensing.depth_dropout)
     return np.where(lost | (depth <= 0), 0.0, np.round(noisy / sensing.depth_step) * sensing.depth_step)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from concent_warp.checks import Bounds, OpenAngle, Pixels, PositiveDuration, Rate, Share, Signed
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.visible_region import cast_rays
+from concent_warp.perception.rays import cast_rays
 from concent_warp.recording.recording import Channel
 from concent_warp.scene.scene import Scene
 
@@ -63,6 +63,16 @@ class SensingCfg:
     """Difference of depth between neighbouring pixels from which on they lie on an edge [m]."""
     depth_dropout: Share = 0.5
     """Share of the pixels on an edge that have no depth [-]: half of what they cover is hidden from the second eye."""
+    object_pattern: bool = True
+    """Whether the objects carry a speckle pattern; without it they have one colour each."""
+    rgb_blur: Annotated[float, Bounds(0, 100)] = 0.0
+    """Standard deviation of the lens' blur [px], off by default."""
+    depth_correlation: Annotated[float, Bounds(0, 100)] = 0.0
+    """Standard deviation of the window over which depth noise is averaged and so correlated [px]; its size stays that
+    of `depth_noise`. Off by default; stereo matching has one to three pixels."""
+    disparity_step: Annotated[float, Bounds(0, 10)] = 0.0
+    """Step in which inverse depth is reported, besides `depth_step` [1/m]; off by default. It is the step of disparity
+    over focal length and baseline: 1/8 px, 600 px and 75 mm give 0.0028 1/m, 2.5 mm at 0.95 m."""
     tracking_std: float = 1e-4
     """Slow deviation of the joints from their commands that no encoder measures [rad]."""
     tracking_time: PositiveDuration = 0.3

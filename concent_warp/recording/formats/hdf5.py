@@ -119,6 +119,8 @@ def _write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream)
             group.attrs["noise_std"] = float(stream.noise_std)
         if stream.frame is not None:
             group.attrs["frame"] = _text(stream.frame)
+        if stream.covariance is not None:
+            _store(group, "covariance", np.asarray(stream.covariance, dtype=float))
 
 
 def _text(value: str) -> np.ndarray:
@@ -235,7 +237,7 @@ class Reader(SafeFile):
 
     def channel(self, group: h5py.Group) -> Channel:
         """Read a commanded or measured channel."""
-        self.refuse_unknown(group, {"time", "value"}, {"noise_std", "frame"})
+        self.refuse_unknown(group, {"time", "value", "covariance"}, {"noise_std", "frame"})
         noise = self.attribute(group, "noise_std")
         if noise is not None and (np.shape(noise) != () or np.asarray(noise).dtype.kind not in "fiu"):
             raise self.error("noise_std is not a number", group.name, expected="one number", found=noise)
@@ -244,6 +246,7 @@ class Reader(SafeFile):
             self.array(group, "value"),
             None if noise is None else float(noise),
             self.text_attribute(group, "frame"),
+            self.array(group, "covariance") if "covariance" in group else None,
         )
 
     def points(self, group: h5py.Group) -> PointTrack:

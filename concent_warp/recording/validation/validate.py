@@ -22,6 +22,7 @@ from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
 from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
+from concent_warp.recording.validation.covariances import check_covariance
 from concent_warp.recording.validation.falls import units_of_falls
 from concent_warp.recording.validation.images import check_image
 from concent_warp.recording.validation.location import ErrorLocation
@@ -151,6 +152,8 @@ def _check_action(channel: Channel, model: mujoco.MjModel, name: str, place: Err
     _check_time(channel.time, place)
     _check_shape(channel.value, (len(channel.time),), place, fix="write one command per time")
     _check_finite(channel.value, place, missing_allowed=False)
+    if channel.covariance is not None:
+        raise place.error("a command has no covariance", fix="leave it out")
     check_command(np.asarray(channel.value), model, row, place, cfg.units)
 
 
@@ -171,7 +174,10 @@ def _check_measured(channel: Channel, model: mujoco.MjModel, name: str, place: E
     value = np.asarray(channel.value)
     if channel.noise_std is not None and not 0 <= channel.noise_std <= MAX_MAGNITUDE:
         raise place.error("noise_std is not a standard deviation", expected=">= 0", found=channel.noise_std)
-    if model.sensor_type[row] in QUATERNION_SENSORS:
+    quaternion = model.sensor_type[row] in QUATERNION_SENSORS
+    if channel.covariance is not None:
+        check_covariance(channel.covariance, value, 3 if quaternion else value.shape[1], place)
+    if quaternion:
         _check_quaternions(value, place, cfg)
     check_measurement(value, model, row, place, cfg.units)
 

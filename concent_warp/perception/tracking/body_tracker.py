@@ -1,0 +1,209 @@
+"""Tracking of one body from moment to moment: prediction, refinement, keyframes, loss and recovery."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from concent_warp.perception.tracking.alignment.align import FREE, Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.registration import relocated
+from concent_warp.perception.tracking.alignment.rows import bias_stds, rendered_crop
+from concent_warp.perception.tracking.alignment.search import find_pose
+from concent_warp.perception.tracking.alignment.texture import Keyframe, TextureMap
+from concent_warp.perception.tracking.cfg import TrackCfg
+from concent_warp.perception.tracking.geometry.pose import moved, rotation_angle, twist_between
+from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry
+from concent_warp.perception.tracking.geometry.view import View
+
+NEARBY = np.diag([1 / 0.015**2] * 3 + [1 / 0.25**2] * 3)
+"""Information of a prediction from the frame before [1/m^2, 1/rad^2]: 15 mm and 0.25 rad."""
+MAX_TRIES = 3
+"""Renewed attempts at the last pose, in a row, before only searches may find a lost body again."""
+
+
+class BodyTracker:
+    """State of the tracking of one body."""
+
+    def __init__(self, shape: TrackedShape, symmetry: Symmetry, cfg: TrackCfg) -> None:
+        """Create a tracker of a body that is not found yet."""
+        self.shape, self.symmetry, self.cfg = shape, symmetry, cfg
+        self.pose: np.ndarray | None = None
+        """Last pose, shape (4, 4)."""
+        self.tracked = False
+        """Whether it was seen in the last moment."""
+        self.speed = np.zeros(6)
+        """Twist a second, shape (6,)."""
+        self.time = 0.0
+        """Time of the last pose [s]."""
+        self.searched = -np.inf
+        """Time of the last search [s]."""
+        self.reason = ""
+        """Why it was not found last."""
+        self.misses = 0
+        """Moments since it was seen."""
+        self.fits: list[Fit | None] = []
+        """One for each moment."""
+        self.textures = TextureMap(cfg.texture)
+        """Keyframes."""
+
+    def begin(self, renderer: RayRenderer, time: float, views: Sequence[View], pose: np.ndarray) -> Agreement:
+        """Take up a given first pose if the first moment agrees with it after a small correction; return the
+        agreement.
+        """
+        fit = refine(renderer, views, self.shape, pose, self.cfg.align, rough=True)
+        if fit is None:
+            return Agreement(0, 0.0, 0.0, 0.0, 0.0)
+        agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, self.cfg.accept)
+        if agreed.accepted(self.cfg.accept) and self.certain(fit):
+            self.pose, self.tracked, self.time = fit.pose, True, time
+            self.fits.append(self.settled(renderer, views, fit))
+        renderer.place(self.shape.row, self.pose)
+        return agreed
+
+    def advance(
+        self,
+        renderer: RayRenderer,
+        time: float,
+        views: Sequence[View],
+        rng: np.random.Generator,
+    ) -> None:
+        """Process one moment."""
+        fit = None
+        if self.pose is not None and (self.tracked or self.misses < MAX_TRIES):
+            fit = self.followed(renderer, time, views)
+        if fit is None and not self.tracked and time - self.searched >= self.cfg.search.interval:
+            fit = self.recovered(renderer, time, views, rng)
+        if fit is None:
+            self.tracked, self.speed, self.misses = False, np.zeros(6), self.misses + 1
+            renderer.place(self.shape.row, None)
+        else:
+            if self.tracked and self.pose is not None and time > self.time:
+                speed = twist_between(self.pose, fit.pose) / (time - self.time)
+                self.speed = 0.3 * self.speed + 0.7 * speed
+            self.pose, self.tracked, self.time, self.misses = fit.pose, True, time, 0
+            renderer.place(self.shape.row, fit.pose)
+        self.fits.append(fit)
+
+    def followed(self, renderer: RayRenderer, time: float, views: Sequence[View]) -> Fit | None:
+        """Return the fit near the predicted pose, or None where nothing agrees."""
+        assert self.pose is not None
+        predicted = moved(self.pose, (time - self.time) * self.speed) if self.tracked else self.pose
+        keyframes = self.chosen(views, predicted)
+        fit = self.accepted(renderer, views, predicted, keyframes, rough=False)
+        if fit is None:
+            starts = [
+                relocated(renderer, v, self.shape, predicted, self.cfg.search.reach, self.cfg.search) for v in views
+            ]
+            for start in (*starts, predicted):
+                if fit is None and start is not None:
+                    fit = self.accepted(renderer, views, start, self.chosen(views, start), rough=True)
+        return None if fit is None else self.settled(renderer, views, fit)
+
+    def accepted(
+        self,
+        renderer: RayRenderer,
+        views: Sequence[View],
+        start: np.ndarray,
+        keyframes: list[tuple[int, Keyframe] | None],
+        *,
+        rough: bool,
+    ) -> Fit | None:
+        """Return the fit from a start if the frames agree with it."""
+        cfg = self.cfg
+        fit = refine(
+            renderer, views, self.shape, start, cfg.align,
+            prior=FREE if rough else NEARBY, keyframes=keyframes, texture=cfg.texture, rough=rough,
+        )  # fmt: skip
+        if fit is None or not self.certain(fit):
+            return None
+        if np.isfinite(fit.texture_correlation) and fit.texture_correlation < cfg.accept.min_texture:
+            return None
+        agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, cfg.accept)
+        return fit if agreed.accepted(cfg.accept) else None
+
+    def certain(self, fit: Fit) -> bool:
+        """Return whether a fit's position is known well enough."""
+        return fit.position_std() < self.cfg.accept.max_translation_std
+
+    def chosen(self, views: Sequence[View], pose: np.ndarray) -> list[tuple[int, Keyframe] | None]:
+        """Return number and keyframe for each view, None where none fits."""
+        result: list[tuple[int, Keyframe] | None] = []
+        for view in views:
+            keyframe = self.textures.choose(view, pose)
+            index = next((i for i, k in enumerate(self.textures.keyframes) if k is keyframe), -1)
+            result.append(None if keyframe is None else (index, keyframe))
+        return result
+
+    def settled(self, renderer: RayRenderer, views: Sequence[View], fit: Fit) -> Fit:
+        """Return a fit, after a keyframe was made of each view that has none near."""
+        for view in views:
+            if self.textures.choose(view, fit.pose) is not None:
+                continue
+            renderer.place(self.shape.row, fit.pose)
+            crop = rendered_crop(renderer, view, self.shape, fit.pose, 20_000)
+            if crop is not None:
+                self.textures.add(view, crop, fit.pose, self.covariance(fit))
+        return fit
+
+    def covariance(self, fit: Fit) -> np.ndarray:
+        """Return the covariance of a fit's pose, shape (6, 6), common errors included."""
+        information = fit.geometry.information + sum(
+            np.linalg.inv(np.linalg.inv(n.information + 1e-3 * FREE) + self.textures.keyframes[k].covariance)
+            for k, n in fit.texture
+        )
+        inverse = np.linalg.inv(information + FREE)
+        std = bias_stds(self.cfg.align)
+        bias = inverse @ fit.geometry.bias * std
+        return inverse + bias @ bias.T
+
+    def recovered(
+        self,
+        renderer: RayRenderer,
+        time: float,
+        views: Sequence[View],
+        rng: np.random.Generator,
+    ) -> Fit | None:
+        """Return the fit of a search in all views, in the representative that follows on from what was known."""
+        self.searched = time
+        best = None
+        for view in views:
+            found = find_pose(renderer, view, self.shape, self.symmetry, self.cfg, rng)
+            self.reason = found.reason
+            if found.fit is not None and (best is None or found.score > best.score):
+                best = found
+        if best is None or best.fit is None:
+            return None
+        pose = self.representative(renderer, views, best.fit.pose)
+        fit = self.accepted(renderer, views, pose, self.chosen(views, pose), rough=False)
+        return None if fit is None else self.settled(renderer, views, fit)
+
+    def representative(self, renderer: RayRenderer, views: Sequence[View], pose: np.ndarray) -> np.ndarray:
+        """Return that pose, of all that the symmetries make alike, whose texture fits, else the nearest to the last."""
+        if len(self.symmetry.turns) == 1:
+            return pose
+        best, most = None, self.cfg.texture.min_correlation
+        if self.textures.keyframes:
+            for other in self.symmetry.equivalents(pose):
+                keyframes = self.chosen(views, other)
+                if not any(keyframes):
+                    continue
+                fit = refine(
+                    renderer, views, self.shape, other, self.cfg.align,
+                    keyframes=keyframes, texture=self.cfg.texture, iterations=1,
+                )  # fmt: skip
+                if fit is not None and fit.texture_correlation > most:
+                    best, most = fit.pose, fit.texture_correlation
+        if best is not None:
+            return best
+        reference = np.eye(4) if self.pose is None else self.pose
+        return self.symmetry.nearest(pose, reference)
+
+    def correction(self, given: np.ndarray) -> tuple[float, float]:
+        """Return how far the pose is from a given one: distance of the middle [m] and angle [rad]."""
+        assert self.pose is not None
+        middle = self.shape.centre
+        shift = (self.pose[:3, :3] - given[:3, :3]) @ middle + self.pose[:3, 3] - given[:3, 3]
+        return float(np.linalg.norm(shift)), rotation_angle(self.pose, given)

@@ -1,0 +1,1 @@
+"""Shapes of objects, their symmetries, and what cameras see of them."""

@@ -1,0 +1,124 @@
+"""Forward-backward smoothing of poses: an extended Kalman filter with constant velocity, and Rauch-Tung-Striebel's
+pass.
+
+Each moment gives the normal equations of a pose rather than a pose, so directions that a frame does not show (the
+turn of a cylinder about its axis) stay open. The acceleration's standard deviation is the most likely of a few, for
+each stretch of the motion: objects rest for most of the time and are jerked in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from concent_warp.perception.tracking.cfg import SmoothCfg
+from concent_warp.perception.tracking.geometry.pose import moved, twist_between
+
+START_SPEED = 0.5
+"""Standard deviation of the speed before the first measurement [m/s], of rotations over the radius."""
+
+
+@dataclass(frozen=True)
+class PoseMeasurement:
+    """What one moment says about a pose."""
+
+    pose: np.ndarray
+    """Where it is linearised, shape (4, 4)."""
+    information: np.ndarray
+    """Shape (6, 6)."""
+    gradient: np.ndarray
+    """Shape (6,)."""
+
+
+def smooth(
+    time: np.ndarray, measurements: Sequence[PoseMeasurement | None], radius: float, cfg: SmoothCfg
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses, shape (T, 4, 4), and covariances of their twists, shape (T, 6, 6).
+
+    Args:
+        time: Times [s], shape (T,).
+        measurements: What each says, the first and at least one; None where the object was not seen.
+        radius: Radius of the object [m].
+        cfg: Settings.
+    """
+    runs = [_filtered(time, measurements, radius, np.full(len(time), a)) for a in cfg.acceleration]
+    likelihood = np.array([run.likelihood for run in runs])
+    window = np.abs(time[:, None] - time[None]) <= cfg.window / 2
+    best = (likelihood @ window).argmax(axis=0)
+    # A change of motion is felt on both sides of it.
+    widest = np.array([best[row].max() for row in window])
+    run = _filtered(time, measurements, radius, np.array(cfg.acceleration)[widest])
+    return _backward(run)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Results of the forward pass."""
+
+    pose: list[np.ndarray]
+    speed: list[np.ndarray]
+    covariance: list[np.ndarray]
+    predicted_pose: list[np.ndarray]
+    predicted_speed: list[np.ndarray]
+    predicted_covariance: list[np.ndarray]
+    transition: list[np.ndarray]
+    likelihood: np.ndarray
+
+
+def _filtered(
+    time: np.ndarray, measurements: Sequence[PoseMeasurement | None], radius: float, acceleration: np.ndarray
+) -> _Run:
+    """Return the forward pass with a standard deviation of the acceleration for each moment [m/s^2], shape (T,)."""
+    first = next(m for m in measurements if m is not None)
+    run = _Run([], [], [], [], [], [], [], np.zeros(len(time)))
+    scale = np.array([1.0] * 3 + [1 / radius] * 3)
+    pose, speed = first.pose, np.zeros(6)
+    covariance = np.diag(np.concatenate([(scale * 0.3) ** 2, (scale * START_SPEED) ** 2]))
+    for t, measurement in enumerate(measurements):
+        step = 0.0 if t == 0 else float(time[t] - time[t - 1])
+        transition = np.eye(12)
+        transition[:6, 6:] = step * np.eye(6)
+        unit = np.diag((scale * acceleration[t]) ** 2)
+        noise = np.block([[step**4 / 4 * unit, step**3 / 2 * unit], [step**3 / 2 * unit, step**2 * unit]])
+        pose = moved(pose, step * speed)
+        covariance = transition @ covariance @ transition.T + noise + 1e-16 * np.eye(12)
+        run.predicted_pose.append(pose)
+        run.predicted_speed.append(speed)
+        run.predicted_covariance.append(covariance)
+        run.transition.append(transition)
+        if measurement is not None:
+            offset = twist_between(measurement.pose, pose)
+            rest = measurement.gradient - measurement.information @ offset
+            gain = np.eye(6) + covariance[:6, :6] @ measurement.information
+            after = covariance - covariance[:, :6] @ measurement.information @ np.linalg.solve(gain, covariance[:6])
+            after = (after + after.T) / 2
+            change = after[:, :6] @ rest
+            run.likelihood[t] = (
+                measurement.gradient @ offset
+                - 0.5 * offset @ measurement.information @ offset
+                + 0.5 * rest @ change[:6]
+                - 0.5 * np.linalg.slogdet(gain)[1]
+            )
+            pose, speed, covariance = moved(pose, change[:6]), speed + change[6:], after
+        run.pose.append(pose)
+        run.speed.append(speed)
+        run.covariance.append(covariance)
+    return run
+
+
+def _backward(run: _Run) -> tuple[np.ndarray, np.ndarray]:
+    """Return smoothed poses (T, 4, 4) and covariances (T, 6, 6)."""
+    pose, speed, covariance = run.pose[-1], run.speed[-1], run.covariance[-1]
+    poses, covariances = [pose], [covariance[:6, :6]]
+    for t in range(len(run.pose) - 2, -1, -1):
+        ahead = run.predicted_covariance[t + 1]
+        gain = np.linalg.solve(ahead, run.transition[t + 1] @ run.covariance[t]).T
+        off = np.concatenate([twist_between(run.predicted_pose[t + 1], pose), speed - run.predicted_speed[t + 1]])
+        change = gain @ off
+        covariance = run.covariance[t] + gain @ (covariance - ahead) @ gain.T
+        pose, speed = moved(run.pose[t], change[:6]), run.speed[t] + change[6:]
+        poses.append(pose)
+        covariances.append(covariance[:6, :6])
+    return np.array(poses[::-1]), np.array(covariances[::-1])

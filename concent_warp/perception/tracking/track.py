@@ -1,0 +1,130 @@
+"""Tracking of the movable objects in the RGB-D video of a recording: ``concent_warp.track``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from concent_warp.checks import check_settings
+from concent_warp.errors import RecordingError, SceneError
+from concent_warp.perception.tracking.cfg import TrackCfg
+from concent_warp.perception.tracking.demonstration_tracker import track_bodies
+from concent_warp.perception.tracking.first_pose import first_poses
+from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.output import with_pose_sensors, written
+from concent_warp.perception.tracking.result import Tracked
+from concent_warp.perception.tracking.video import Video
+from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.recording.recording import Recording
+from concent_warp.recording.validation.validate import validate
+from concent_warp.scene.scene import Scene
+
+
+def track(
+    recording: Recording,
+    cfg: TrackCfg | None = None,
+    *,
+    bodies: Sequence[str] | None = None,
+    cameras: Sequence[str] = (),
+    pose: str | Path | Mapping[str, np.ndarray] = "initial",
+    scene: Scene | None = None,
+    keep_measured: bool = False,
+    images: bool = False,
+    out: str | Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Tracked:
+    """Return the recording with the poses of its movable objects tracked in its RGB-D video.
+
+    Each frame's depth and edges are compared with the shape of the object, and its texture, where it has one, with
+    former frames; robot and scene are rendered at the measured joint angles, so that what they hide is left out. A
+    pose that does not agree with the image is not reported: the object is lost, its channels are NaN, and it is
+    searched everywhere in view. Poses are smoothed forward and backward. Measured poses in the recording are not read.
+
+    Args:
+        recording: The recording; joint sensors tell the robot's configuration.
+        cfg: Settings.
+        bodies: Bodies with a free joint; by default all of them.
+        cameras: Cameras that are used; by default all with depth.
+        pose: First poses: "initial", the recording's initial state, or a search where it has none; "none", a search; a
+            TOML or JSON file with position and quaternion of each body; or transforms, shape (4, 4), by body.
+        scene: Scene in place of the recording's own.
+        keep_measured: Whether measured poses in the recording stay instead of the tracked ones.
+        images: Whether the result keeps the video.
+        out: File to write the recording to, whole or not at all.
+        progress: Called with the share done, 0..1.
+
+    Raises:
+        RecordingError: There is no video with depth, no such body or camera, a first pose disagrees with the image, or
+            no body was found.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> try:
+        ...     cw.track(cw.load_recording(cw.example("servo")))
+        ... except cw.RecordingError as error:
+        ...     "free joint" in str(error)
+        True
+    """
+    cfg = cfg or TrackCfg()
+    check_settings(cfg)
+    scene = scene or Scene(recording.scene, recording.source)
+    names = _movable(scene, bodies)
+    try:
+        shapes = [TrackedShape.of_body(scene, name, cfg.seed) for name in names]
+    except SceneError as error:
+        raise RecordingError("a body cannot be tracked", where=recording.source, found=str(error).rstrip(".")) from None
+    sensed = with_pose_sensors(scene, names)
+    demonstrations, tracks, remarks = [], [], []
+    count = len(recording.demonstrations)
+    for k, demonstration in enumerate(recording.demonstrations):
+        where = f"{recording.source}, {demonstration.name}"
+        video = Video.of(scene.model, demonstration, cameras, cfg.simultaneous, where)
+        if video.unmeasured:
+            remarks.append(
+                f"{demonstration.name}: nothing measures {', '.join(video.unmeasured)}; taken to stand still"
+            )
+        first = first_poses(pose, scene, demonstration, shapes, where)
+        step = None if progress is None else lambda share, k=k: progress((k + share) / count)
+        found = track_bodies(scene, video, shapes, first, cfg, demonstration.name, where, step)
+        if all(t.lost.all() for t in found):
+            reasons = "; ".join(f"{t.body}: {t.reason or 'hidden'}" for t in found)
+            raise RecordingError(
+                "no body was found in the video", where=where, expected=f"one of {list(names)}", found=reasons,
+                fix="check the camera's pose and the scene, or give the first pose in a file",
+            )  # fmt: skip
+        options = {"keep_measured": keep_measured, "images": images}
+        demonstrations.append(written(demonstration, sensed, found, shapes, video, cfg.points, **options))
+        tracks += found
+    result = replace(recording, scene=sensed.xml, demonstrations=tuple(demonstrations))
+    if out is not None:
+        write_hdf5(result, out)
+    else:
+        validate(result)
+    return Tracked(result, tuple(tracks), tuple(remarks))
+
+
+def _movable(scene: Scene, bodies: Sequence[str] | None) -> list[str]:
+    """Return the names of the bodies to track.
+
+    Raises:
+        RecordingError: One has no free joint, or there is none.
+    """
+    model = scene.model
+    free = [
+        model.body(int(model.jnt_bodyid[j])).name
+        for j in range(model.njnt)
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
+    ]
+    if not free:
+        raise RecordingError(
+            "the scene has no object to track", where=scene.source, expected="a body with a free joint", found="none"
+        )
+    if unknown := [b for b in bodies or () if b not in free]:
+        raise RecordingError(
+            "a body cannot be tracked", where=scene.source, expected=f"bodies with a free joint: {free}", found=unknown
+        )
+    return list(bodies or free)
