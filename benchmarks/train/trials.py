@@ -47,8 +47,8 @@ are Wilson's, of these policies.
 *In simulation*: success in the training's own worlds. *Stress test*: the same policy in the model with the shapes of
 the scene in place of spheres, stiff contacts, short steps, and friction factors of 0.6 or 1.7 (`StressCfg`). With all
 spheres in its physics the test does not predict success: fitted geometries differ in how hard they are. The shapes of
-the scene are those of Reality but for the chamfers of its edges; where a scene's shapes are wrong, the test is too. That
-its episodes start from grasps as demonstrated was chosen by looking at these policies: from turned grasps, as in
+the scene are those of Reality but for the chamfers of its edges; where a scene's shapes are wrong, the test is too.
+Shapes and starting grasps, now as demonstrated, were chosen by looking at these policies: from turned grasps, as in
 training, the correlation is 0.51 [-0.02, 0.90].
 
 What the figures do not show: other tasks; policies trained for longer; how far one or two seeds speak for settings.
