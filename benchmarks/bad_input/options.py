@@ -29,12 +29,14 @@ NEEDED = {
     "demo": "-o out",
     "record": "-o out.h5",
     "import": "log --model scene.xml --map map.toml -o out.h5",
+    "calibrate": "recording.h5 -o out.h5",
+    "track": "recording.h5 -o out.h5",
 }
 """What each command needs besides the option that is wrong."""
 SIGNED = (
     "--jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
     "--reality.sensing.camera-target", "--environment.reward.engineered.hole", "--environment.reward.engineered.seat",
-    "-position", "-yaw",
+    "-position", "-yaw", "--start",
 )  # fmt: skip
 """Ends of options that may be -1."""
 SENSELESS = {"FLOAT": ("nan", "-1", "inf", "1e300"), "INT": ("-1", "9" * 300, "1.5", "nan", "-1")}
@@ -98,6 +100,12 @@ WRONG = {
     "record": (
         "--seeds -1", "--robot gone.xml", "--robot.tcp-site gone", "--robot.gripper-actuators gone",
         "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1",
+    ),
+    "calibrate": (
+        "--method magic", "--cameras nothing", "--tag-size 0", "--start 1 2", "--target-body nothing",
+    ),
+    "track": (
+        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml",
     ),
     "import": (
         "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",

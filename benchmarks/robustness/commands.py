@@ -16,8 +16,8 @@ SERVO = ROOT / "concent_warp" / "examples" / "servo.h5"
 SHIPPED = ROOT / "train" / "pretrained" / "shape_sorter"
 QUICK = "--reality.expert.speed 2"
 SPHERES, GENERATIONS, POPULATION = 60, 4, 4
-RECORDING, MODEL, SERVO_MODEL, TRAINED, PHOTOGRAPHS, FOOTAGE = (
-    "demo.h5", "model.toml", "servo.toml", "trained", "photographs", "empty.h5",
+RECORDING, MODEL, SERVO_MODEL, TRAINED, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG = (
+    "demo.h5", "model.toml", "servo.toml", "trained", "photographs", "empty.h5", "video.h5", "log",
 )  # fmt: skip
 """Names of the inputs."""
 TRAIN = (
@@ -66,6 +66,14 @@ FIT = f"fit {{inputs}}/{RECORDING} --out {{out}}/run {_fit(GENERATIONS)}"
 RENDER = "render --pretrained --episodes 4 --worlds 2 --size 32 --cameras base --device cpu --keep all --out {out}/data"
 WRITING = [
     Writing("record", f"record --out {{out}}/demo.h5 --seeds 0 {QUICK}"),
+    Writing(
+        "import", f"import {{inputs}}/{LOG} --model {{inputs}}/log.xml --map {{inputs}}/map.toml --out {{out}}/demo.h5"
+    ),
+    Writing(
+        "calibrate",
+        f"calibrate {{inputs}}/{VIDEO} --method robot --out {{out}}/demo.h5 --picture {{out}}/picture.png",
+    ),
+    Writing("track", f"track {{inputs}}/{VIDEO} --out {{out}}/tracked.h5"),
     Writing(
         "geometry", f"geometry {{inputs}}/{RECORDING} --count {SPHERES} --out {{out}}/m.toml --export {{out}}/m.xml"
     ),
@@ -147,6 +155,8 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
         TRAINED: f"{TRAIN} --iterations 2 --out {TRAINED}",
         FOOTAGE: f"record --out {FOOTAGE} --seeds 10 {QUICK} --reality.footage.cameras base "
         "--reality.footage.size 64 64 --reality.footage.rate 5 --reality.footage.no-objects",
+        VIDEO: f"record --out {VIDEO} --seeds 0 {QUICK} --reality.sensing.images --reality.sensing.image-rate 10 "
+        "--reality.sensing.image-size 180 240",
     }
     for name, line in given.items():
         if (names is None or name in names) and not (inputs / name).exists():
@@ -160,6 +170,11 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
             print(f"made {name} in {done.seconds:.0f} s", flush=True)
     if (names is None or PHOTOGRAPHS in names) and not (inputs / PHOTOGRAPHS / "transforms.json").exists():
         _photograph(inputs / PHOTOGRAPHS)
+    if (names is None or LOG in names) and not (inputs / LOG).exists():
+        from benchmarks.bad_input.sound_inputs import SCENE, write_log
+
+        write_log(inputs)
+        (inputs / "log.xml").write_text(SCENE)
 
 
 def _photograph(folder: Path) -> None:

@@ -29,6 +29,7 @@ NEGATIVE = {
     "--jobs": "-1 stands for one process a CPU",
     "--eye": COORDINATE,
     "--lights.ground": COORDINATE,
+    "--start": COORDINATE,
     "--reality.expert.grip-height": COORDINATE,
     "--reality.sensing.camera-position": COORDINATE,
     "--reality.sensing.camera-target": COORDINATE,

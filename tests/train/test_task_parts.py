@@ -12,7 +12,7 @@ from concent_warp.errors import TrainError
 from concent_warp.events.sequence import ContactEvent, ContactInterval, ContactPair, Entity
 from concent_warp.recording.recording import Channel, Demonstration
 from concent_warp.scene.scene import Scene
-from concent_warp.train.cfg import ALL, ActionCfg
+from concent_warp.train.cfg import ALL, LAST, ActionCfg
 from concent_warp.train.task.movable_fixtures import mocap_id, with_movable_fixtures
 from concent_warp.train.task.robot import Robot, _opening
 from concent_warp.train.task.task import Replay, Task, _chain, _objects_by_handling, _replay, _target_position
@@ -144,10 +144,11 @@ def test_fixed_objects_become_mocap_bodies_that_touch_nothing_fixed():
 def test_chain_is_of_all_stages_or_of_one():
     events = make_events()
     assert _chain(events, ALL) == (0, 2)
+    assert _chain(events, LAST) == (2, 2)
     assert [_chain(events, name) for name in ("pick", "align", "insert")] == [(0, 0), (1, 1), (2, 2)]
-    with pytest.raises(TrainError, match=r"no such stage.*\['pick', 'align', 'insert', 'all'\].*fly"):
+    with pytest.raises(TrainError, match=r"no such stage.*\['pick', 'align', 'insert', 'last', 'all'\].*fly"):
         _chain(events, "fly")
-    with pytest.raises(TrainError, match=r"\['all'\].*all"):
+    with pytest.raises(TrainError, match=r"\['last', 'all'\].*all"):
         _chain(replace(events, stages=()), ALL)
     assert make_task().chained == (0, 1, 2)
     assert make_task(first=1).chained == (1, 2)
