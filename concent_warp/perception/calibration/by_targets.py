@@ -366,7 +366,7 @@ def _check_spread(
     axis = ", ".join(f"{value:.2f}" for value in axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))]))
     raise RecordingError(
         f"the motion does not determine the camera's pose: {carrier} turns about one axis only, ({axis}) in its frame, "
-        "and positions along it cannot be told apart",
+        "and positions along it cannot be distinguished",
         where=footage.where,
         expected=f"rotations of {cfg.limits.min_rotation:g} deg about a second axis",
         found=f"{np.degrees(size[0]):.1f} deg about this axis and {np.degrees(size[1]):.1f} deg about others",
