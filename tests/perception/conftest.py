@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from grasp_films import Film, filmed
+from tests.perception.grasp_films import Film, filmed
 
 from concent_warp.reality.record import RealityCfg, record
 

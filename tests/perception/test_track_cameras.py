@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from grasp_films import CAMERA, RATE, START
+from tests.perception.grasp_films import CAMERA, RATE, START
 
 import concent_warp as cw
 from concent_warp.perception.tracking.geometry.pose import twist_between
