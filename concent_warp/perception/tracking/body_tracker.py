@@ -201,6 +201,10 @@ class BodyTracker:
         reference = np.eye(4) if self.pose is None else self.pose
         return self.symmetry.nearest(pose, reference)
 
+    def numbered_fits(self) -> tuple[list[Fit | None], int]:
+        """Return the fits of all moments and the number of keyframes that their texture refers to."""
+        return self.fits, len(self.textures.keyframes)
+
     def correction(self, given: np.ndarray) -> tuple[float, float]:
         """Return how far the pose is from a given one: distance of the middle [m] and angle [rad]."""
         assert self.pose is not None

@@ -141,6 +141,32 @@ class SearchCfg:
 
 
 @dataclass(frozen=True)
+class RegistrationCfg:
+    """Settings of poses from tracked points."""
+
+    points: Count = 80
+    """Points of a keyframe in each camera."""
+    min_points: Annotated[int, Bounds(4, 10_000)] = 8
+    """Least number of points that agree with a pose, and of a keyframe."""
+    border: Count = 3
+    """Distance from the body's outline within which no point is chosen [px]."""
+    hypotheses: Count = 64
+    """Poses from three points each that are compared (random sample consensus)."""
+    tolerance: Positive = 0.006
+    """Distance within which a point agrees with a pose [m]: some standard deviations of a camera's depth at 1 m."""
+    iterations: Count = 6
+    """Gauss-Newton iterations on the pixels and depths of the points that agree."""
+    window: Count = 30
+    """Frames that points are followed through from their keyframe."""
+    min_share: PositiveShare = 0.5
+    """Share of the keyframe's points below which a new keyframe is made [-]."""
+    shape: bool = True
+    """Whether each pose is weighed with depth and edges of the shape, as that of a keyframe always is."""
+    fallback: bool = True
+    """Whether the model-to-frame tracker follows the body where too few points agree."""
+
+
+@dataclass(frozen=True)
 class SmoothCfg:
     """Settings of the forward-backward smoothing."""
 
@@ -171,6 +197,8 @@ class TrackCfg:
     """Texture points."""
     search: SearchCfg = field(default_factory=SearchCfg)
     """First pose without prior, and recovery."""
+    registration: RegistrationCfg = field(default_factory=RegistrationCfg)
+    """Poses from tracked points."""
     smooth: SmoothCfg = field(default_factory=SmoothCfg)
     """Smoothing over time."""
     points: Count = 64

@@ -12,7 +12,8 @@ from concent_warp.perception.tracking.bundle import bundled
 from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
-from concent_warp.perception.tracking.geometry.symmetry import symmetry_of
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry, symmetry_of
+from concent_warp.perception.tracking.masks import BodyMasks
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.smooth import smooth
 from concent_warp.perception.tracking.video import Video
@@ -31,6 +32,9 @@ def track_bodies(
     name: str,
     where: str,
     progress: Callable[[float], None] | None,
+    *,
+    make: Callable[[TrackedShape, Symmetry, TrackCfg], BodyTracker] = BodyTracker,
+    masks: BodyMasks | None = None,
 ) -> list[BodyTrack]:
     """Return the tracks of bodies in one demonstration.
 
@@ -43,12 +47,15 @@ def track_bodies(
         name: The demonstration's name.
         where: File and demonstration, for messages.
         progress: Called with the share done, 0..1.
+        make: Creates the tracker of a body.
+        masks: Pixels of the bodies, where they are known.
 
     Raises:
         RecordingError: A given first pose does not agree with the video.
     """
     renderer = RayRenderer(scene.model)
-    trackers = [BodyTracker(s, symmetry_of(s, cfg.symmetry_tolerance), cfg) for s in shapes]
+    trackers = [make(s, symmetry_of(s, cfg.symmetry_tolerance), cfg) for s in shapes]
+    masks = masks or BodyMasks()
     rng = np.random.default_rng(cfg.seed)
     count = len(video.time)
     for moment, time in enumerate(video.time):
@@ -56,8 +63,9 @@ def track_bodies(
         for tracker in trackers:
             here = first.get(tracker.shape.name) if moment == 0 else tracker.pose if tracker.tracked else None
             renderer.place(tracker.shape.row, here)
-        views = video.views(moment, renderer)
+        all_views = video.views(moment, renderer)
         for tracker in trackers:
+            views = masks.on(all_views, video.frames[moment], tracker.shape.name)
             given = first.get(tracker.shape.name)
             if moment == 0 and given is not None:
                 _begin(tracker, renderer, float(time), views, given, where)
@@ -69,7 +77,7 @@ def track_bodies(
         if progress is not None:
             progress(0.9 * (moment + 1) / count)
     for tracker in trackers:
-        _fill_backward(tracker, trackers, renderer, video)
+        _fill_backward(tracker, trackers, renderer, video, masks)
     tracks = [_smoothed(tracker, video.time, cfg, name) for tracker in trackers]
     if progress is not None:
         progress(1.0)
@@ -116,7 +124,9 @@ def _check_correction(tracker: BodyTracker, given: np.ndarray, where: str) -> No
         )
 
 
-def _fill_backward(tracker: BodyTracker, others: list[BodyTracker], renderer: RayRenderer, video: Video) -> None:
+def _fill_backward(
+    tracker: BodyTracker, others: list[BodyTracker], renderer: RayRenderer, video: Video, masks: BodyMasks
+) -> None:
     """Follow a body backward from where it was found into the moments before, in which it was not."""
     fits = tracker.fits
     for moment in range(len(fits) - 2, -1, -1):
@@ -130,7 +140,7 @@ def _fill_backward(tracker: BodyTracker, others: list[BodyTracker], renderer: Ra
                 renderer.place(other.shape.row, None if there is None else there.pose)
         tracker.pose, tracker.tracked, tracker.speed = after.pose, True, np.zeros(6)
         tracker.time = float(video.time[moment])
-        views = video.views(moment, renderer)
+        views = masks.on(video.views(moment, renderer), video.frames[moment], tracker.shape.name)
         fits[moment] = tracker.followed(renderer, tracker.time, views)
 
 
@@ -139,7 +149,7 @@ def _smoothed(tracker: BodyTracker, time: np.ndarray, cfg: TrackCfg, name: str) 
     pose = np.full((len(time), 4, 4), np.nan)
     covariance = np.full((len(time), 6, 6), np.nan)
     seen = np.array([fit is not None for fit in tracker.fits])
-    bundle = bundled(tracker.fits, len(tracker.textures.keyframes), cfg.align)
+    bundle = bundled(*tracker.numbered_fits(), cfg.align)
     # Stretches between long gaps are independent: nothing is known of the motion in between.
     rows = np.flatnonzero(seen)
     for part in np.split(rows, np.flatnonzero(np.diff(time[rows]) > cfg.smooth.max_gap) + 1) if len(rows) else []:

@@ -10,12 +10,18 @@ import mujoco
 import numpy as np
 
 from concent_warp.checks import check_settings
-from concent_warp.errors import RecordingError, SceneError
+from concent_warp.errors import ConcentError, RecordingError, SceneError
+from concent_warp.perception.backends.protocols import Masker, PointTracker
 from concent_warp.perception.tracking.cfg import TrackCfg
-from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.first_pose import first_poses
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.output import with_pose_sensors, written
+from concent_warp.perception.tracking.pose_tracker import (
+    ModelToFrameTracker,
+    PointPoseTracker,
+    PoseTracker,
+    TrackingInput,
+)
 from concent_warp.perception.tracking.result import Tracked
 from concent_warp.perception.tracking.video import Video
 from concent_warp.recording.formats.hdf5 import write_hdf5
@@ -32,6 +38,9 @@ def track(
     cameras: Sequence[str] = (),
     pose: str | Path | Mapping[str, np.ndarray] = "initial",
     scene: Scene | None = None,
+    masker: Masker | None = None,
+    points: PointTracker | None = None,
+    tracker: PoseTracker | None = None,
     keep_measured: bool = False,
     images: bool = False,
     out: str | Path | None = None,
@@ -52,6 +61,9 @@ def track(
         pose: First poses: "initial", the recording's initial state, or a search where it has none; "none", a search; a
             TOML or JSON file with position and quaternion of each body; or transforms, shape (4, 4), by body.
         scene: Scene in place of the recording's own.
+        masker: Makes masks of the bodies, such as `DepthMasker` or `Sam2Masker`; what is outside them is left out.
+        points: Follows points, such as `FlowTracker`, `FeatureTracker` or `TapirTracker`, which then give the poses.
+        tracker: Tracker of poses in place of the default, in place of `masker` and `points`, too.
         keep_measured: Whether measured poses in the recording stay instead of the tracked ones.
         images: Whether the result keeps the video.
         out: File to write the recording to, whole or not at all.
@@ -60,6 +72,7 @@ def track(
     Raises:
         RecordingError: There is no video with depth, no such body or camera, a first pose disagrees with the image, or
             no body was found.
+        ConcentError: `tracker` is given together with `masker` or `points`.
 
     Example:
         >>> import concent_warp as cw
@@ -71,6 +84,7 @@ def track(
     """
     cfg = cfg or TrackCfg()
     check_settings(cfg)
+    tracker = _tracker(cfg, masker, points, tracker)
     scene = scene or Scene(recording.scene, recording.source)
     names = _movable(scene, bodies)
     try:
@@ -89,7 +103,7 @@ def track(
             )
         first = first_poses(pose, scene, demonstration, shapes, where)
         step = None if progress is None else lambda share, k=k: progress((k + share) / count)
-        found = track_bodies(scene, video, shapes, first, cfg, demonstration.name, where, step)
+        found = tracker.track(TrackingInput(scene, video, shapes, first, demonstration.name, where), step)
         if all(t.lost.all() for t in found):
             reasons = "; ".join(f"{t.body}: {t.reason or 'hidden'}" for t in found)
             raise RecordingError(
@@ -105,6 +119,21 @@ def track(
     else:
         validate(result)
     return Tracked(result, tuple(tracks), tuple(remarks))
+
+
+def _tracker(
+    cfg: TrackCfg, masker: Masker | None, points: PointTracker | None, tracker: PoseTracker | None
+) -> PoseTracker:
+    """Return what tracks poses.
+
+    Raises:
+        ConcentError: Both a tracker and parts of another one are given.
+    """
+    if tracker is not None:
+        if masker is not None or points is not None:
+            raise ConcentError("a tracker of poses has its own masks and points", expected="tracker, or masker, points")
+        return tracker
+    return ModelToFrameTracker(cfg, masker=masker) if points is None else PointPoseTracker(points, cfg, masker=masker)
 
 
 def _movable(scene: Scene, bodies: Sequence[str] | None) -> list[str]:

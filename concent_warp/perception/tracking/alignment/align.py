@@ -232,7 +232,8 @@ def _agreement(
         return None
     tolerance = max(cfg.depth_tolerance, 4 * depth_std if np.isfinite(depth_std) else 0.0)
     difference = crop.measured - crop.depth
-    with_depth = crop.own & (crop.measured > 0)
+    # What covers the body off its mask is left out; what is seen behind it there still speaks against the pose.
+    with_depth = crop.own & (crop.measured > 0) & (crop.mask | (difference > tolerance))
     inner = cv2.erode(crop.own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     inner = inner & with_depth if (inner & with_depth).sum() >= cfg.min_pixels else with_depth
     count = max(int(inner.sum()), 1)
@@ -244,7 +245,7 @@ def _agreement(
     depths = crop.depth[crop.own]
     near = crop.measured < (depths.max() + tolerance if len(depths) else 0.0)
     near &= crop.measured > (depths.min() - tolerance if len(depths) else 0.0)
-    strange = int((ring & near & (crop.measured < crop.depth - tolerance)).sum())
+    strange = int((ring & near & crop.mask & (crop.measured < crop.depth - tolerance)).sum())
     alone = _outline_pixels(view, shape, pose, crop)
     misfit, scatter = _misfit(np.where(inner & (np.abs(difference) < 2 * tolerance), difference, np.nan))
     return Agreement(

@@ -89,7 +89,7 @@ def unknown_points(
     pixels = pixel_grid(*view.shape)[window][::stride, ::stride].reshape(-1, 2)
     measured = view.depth[window][::stride, ::stride].ravel().astype(float)
     expected = renderer.cast(view.camera, pixels).depth
-    front = (measured > 0) & (measured < expected - cfg.foreground)
+    front = (measured > 0) & (measured < expected - cfg.foreground) & view.may_show(pixels)
     points = view.camera.lift(pixels[front], measured[front])
     return points[np.linalg.norm(points - centre, axis=1) < radius]
 

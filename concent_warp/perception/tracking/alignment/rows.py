@@ -100,6 +100,8 @@ class Crop:
     """Rays scaled to a depth of 1, world frame, shape (h, w, 3)."""
     measured: np.ndarray
     """Measured depth [m], shape (h, w), 0 where there is none."""
+    mask: np.ndarray
+    """Pixels that may be the body's by the frame's mask, shape (h, w) bool; all where it has none."""
     centre: np.ndarray
     """Middle of the body [m], world frame, shape (3,)."""
     reach: float
@@ -137,6 +139,7 @@ def rendered_crop(renderer: RayRenderer, view: View, shape: TrackedShape, pose: 
         hits.normal.reshape(*size, 3),
         hits.rays.reshape(*size, 3),
         view.depth[np.ix_(rows, columns)].astype(float),
+        np.ones(size, dtype=bool) if view.mask is None else view.mask[np.ix_(rows, columns)],
         centre,
         shape.reach,
     )
@@ -162,7 +165,7 @@ def depth_rows(
     mask = inner if inner.sum() > 0.4 * crop.own.sum() else crop.own
     slope = -np.einsum("hwk,hwk->hw", crop.normal, crop.rays)
     difference = np.where(mask, crop.measured - np.where(mask, crop.depth, 0.0), 0.0)
-    used = mask & (crop.measured > 0) & (np.abs(difference) < gate)
+    used = mask & crop.mask & (crop.measured > 0) & (np.abs(difference) < gate)
     used &= slope > cfg.slant * np.linalg.norm(crop.rays, axis=2)
     count = int(used.sum())
     if count < 6:
@@ -260,6 +263,7 @@ def edge_rows(
     across *= np.where(sign > 0, -1.0, 1.0)[:, None]
     limit = np.array(view.shape[::-1]) - 1 - reach
     good = ((pixels >= reach) & (pixels <= limit)).all(axis=1) & (depth > 0) & (length > 1e-6)
+    good &= view.may_show(pixels)
     slack = 0.03 * shape.reach
     steps = np.array(PROFILE) * (reach + 1)
     places = np.concatenate([pixels - 0.7 * across * contour[use, None], *(pixels + step * across for step in steps)])

@@ -123,7 +123,7 @@ def foreground_clusters(renderer: RayRenderer, view: View, cfg: SearchCfg) -> li
     # The rims of what is known are not where they should be by a pixel or so.
     flat = np.where(np.isfinite(expected), expected, 1e3)
     rim = cv2.morphologyEx(flat.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > cfg.depth_jump
-    front = (measured > 0) & (measured < expected - cfg.foreground) & ~rim
+    front = (measured > 0) & (measured < expected - cfg.foreground) & ~rim & view.may_show(pixels).reshape(size)
     front = cv2.morphologyEx(front.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
     # Where depth jumps from pixel to pixel, one thing ends and another begins.
     shown = np.where(measured > 0, measured, np.nan)

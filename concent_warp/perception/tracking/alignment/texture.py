@@ -108,7 +108,7 @@ def new_keyframe(view: View, crop: Crop, pose: np.ndarray, covariance: np.ndarra
     rays = view.camera.rays(around) @ view.camera.pose[:3, :3].T
     lean = np.einsum("npk,nk->np", rays, normal)
     level = np.einsum("nk,nk->n", anchor - view.camera.position, normal)
-    good = crop.own[i, j] & (brightness.std(axis=1) > cfg.min_contrast * view.noise)
+    good = crop.own[i, j] & crop.mask[i, j] & (brightness.std(axis=1) > cfg.min_contrast * view.noise)
     good &= -np.einsum("nk,nk->n", normal, crop.rays[i, j]) > LOOKED_AT * np.linalg.norm(crop.rays[i, j], axis=1)
     good &= (
         np.linalg.norm(crop.normal[i, j] - _corner_normals(crop, i, j, max(1, half // stride)), axis=2).max(axis=0)
@@ -168,7 +168,7 @@ def texture_rows(
     sight = points - view.camera.position
     cosine = -np.einsum("nk,nk->n", keyframe.normals @ pose[:3, :3].T, sight) / np.linalg.norm(sight, axis=1)
     border = cfg.half_patch + cfg.max_shift + 2
-    inside = ((pixels > border) & (pixels < np.array(view.shape[::-1]) - border)).all(axis=1)
+    inside = ((pixels > border) & (pixels < np.array(view.shape[::-1]) - border)).all(axis=1) & view.may_show(pixels)
     hits = renderer.cast(view.camera, pixels)
     seen = (
         inside
@@ -237,7 +237,7 @@ def common_shift(
     facing = -np.einsum("nk,nk->n", keyframe.normals @ pose[:3, :3].T, sight) > LOOKED_AT * np.linalg.norm(
         sight, axis=1
     )
-    seen = facing & (renderer.cast(view.camera, pixels).body == shape.row)
+    seen = facing & view.may_show(pixels) & (renderer.cast(view.camera, pixels).body == shape.row)
     rows = np.flatnonzero(seen)[:: max(1, int(seen.sum()) // SHIFTED_PATCHES)]
     if len(rows) < 4:
         return np.zeros(3)

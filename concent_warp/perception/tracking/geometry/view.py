@@ -11,6 +11,8 @@ from concent_warp.perception.pinhole import Pinhole
 
 NOISE_KERNEL = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
 """Mask that is blind to even shading (as in Immerkaer, "Fast noise variance estimation", CVIU 64(2), 1996)."""
+MASK_ERROR = 3
+"""Distance of a mask's border from the object's outline that is allowed for [px]."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class View:
     """Colour, uint8, shape (H, W, 3)."""
     depth: np.ndarray
     """Measured depth [m], float32, shape (H, W), 0 where there is none."""
+    mask: np.ndarray | None = None
+    """Pixels of the body that is looked for, shape (H, W) bool; None where they are not known."""
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -30,6 +34,24 @@ class View:
         import cv2
 
         return cv2.cvtColor(np.ascontiguousarray(self.rgb), cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+    @cached_property
+    def _around_mask(self) -> np.ndarray | None:
+        """The mask, widened by the error of its border."""
+        import cv2
+
+        if self.mask is None:
+            return None
+        return cv2.dilate(self.mask.astype(np.uint8), np.ones((2 * MASK_ERROR + 1,) * 2, np.uint8)) > 0
+
+    def may_show(self, pixels: np.ndarray) -> np.ndarray:
+        """Return whether pixels (n, 2) [px] lie on the mask or at its border, shape (n,); all where there is none."""
+        mask = self._around_mask
+        if mask is None:
+            return np.ones(len(pixels), dtype=bool)
+        inside = ((pixels > -0.5) & (pixels < np.array(self.shape[::-1]) - 0.5)).all(axis=1)
+        at = np.round(np.where(inside[:, None], pixels, 0)).astype(int)
+        return inside & mask[at[:, 1], at[:, 0]]
 
     @property
     def shape(self) -> tuple[int, int]:

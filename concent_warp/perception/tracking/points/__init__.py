@@ -1,0 +1,1 @@
+"""Poses from points that are tracked in the images."""
