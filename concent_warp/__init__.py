@@ -45,10 +45,21 @@ _HOMES = {
     "fit.geometry.search": ("FitResult",),
     "ground": ("GroundCfg", "Grounded", "ground"),
     "model": ("Model", "load_model"),
+    "perception.backends.cfg": (
+        *("DepthMaskerCfg", "FeatureTrackerCfg", "FlowTrackerCfg"),
+        *("Sam2MaskerCfg", "TapirTrackerCfg"),
+    ),
+    "perception.backends.depth": ("DepthMasker",),
+    "perception.backends.features": ("FeatureTracker",),
+    "perception.backends.flow": ("FlowTracker",),
+    "perception.backends.protocols": ("CameraFrames", "MaskPrompt", "Masker", "PixelTracks", "PointTracker"),
+    "perception.backends.sam2": ("Sam2Masker",),
+    "perception.backends.tapir": ("TapirTracker",),
     "perception.calibration.calibrate": ("calibrate",),
     "perception.calibration.cfg": ("CalibrateCfg", "CalibrationTargetCfg"),
     "perception.calibration.result": ("Calibration", "CameraCalibration"),
     "perception.tracking.cfg": ("TrackCfg",),
+    "perception.tracking.pose_tracker": ("ModelToFrameTracker", "PointPoseTracker", "PoseTracker", "TrackingInput"),
     "perception.tracking.result": ("BodyTrack", "Tracked"),
     "perception.tracking.track": ("track",),
     "recording.formats.hdf5": ("write_hdf5",),
@@ -110,10 +121,29 @@ if TYPE_CHECKING:
     from concent_warp.fit.geometry.search import FitResult
     from concent_warp.ground import GroundCfg, Grounded, ground
     from concent_warp.model import Model, load_model
+    from concent_warp.perception.backends.cfg import (
+        DepthMaskerCfg,
+        FeatureTrackerCfg,
+        FlowTrackerCfg,
+        Sam2MaskerCfg,
+        TapirTrackerCfg,
+    )
+    from concent_warp.perception.backends.depth import DepthMasker
+    from concent_warp.perception.backends.features import FeatureTracker
+    from concent_warp.perception.backends.flow import FlowTracker
+    from concent_warp.perception.backends.protocols import CameraFrames, Masker, MaskPrompt, PixelTracks, PointTracker
+    from concent_warp.perception.backends.sam2 import Sam2Masker
+    from concent_warp.perception.backends.tapir import TapirTracker
     from concent_warp.perception.calibration.calibrate import calibrate
     from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
     from concent_warp.perception.calibration.result import Calibration, CameraCalibration
     from concent_warp.perception.tracking.cfg import TrackCfg
+    from concent_warp.perception.tracking.pose_tracker import (
+        ModelToFrameTracker,
+        PointPoseTracker,
+        PoseTracker,
+        TrackingInput,
+    )
     from concent_warp.perception.tracking.result import BodyTrack, Tracked
     from concent_warp.perception.tracking.track import track
     from concent_warp.recording.formats.hdf5 import write_hdf5

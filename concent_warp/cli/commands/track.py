@@ -10,9 +10,16 @@ import numpy as np
 import tyro
 from rich.markup import escape
 
-from concent_warp.cli.options import OutPath
+from concent_warp.checks import check_device
+from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.model import Model
+from concent_warp.perception.backends.named import (
+    MaskerName,
+    PointTrackerName,
+    named_masker,
+    named_point_tracker,
+)
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
 from concent_warp.recording.load import load_recording
@@ -40,6 +47,19 @@ class Arguments:
     """Cameras to use; all with depth by default."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
+    masker: MaskerName = "none"
+    """Masks of the bodies, outside of which nothing is looked at: depth (what stands out from robot and static scene)
+    or sam2 (SAM 2 with --masker-weights)."""
+    masker_weights: Path | None = None
+    """Folder with a checkpoint of SAM 2 in the format of transformers."""
+    points: PointTrackerName = "none"
+    """Points that are tracked in the images and give the poses between keyframes: flow (optical flow), features (XFeat)
+    or tapir (TAPIR or BootsTAPIR with --points-checkout and --points-weights)."""
+    points_checkout: Path | None = None
+    """Folder with a checkout of github.com/google-deepmind/tapnet, whose code is run."""
+    points_weights: Path | None = None
+    """Checkpoint of TAPIR for torch."""
+    device: DeviceOption = None
     keep_measured: bool = False
     """Keep measured poses of the objects that are in the recording, rather than replace them."""
     images: bool = False
@@ -53,6 +73,11 @@ class Arguments:
 def run(arguments: Arguments) -> Tracked:
     """Track, write, and say what was found."""
     claim_file(arguments.out, overwrite=arguments.overwrite)
+    check_device(arguments.device)
+    masker = named_masker(arguments.masker, arguments.masker_weights, arguments.device)
+    points = named_point_tracker(
+        arguments.points, arguments.points_checkout, arguments.points_weights, arguments.device
+    )
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     scene = None if arguments.model is None else Model.load(arguments.model).scene
     make_folder(arguments.out.parent)
@@ -63,6 +88,8 @@ def run(arguments: Arguments) -> Tracked:
             cameras=arguments.camera,
             pose=arguments.pose,
             scene=scene,
+            masker=masker,
+            points=points,
             keep_measured=arguments.keep_measured,
             images=arguments.images,
             out=arguments.out,

@@ -110,6 +110,8 @@ class DepthMaskerCfg:
     """The same along the line of sight [m]."""
     min_pixels: Count = 20
     """Least number of pixels of an object that is seen."""
+    max_growth: Positive = 1.3
+    """Pixels over the most that the object had, up to which what its mask lies on is the object as a whole [-]."""
 
 
 @dataclass(frozen=True)
@@ -126,5 +128,5 @@ class Sam2MaskerCfg:
     """Logit of a pixel above which it belongs to the object [-]."""
     min_presence: Annotated[float, Bounds(-100, 100)] = 0.0
     """Logit of the object's presence below which its mask is empty [-]."""
-    memory: Annotated[int, Bounds(8, 10_000)] = 32
+    memory: Annotated[int, Bounds(17, 10_000)] = 32
     """Former frames whose results are kept: the model looks at 7 masks and 16 object pointers."""

@@ -30,6 +30,8 @@ class _Last:
     """Depth of its nearest pixels [m], the nearest 5 % aside."""
     far: float
     """Depth of its farthest pixels [m], the farthest 5 % aside."""
+    largest: int
+    """Largest number of pixels that it had."""
 
 
 class DepthMasker:
@@ -69,7 +71,8 @@ class DepthMasker:
                         mask = self._followed(part, count, frames.depth[frame], previous.get(name))
                     if mask.sum() >= self.cfg.min_pixels:
                         near, far = np.quantile(frames.depth[frame][mask], (0.05, 0.95))
-                        previous[name] = _Last(mask, float(near), float(far))
+                        largest = max(int(mask.sum()), previous[name].largest if name in previous else 0)
+                        previous[name] = _Last(mask, float(near), float(far), largest)
                         result[name][frame] = mask
         return result
 
@@ -98,7 +101,12 @@ class DepthMasker:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         around = cv2.dilate(last.mask.astype(np.uint8), kernel) > 0
         around &= (depth > last.near - self.cfg.depth_reach) & (depth < last.far + self.cfg.depth_reach)
-        return _parts_mostly_in(part, count, around) & around
+        chosen = _parts_mostly_in(part, count, around) & around
+        # What covered a part of the object has gone: all of what its mask lies on is the object, if that is no larger.
+        total, inside = np.bincount(part.ravel(), minlength=count), np.bincount(part[last.mask], minlength=count)
+        whole = (inside > SAME_PART * last.mask.sum()) & (total < self.cfg.max_growth * last.largest)
+        whole[0] = False
+        return chosen | whole[part]
 
 
 def _prompted(part: np.ndarray, count: int, prompt: MaskPrompt) -> np.ndarray:

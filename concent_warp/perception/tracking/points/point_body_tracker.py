@@ -115,10 +115,12 @@ class PointBodyTracker(BodyTracker):
             return fit
         self.keyframes.append(made)
         seen = made.seen(self.video.frames[moment], views)
-        normals = [
-            point_rows(v, s, np.zeros(len(s.points)), fit.pose, np.ones(len(s.points), bool), self.cfg.align)
-            for v, s in zip(views, seen, strict=True)
-        ]
+        cfg = self.cfg
+        normals = []
+        for view, part in zip(views, seen, strict=True):
+            count = len(part.points)
+            every, no_depth = np.ones(count, dtype=bool), np.zeros(count)
+            normals.append(point_rows(view, part, no_depth, fit.pose, every, cfg.registration, cfg.align))
         return replace(fit, texture=[*fit.texture, *_numbered(made, normals)])
 
     def _is_due(self, moment: int, fit: Fit, views: Sequence[View]) -> bool:

@@ -79,9 +79,11 @@ def registered(
         return None
     parts = list(zip(views, seen, depths, agreeing, strict=True))
     for _ in range(cfg.iterations):
-        total = sum((point_rows(v, s, depth, pose, rows, align) for v, s, depth, rows in parts), Normal())
+        total = sum((point_rows(v, s, depth, pose, rows, cfg, align) for v, s, depth, rows in parts), Normal())
         pose = moved(pose, np.linalg.solve(total.information + 1e-3 * FREE, total.gradient))
-    normals = [point_rows(v, s, 0 * depth if cfg.shape else depth, pose, rows, align) for v, s, depth, rows in parts]
+    normals = [
+        point_rows(v, s, 0 * depth if cfg.shape else depth, pose, rows, cfg, align) for v, s, depth, rows in parts
+    ]
     return Registered(pose, normals, sum(int(rows.sum()) for rows in agreeing))
 
 
@@ -132,7 +134,13 @@ def _agreeing(view: View, seen: SeenPoints, depth: np.ndarray, pose: np.ndarray,
 
 
 def point_rows(
-    view: View, seen: SeenPoints, depth: np.ndarray, pose: np.ndarray, rows: np.ndarray, align: AlignCfg
+    view: View,
+    seen: SeenPoints,
+    depth: np.ndarray,
+    pose: np.ndarray,
+    rows: np.ndarray,
+    cfg: RegistrationCfg,
+    align: AlignCfg,
 ) -> Normal:
     """Return the normal equations of the pixels and depths of points at a pose.
 
@@ -142,6 +150,7 @@ def point_rows(
         depth: Measured depth of each [m], shape (n,), 0 where there is none.
         pose: The body's, shape (4, 4).
         rows: Points that count, shape (n,) bool.
+        cfg: Settings.
         align: Settings of scatters and weights.
     """
     if rows.sum() < 3:
@@ -150,7 +159,7 @@ def point_rows(
     pixels, away, projection = view.pixel_rows(points)
     jacobian = np.concatenate([point_jacobian(points, pose[:3, 3], projection[:, axis]) for axis in (0, 1)], axis=0)
     residual = (seen.pixels[rows] - pixels).T.ravel()
-    total, _, _ = weighted(jacobian, residual, align.min_texture_std, align)
+    total, _, _ = weighted(jacobian, residual, align.min_texture_std, align, cfg.inflation)
     known = depth[rows] > 0
     if known.sum() >= 3:
         sight = np.broadcast_to(view.camera.pose[:3, 2], (int(known.sum()), 3))
