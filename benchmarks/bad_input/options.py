@@ -105,7 +105,9 @@ WRONG = {
         "--method magic", "--cameras nothing", "--tag-size 0", "--start 1 2", "--target-body nothing",
     ),
     "track": (
-        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml",
+        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml", "--masker magic", "--masker sam2",
+        "--masker sam2 --masker-weights gone", "--masker-weights gone", "--points magic", "--points tapir",
+        "--points tapir --points-checkout gone --points-weights gone", "--points-weights gone", "--device gpu",
     ),
     "import": (
         "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",

@@ -46,3 +46,39 @@ def test_nothing_is_written_where_the_first_pose_is_refused(video, tmp_path, cap
     assert "first pose of 'block'" in said
     assert "Traceback" not in said
     assert not out.exists()
+
+
+def test_masks_and_points_are_chosen_by_name(video, tmp_path, capsys):
+    from concent_warp.cli import main
+
+    out = tmp_path / "tracked.h5"
+    line = ["track", str(video), "-o", str(out), "--pose", "none", "--json", "--points", "flow", "--masker", "depth"]
+    assert main(line) == 0
+    (figures,) = json.loads(capsys.readouterr().out)["tracks"]
+    assert figures["frames_lost"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--masker sam2", "--masker sam2 has no weights; expected --masker-weights FOLDER"),
+        ("--masker sam2 --masker-weights gone", "gone: no weights of SAM 2"),
+        ("--masker depth --masker-weights gone", "--masker-weights means nothing with --masker depth"),
+        ("--points tapir", "found no --points-checkout, --points-weights"),
+        ("--points tapir --points-checkout gone --points-weights gone.pt", "gone: no code of TAPIR"),
+        ("--points flow --points-weights gone.pt", "--points-weights means nothing with --points flow"),
+        ("--points-checkout gone", "--points-checkout means nothing with --points none"),
+        ("--device gpu", "no such device"),
+    ],
+)
+def test_what_a_masker_or_point_tracker_lacks_is_said_before_anything_is_read(
+    options, words, tmp_path, capsys, monkeypatch
+):
+    from concent_warp.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    assert main(["track", "nowhere.h5", *options.split()]) == 2
+    said = capsys.readouterr().err
+    assert words in " ".join(said.split())
+    assert "Traceback" not in said
+    assert not list(tmp_path.iterdir())

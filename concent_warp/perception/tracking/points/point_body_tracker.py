@@ -62,10 +62,9 @@ class PointBodyTracker(BodyTracker):
 
     def followed(self, renderer: RayRenderer, time: float, views: Sequence[View]) -> Fit | None:
         """Return the fit of the points, else that near the predicted pose; None where nothing agrees."""
-        if len(self.fits) >= len(self.video.time):
-            # The gaps are filled backward, where points are not followed.
-            return super().followed(renderer, time, views)
-        fit = self.by_registration(renderer, views)
+        # Gaps are filled backward, where points are not followed.
+        ahead = len(self.fits) < len(self.video.time)
+        fit = self.by_registration(renderer, views) if ahead else None
         if fit is not None:
             return self.settled(renderer, views, fit)
         return super().followed(renderer, time, views) if self.cfg.registration.fallback else None
@@ -125,16 +124,16 @@ class PointBodyTracker(BodyTracker):
 
     def _is_due(self, moment: int, fit: Fit, views: Sequence[View]) -> bool:
         """Return whether the moment should be a keyframe."""
-        if self.video.time[moment] - self.tried < self.cfg.search.interval:
-            return False
+        rested = self.video.time[moment] - self.tried >= self.cfg.search.interval
         if not self.keyframes:
-            return True
+            return rested
         keyframe, frames = self.keyframes[-1], self.video.frames[moment]
         if keyframe.ends(frames):
-            return True
+            # Its points are followed no further; attempts that failed since are not repeated at once.
+            return rested or self.tried == self.video.time[keyframe.moment]
         left = sum(len(part.points) for part in keyframe.seen(frames, views))
         turned = np.degrees(rotation_angle(keyframe.pose, fit.pose)) > self.cfg.texture.max_angle
-        return turned or left < self.cfg.registration.min_share * keyframe.count
+        return rested and (turned or left < self.cfg.registration.min_share * keyframe.count)
 
     def numbered_fits(self) -> tuple[list[Fit | None], int]:
         """See `BodyTracker.numbered_fits`; keyframes of points come after those of texture."""
