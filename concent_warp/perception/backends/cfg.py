@@ -104,8 +104,9 @@ class DepthMaskerCfg:
     """Distance in front of robot and static scene from which on a pixel belongs to an object [m]."""
     depth_jump: Positive = 0.01
     """Difference of depth between neighbouring pixels that separates two objects [m]."""
-    reach: Count = 24
-    """Distance that an object moves from frame to frame at most, per 640 pixels of the image's width [px]."""
+    reach: Count = 32
+    """Distance that an object moves from frame to frame at most, per 640 pixels of the image's width [px]; where it was
+    not seen in between, as many times that as frames have passed."""
     depth_reach: Positive = 0.03
     """The same along the line of sight [m]."""
     min_pixels: Count = 20

@@ -26,6 +26,8 @@ class _Last:
 
     mask: np.ndarray
     """Its pixels, shape (H, W) bool."""
+    frame: int
+    """The frame."""
     near: float
     """Depth of its nearest pixels [m], the nearest 5 % aside."""
     far: float
@@ -68,11 +70,11 @@ class DepthMasker:
                     if frame == prompts[name].frame:
                         mask = _prompted(part, count, prompts[name])
                     else:
-                        mask = self._followed(part, count, frames.depth[frame], previous.get(name))
+                        mask = self._followed(part, count, frames.depth[frame], previous.get(name), frame)
                     if mask.sum() >= self.cfg.min_pixels:
                         near, far = np.quantile(frames.depth[frame][mask], (0.05, 0.95))
                         largest = max(int(mask.sum()), previous[name].largest if name in previous else 0)
-                        previous[name] = _Last(mask, float(near), float(far), largest)
+                        previous[name] = _Last(mask, frame, float(near), float(far), largest)
                         result[name][frame] = mask
         return result
 
@@ -85,22 +87,22 @@ class DepthMasker:
         if frames.known is not None:
             front &= depth < frames.known(frame) - self.cfg.foreground
         jump = np.zeros(depth.shape, dtype=bool)
-        known = depth > 0
-        jump[:, 1:] |= (np.abs(np.diff(depth, axis=1)) > self.cfg.depth_jump) & known[:, 1:] & known[:, :-1]
-        jump[1:] |= (np.abs(np.diff(depth, axis=0)) > self.cfg.depth_jump) & known[1:] & known[:-1]
+        jump[:, 1:] |= (np.abs(np.diff(depth, axis=1)) > self.cfg.depth_jump) & front[:, 1:] & front[:, :-1]
+        jump[1:] |= (np.abs(np.diff(depth, axis=0)) > self.cfg.depth_jump) & front[1:] & front[:-1]
         count, part = cv2.connectedComponents((front & ~jump).astype(np.uint8), connectivity=4)
         return part, count
 
-    def _followed(self, part: np.ndarray, count: int, depth: np.ndarray, last: _Last | None) -> np.ndarray:
+    def _followed(self, part: np.ndarray, count: int, depth: np.ndarray, last: _Last | None, frame: int) -> np.ndarray:
         """Return the mask in a frame from where the object was seen last."""
         import cv2
 
         if last is None:
             return np.zeros(part.shape, dtype=bool)
-        reach = max(1, round(self.cfg.reach * part.shape[1] / 640))
+        gap = abs(frame - last.frame)
+        reach = max(1, round(gap * self.cfg.reach * part.shape[1] / 640))
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         around = cv2.dilate(last.mask.astype(np.uint8), kernel) > 0
-        around &= (depth > last.near - self.cfg.depth_reach) & (depth < last.far + self.cfg.depth_reach)
+        around &= (depth > last.near - gap * self.cfg.depth_reach) & (depth < last.far + gap * self.cfg.depth_reach)
         chosen = _parts_mostly_in(part, count, around) & around
         # What covered a part of the object has gone: all of what its mask lies on is the object, if that is no larger.
         total, inside = np.bincount(part.ravel(), minlength=count), np.bincount(part[last.mask], minlength=count)
