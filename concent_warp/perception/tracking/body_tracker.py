@@ -100,6 +100,7 @@ class BodyTracker:
             for start in (*starts, predicted):
                 if fit is None and start is not None:
                     fit = self.accepted(renderer, views, start, self.chosen(views, start), rough=True)
+                    fit = None if fit is None else self.same_representative(renderer, views, fit, predicted)
         return None if fit is None else self.settled(renderer, views, fit)
 
     def accepted(
@@ -200,6 +201,18 @@ class BodyTracker:
             return best
         reference = np.eye(4) if self.pose is None else self.pose
         return self.symmetry.nearest(pose, reference)
+
+    def same_representative(
+        self, renderer: RayRenderer, views: Sequence[View], fit: Fit, predicted: np.ndarray
+    ) -> Fit | None:
+        """Return a fit in that pose, of all that the symmetries make alike, which is nearest to the predicted one.
+
+        The points of a part of the body may be aligned in another; texture is compared in the nearest one.
+        """
+        pose = self.symmetry.nearest(fit.pose, predicted)
+        if rotation_angle(pose, fit.pose) < np.radians(self.cfg.search.same_rotation):
+            return fit
+        return self.accepted(renderer, views, pose, self.chosen(views, pose), rough=False)
 
     def numbered_fits(self) -> tuple[list[Fit | None], int]:
         """Return the fits of all moments and the number of keyframes that their texture refers to."""

@@ -34,10 +34,14 @@ class BodyMasks:
     missing where none are known."""
 
     def on(self, views: Sequence[View], frames: Sequence[tuple[int, int]], body: str) -> list[View]:
-        """Return views of a moment with the masks of a body; `frames` are camera and frame of each."""
+        """Return views of a moment with the masks of a body; `frames` are camera and frame of each.
+
+        Where a mask is empty, the masker does not know where the body is, and the whole frame is looked at.
+        """
         known = self.by_body.get(body, {})
         return [
-            replace(view, mask=known[c][k]) if c in known else view for view, (c, k) in zip(views, frames, strict=True)
+            replace(view, mask=known[c][k]) if c in known and known[c][k].any() else view
+            for view, (c, k) in zip(views, frames, strict=True)
         ]
 
 

@@ -245,7 +245,10 @@ def _agreement(
     depths = crop.depth[crop.own]
     near = crop.measured < (depths.max() + tolerance if len(depths) else 0.0)
     near &= crop.measured > (depths.min() - tolerance if len(depths) else 0.0)
-    strange = int((ring & near & crop.mask & (crop.measured < crop.depth - tolerance)).sum())
+    # Nothing is known of what is behind something off the mask.
+    in_front = crop.measured < crop.depth - tolerance
+    ring &= crop.mask | ~in_front
+    strange = int((ring & near & in_front).sum())
     alone = _outline_pixels(view, shape, pose, crop)
     misfit, scatter = _misfit(np.where(inner & (np.abs(difference) < 2 * tolerance), difference, np.nan))
     return Agreement(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from concent_warp.perception.rigid_motion import kabsch
-from concent_warp.perception.tracking.alignment.rows import DEFAULT_INFLATION, Normal, point_jacobian, weighted
+from concent_warp.perception.tracking.alignment.rows import DEFAULT_INFLATION, MAD, Normal, point_jacobian, weighted
 from concent_warp.perception.tracking.cfg import AlignCfg, RegistrationCfg
 from concent_warp.perception.tracking.geometry.pose import moved
 from concent_warp.perception.tracking.geometry.view import View
@@ -81,6 +81,8 @@ def registered(
     for _ in range(cfg.iterations):
         total = sum((point_rows(v, s, depth, pose, rows, cfg, align) for v, s, depth, rows in parts), Normal())
         pose = moved(pose, np.linalg.solve(total.information + 1e-3 * FREE, total.gradient))
+    if _pixel_scatter(parts, pose) > cfg.max_scatter:
+        return None
     normals = [
         point_rows(v, s, 0 * depth if cfg.shape else depth, pose, rows, cfg, align) for v, s, depth, rows in parts
     ]
@@ -131,6 +133,17 @@ def _agreeing(view: View, seen: SeenPoints, depth: np.ndarray, pose: np.ndarray,
     beside = np.linalg.norm(pixels - seen.pixels, axis=1) * np.abs(away) / focal
     along = np.where(depth > 0, np.abs(depth - away), 0.0)
     return (away > 0) & (np.hypot(beside, along) < tolerance)
+
+
+def _pixel_scatter(parts: Sequence[tuple[View, SeenPoints, np.ndarray, np.ndarray]], pose: np.ndarray) -> float:
+    """Return the scatter of the pixels of points that agree with a pose [px]; `parts` are views with their points, the
+    depths of these and which of them agree.
+    """
+    off = []
+    for view, seen, _, rows in parts:
+        pixels, _, _ = view.pixel_rows(seen.points[rows] @ pose[:3, :3].T + pose[:3, 3])
+        off.append((seen.pixels[rows] - pixels).ravel())
+    return MAD * float(np.median(np.abs(np.concatenate(off))))
 
 
 def point_rows(
