@@ -16,10 +16,10 @@ class Screen {
     this.camera = camera; this.frame = -1; this.pictures = []; this.centre = null;
     const shown = camera.time.length === camera.total ? `all ${camera.total} frames` : `${camera.time.length} of ${camera.total} frames shown`;
     const figure = document.createElement("figure");
-    figure.innerHTML = `<figcaption><b>${Chart.escape(camera.name)}</b><span class="quiet">${shown}</span></figcaption>
+    figure.innerHTML = `<figcaption><b>${Chart.escape(camera.name)}</b><span class="quiet"><span class="when"></span>, ${shown}</span></figcaption>
       <div class="screen"><canvas width="${camera.width}" height="${camera.height}" role="img" aria-label="frame of ${Chart.escape(camera.name)}"></canvas><svg></svg><div class="flag" hidden></div></div>`;
     host.append(figure);
-    this.box = figure.querySelector(".screen"); this.canvas = figure.querySelector("canvas"); this.svg = figure.querySelector("svg"); this.flag = figure.querySelector(".flag");
+    this.box = figure.querySelector(".screen"); this.canvas = figure.querySelector("canvas"); this.svg = figure.querySelector("svg"); this.flag = figure.querySelector(".flag"); this.when = figure.querySelector(".when");
     this.size = this.closeUp();
   }
   picture(k) {
@@ -65,6 +65,7 @@ class Screen {
     // Centres of pixels have whole coordinates.
     this.svg.setAttribute("viewBox", `${x - 0.5} ${y - 0.5} ${w} ${h}`);
     const bodies = Object.entries(camera.bodies), line = (ends) => { let d = ""; for (let i = 0; i < ends.length; i += 4) d += `M${ends[i] / 10} ${ends[i + 1] / 10}L${ends[i + 2] / 10} ${ends[i + 3] / 10}`; return d; };
+    this.when.textContent = `frame of ${camera.time[frame].toFixed(2)} s`;
     let out = "";
     if ($("outlines").checked) for (const [name, body] of bodies) {
       const seen = line(body.seen[frame]), kind = body.state[frame];

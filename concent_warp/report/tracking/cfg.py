@@ -21,8 +21,8 @@ class TrackReportCfg:
     max_frames: Count = 120
     """Most frames of each camera and demonstration that are shown, evenly spaced; plots show all [-]."""
     max_image_bytes: Annotated[int, Bounds(10_000, 1_000_000_000)] = 8_000_000
-    """Size of all images of the page as they are embedded [bytes]; of each camera fewer frames are shown where it would
-    be more."""
+    """Size of all images of the page as they are embedded [bytes]; of each camera fewer frames, at least one, are shown
+    where it would be more."""
     image_width: Annotated[int, Bounds(16, 16_383)] = 640
     """Largest width of the images [px]; larger ones are reduced."""
     image_quality: Annotated[int, Bounds(1, 100)] = 70

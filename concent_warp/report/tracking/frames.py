@@ -45,9 +45,16 @@ class CameraFrames:
 def shown_frames(videos: Sequence[Video], cfg: TrackReportCfg) -> list[list[CameraFrames]]:
     """Return the frames of each camera of each demonstration that are shown, within the size that is allowed."""
     found = [[_camera_frames(video, c, cfg) for c in range(len(video.streams))] for video in videos]
-    size = sum(len(image) for cameras in found for camera in cameras for image in camera.images)
-    factor = -(-size // cfg.max_image_bytes)
-    return found if factor <= 1 else [[camera.thinned(factor) for camera in cameras] for cameras in found]
+    factor, shown = 1, found
+    while _size(shown) > cfg.max_image_bytes and any(len(c.images) > 1 for cameras in shown for c in cameras):
+        factor += 1
+        shown = [[camera.thinned(factor) for camera in cameras] for cameras in found]
+    return shown
+
+
+def _size(frames: Sequence[Sequence[CameraFrames]]) -> int:
+    """Return the size of all images [bytes]."""
+    return sum(len(image) for cameras in frames for camera in cameras for image in camera.images)
 
 
 def _camera_frames(video: Video, camera: int, cfg: TrackReportCfg) -> CameraFrames:

@@ -13,7 +13,9 @@ from concent_warp.perception.tracking.geometry.view import View
 ASIDE = 0.02
 """Distance from an edge, over the body's reach, at which is looked up what covers it [-]."""
 SLACK = 0.04
-"""Distance of a surface in front, over the body's reach, from which on it covers an edge [-]."""
+"""Distance of another body in front, over the body's reach, from which on it covers an edge [-]."""
+OWN_SLACK = 0.15
+"""The same of the body itself [-]: at the contour of round shapes, triangles lie that far behind the exact surface."""
 FARTHEST = 10.0
 """Places farther outside the image than this many of its sizes are left out."""
 
@@ -47,13 +49,14 @@ def outline(renderer: RayRenderer, view: View, shape: TrackedShape, pose: np.nda
     beside = points[use] + ASIDE * shape.reach * edges.inward[use, front] @ rotation
     pixels, depth, _ = view.pixel_rows(beside)
     hits = renderer.cast(view.camera, pixels)
-    hidden = hits.depth < depth - SLACK * shape.reach
+    own = hits.body == shape.row
+    hidden = hits.depth < depth - np.where(own, OWN_SLACK, SLACK) * shape.reach
     half = edges.half[use, None] * edges.direction[use] @ rotation
     ends = np.concatenate([points[use] - half, points[use] + half])
     places, ahead, _ = view.pixel_rows(ends)
     near = (np.abs(places) < FARTHEST * max(view.shape)).all(axis=1) & (ahead > 1e-3)
     count = len(use)
-    drawn = near[:count] & near[count:] & ~(hidden & (hits.body == shape.row))
+    drawn = near[:count] & near[count:] & ~(hidden & own)
     segments = np.stack([places[:count], places[count:]], axis=1)[drawn]
     return _joined(segments, edges.edge[use][drawn], np.flatnonzero(drawn), hidden[drawn])
 
