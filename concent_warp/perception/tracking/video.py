@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.perception.configuration import configurations
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.tracking.configuration import configurations
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.view import View
 from concent_warp.recording.recording import Demonstration, ImageStream
