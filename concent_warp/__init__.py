@@ -60,7 +60,7 @@ _HOMES = {
     "perception.calibration.result": ("Calibration", "CameraCalibration"),
     "perception.tracking.cfg": ("TrackCfg",),
     "perception.tracking.pose_tracker": ("ModelToFrameTracker", "PointPoseTracker", "PoseTracker", "TrackingInput"),
-    "perception.tracking.result": ("BodyTrack", "Tracked"),
+    "perception.tracking.result": ("BodyTrack", "Tracked", "TrackQuality"),
     "perception.tracking.track": ("track",),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
@@ -69,6 +69,8 @@ _HOMES = {
     "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
+    "report.tracking.cfg": ("LiveTrackCfg", "TrackReportCfg"),
+    "report.tracking.report": ("write_track_report",),
     "scene.scene": ("Scene",),
     "scene.spheres.build": ("ContactGeometryCfg",),
     "scene.spheres.contact_geometry": ("ContactGeometry",),
@@ -144,7 +146,7 @@ if TYPE_CHECKING:
         PoseTracker,
         TrackingInput,
     )
-    from concent_warp.perception.tracking.result import BodyTrack, Tracked
+    from concent_warp.perception.tracking.result import BodyTrack, Tracked, TrackQuality
     from concent_warp.perception.tracking.track import track
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
@@ -153,6 +155,8 @@ if TYPE_CHECKING:
     from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
+    from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg
+    from concent_warp.report.tracking.report import write_track_report
     from concent_warp.scene.scene import Scene
     from concent_warp.scene.spheres.build import ContactGeometryCfg
     from concent_warp.scene.spheres.contact_geometry import ContactGeometry

@@ -108,6 +108,7 @@ WRONG = {
         "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml", "--masker magic", "--masker sam2",
         "--masker sam2 --masker-weights gone", "--masker-weights gone", "--points magic", "--points tapir",
         "--points tapir --points-checkout gone --points-weights gone", "--points-weights gone", "--device gpu",
+        "--report scene.xml", "--live --view.host nowhere.invalid",
     ),
     "import": (
         "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",

@@ -16,6 +16,7 @@ from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import Symmetry
 from concent_warp.perception.tracking.masks import body_masks, camera_frames
 from concent_warp.perception.tracking.points.point_body_tracker import PointBodyTracker
+from concent_warp.perception.tracking.moment import TrackedMoment
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.video import Video
 from concent_warp.scene.scene import Scene
@@ -43,6 +44,8 @@ class TrackingInput:
     """Name of the demonstration."""
     where: str
     """File and demonstration, for messages."""
+    watch: Callable[[TrackedMoment], None] | None = None
+    """Called after each moment, with its frames and what was found in them."""
 
 
 @runtime_checkable
@@ -92,7 +95,7 @@ class ModelToFrameTracker:
             masks = body_masks(self.masker, given.scene, given.video, given.shapes, given.first, self.cfg)
         return track_bodies(
             given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
-            masks=masks,
+            given.watch, masks=masks,
         )  # fmt: skip
 
 
@@ -129,5 +132,5 @@ class PointPoseTracker:
 
         return track_bodies(
             given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
-            make=make, masks=masks,
+            given.watch, make=make, masks=masks,
         )  # fmt: skip

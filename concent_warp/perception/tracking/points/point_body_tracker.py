@@ -93,7 +93,7 @@ class PointBodyTracker(BodyTracker):
             return None
         geometry = shaped.geometry if cfg.registration.shape else Normal()
         self.by_points += 1
-        return replace(shaped, geometry=geometry, texture=_numbered(keyframe, found.normals))
+        return replace(shaped, geometry=geometry, texture=_numbered(keyframe, found.normals), agreement=agreed)
 
     def settled(self, renderer: RayRenderer, views: Sequence[View], fit: Fit) -> Fit:
         """Return a fit; where points run out, after keyframes were made of the moment."""
