@@ -190,7 +190,7 @@ def page(rows: dict[str, Any]) -> str:
         INTRODUCTION.format(count=len(seeds), first=seeds[0], last=seeds[-1]),
         machine_line(next(iter(rows.values()))["machine"]) + "\n",
         table(head, lines),
-        "What the figures do not show: SAM 2 and TAPIR, whose weights users bring: they ran with made-up weights only;\n"
+        "What the figures do not show: SAM 2 and TAPIR, whose weights users bring: they ran with made-up weights;\n"
         "motion blur; a hand that touches the block, which depth alone cannot tell from it.\n",
     ])  # fmt: skip
 

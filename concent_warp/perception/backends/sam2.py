@@ -153,8 +153,9 @@ def _load(folder: Path) -> Any:
     shown = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
-        options = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
-        model, loaded = Sam2VideoModel.from_pretrained(folder, **options)
+        options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+        result: Any = Sam2VideoModel.from_pretrained(folder, **options)
+        model, loaded = result
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConcentError("the weights cannot be loaded", where=folder, expected=expected, found=found) from None

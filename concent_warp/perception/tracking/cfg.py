@@ -159,8 +159,8 @@ class RegistrationCfg:
     tolerance: Positive = 0.006
     """Distance within which a point agrees with a pose [m]: some standard deviations of a camera's depth at 1 m."""
     max_scatter: Positive = 0.6
-    """Largest scatter of the pixels of points that agree with a pose [px]: points that something drags along do not move
-    as one body."""
+    """Largest scatter of the pixels of points that agree with a pose [px]: points that something drags along do not
+    move as one body."""
     inflation: Annotated[float, Bounds(1, 1000)] = 8.0
     """Factor of the variance of tracked pixels [-]: their errors last over frames."""
     iterations: Count = 6

@@ -15,8 +15,8 @@ from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import Symmetry
 from concent_warp.perception.tracking.masks import body_masks, camera_frames
-from concent_warp.perception.tracking.points.point_body_tracker import PointBodyTracker
 from concent_warp.perception.tracking.moment import TrackedMoment
+from concent_warp.perception.tracking.points.point_body_tracker import PointBodyTracker
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.video import Video
 from concent_warp.scene.scene import Scene

@@ -50,14 +50,27 @@ def test_a_body_behind_an_unknown_hand_is_lost_without_masks_and_tracked_with_th
     assert rotation.max() < 3
 
 
-def test_a_mask_elsewhere_loses_the_body(plain):
-    class Elsewhere:
-        def masks(self, frames, prompts):
-            return {name: np.zeros((frames.count, *frames.size), dtype=bool) for name in prompts}
+def test_a_mask_elsewhere_loses_the_body_and_an_empty_one_changes_nothing(plain):
+    class Corner:
+        """Finds every object in a square at the image's corner."""
 
-    assert isinstance(Elsewhere(), cw.Masker)
+        edge = 30
+
+        def masks(self, frames, prompts):
+            result = {name: np.zeros((frames.count, *frames.size), dtype=bool) for name in prompts}
+            for mask in result.values():
+                mask[:, : self.edge, : self.edge] = True
+            return result
+
+    class Nowhere(Corner):
+        edge = 0
+
+    first, recording = {"block": plain.poses[0]}, shortened(plain, 2)
+    assert isinstance(Corner(), cw.Masker)
     with pytest.raises(cw.RecordingError, match="first pose of 'block'"):
-        cw.track(shortened(plain, 2), pose={"block": plain.poses[0]}, masker=Elsewhere())
+        cw.track(recording, pose=first, masker=Corner())
+    without = cw.track(recording, pose=first).track("block")
+    np.testing.assert_array_equal(cw.track(recording, pose=first, masker=Nowhere()).track("block").pose, without.pose)
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,8 @@ class View:
         if mask is None:
             return np.ones(len(pixels), dtype=bool)
         inside = ((pixels > -0.5) & (pixels < np.array(self.shape[::-1]) - 0.5)).all(axis=1)
-        at = np.round(np.where(inside[:, None], pixels, 0)).astype(int)
-        return inside & mask[at[:, 1], at[:, 0]]
+        column, row = np.round(np.where(inside[:, None], pixels, 0)).astype(int).T
+        return np.logical_and(inside, mask[row, column])
 
     @property
     def shape(self) -> tuple[int, int]:
