@@ -57,7 +57,7 @@ class View:
         if mask is None:
             return np.ones(len(pixels), dtype=bool)
         inside = ((pixels > -0.5) & (pixels < np.array(self.shape[::-1]) - 0.5)).all(axis=1)
-        column, row = np.round(np.where(inside[:, None], pixels, 0)).astype(int).T
+        column, row = np.round(np.where(inside[:, None], pixels, 0)).astype(int).T  # pyright: ignore[reportIndexIssue]
         return np.logical_and(inside, mask[row, column])
 
     @property
