@@ -88,7 +88,7 @@ def _record(
         trial = rig.plan(rng, k)
         trial = replace(trial, duration=trial.duration + begin - TAIL.get(rig.name, 0.0))
         motion, qpos, _ = perform(model, trial, effects, physics)
-        motion = TrueMotion(motion.time - begin, motion.sensordata)
+        motion = replace(motion, time=motion.time - begin)
         seen = signals(rig.scene.model, model, motion.sensordata)
         start = (None, None)
         if rig.start != "unknown":
