@@ -18,7 +18,7 @@ from benchmarks.independent.plane_contact import PlaneContact
 from concent_warp.reality.expert.plan import ExpertCfg
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.reality.rigs.insertion import TASK
-from concent_warp.reality.rigs.rig import TrueMotion, WorldPhysics, perform
+from concent_warp.reality.rigs.rig import WorldPhysics, perform
 from concent_warp.reality.sensors.sensing import SensingCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
 from concent_warp.recording.recording import Channel, Demonstration, Recording
@@ -88,7 +88,7 @@ def _record(
         trial = rig.plan(rng, k)
         trial = replace(trial, duration=trial.duration + begin - TAIL.get(rig.name, 0.0))
         motion, qpos, _ = perform(model, trial, effects, physics)
-        motion = TrueMotion(motion.time - begin, motion.sensordata)
+        motion = replace(motion, time=motion.time - begin)
         seen = signals(rig.scene.model, model, motion.sensordata)
         start = (None, None)
         if rig.start != "unknown":

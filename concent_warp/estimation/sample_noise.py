@@ -48,5 +48,5 @@ def whitened(value: np.ndarray, whitening: np.ndarray | None) -> np.ndarray:
     """Return residuals (T, k) times matrices (T, k, k); a sample with missing components stays as it is."""
     if whitening is None:
         return value
-    whole = np.isfinite(value).all(axis=1)
-    return np.where(whole[:, None], np.einsum("tij,tj->ti", whitening, np.where(whole[:, None], value, 0.0)), value)
+    whole = np.asarray(np.isfinite(value).all(axis=1, keepdims=True))
+    return np.where(whole, np.einsum("tij,tj->ti", whitening, np.where(whole, value, 0.0)), value)

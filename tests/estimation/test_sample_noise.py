@@ -53,8 +53,10 @@ def test_a_sample_that_claims_to_be_exact_counts_no_more_than_the_floor_lets_it(
     covariance = np.stack([np.zeros((3, 3)), *[np.eye(3)] * 9])
     channel = Channel(np.arange(10.0), np.zeros((10, 3)), None, None, covariance)
     matrices = relative_whitening(channel)
+    std = covariance_std(channel)
     assert matrices is not None
-    np.testing.assert_allclose(matrices[0], np.eye(3) * covariance_std(channel) / MIN_STD_SHARE)
+    assert std is not None
+    np.testing.assert_allclose(matrices[0], np.eye(3) * std / MIN_STD_SHARE)
 
 
 def test_missing_samples_and_components_stay_as_they_are():
@@ -90,5 +92,7 @@ def test_compare_and_fit_measure_an_error_by_the_noise_of_its_own_samples():
     assert ratios[1] == pytest.approx(1.0, abs=0.1)
     assert ratios[0] == pytest.approx(fitted.before, rel=0.1)
     # By one standard deviation for all, the poor half would hide most of the error.
-    alone = seen_by_turns(covariance=False)
-    assert compare({"before": before}, alone).summarise("before", "angle").ratio < 0.5 * ratios[0]
+    alone = compare({"before": before}, seen_by_turns(covariance=False)).summarise("before", "angle").ratio
+    assert alone is not None
+    assert ratios[0] is not None
+    assert alone < 0.5 * ratios[0]

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import concent_warp as cw
 from concent_warp.perception.tracking.geometry.outline import Outline
 from concent_warp.report.tracking.live import LOST_COLOUR, LiveTrackView, padded, picture, strip
+from tests.cli.live_page import BROWSER, opened
 from tests.report.drawn_film import drawn, poses
-
-sys.path.append(str(Path(__file__).parents[1] / "cli"))
-from live_page import BROWSER, opened
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
