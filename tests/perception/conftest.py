@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 import pytest
-from tests.perception.grasp_films import Film, filmed
 
 from concent_warp.reality.record import RealityCfg, record
+from tests.perception.grasp_films import Film, filmed
 
 
 @pytest.fixture(scope="session")

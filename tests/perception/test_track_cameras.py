@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from tests.perception.grasp_films import CAMERA, RATE, START
 
 import concent_warp as cw
 from concent_warp.perception.tracking.geometry.pose import twist_between
@@ -14,6 +13,7 @@ from concent_warp.reality.record import RealityCfg
 from concent_warp.reality.sensors.camera import record_depth_images
 from concent_warp.recording.recording import Channel, ImageStream
 from concent_warp.scene.scene import Scene
+from tests.perception.grasp_films import CAMERA, RATE, START
 
 OTHER = {"camera_position": (0.9, 0.55, 0.7), "camera_target": (0.47, -0.08, 0.04)}
 SHIFT = 0.12

@@ -13,6 +13,7 @@ from rich.markup import escape
 from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.model import Model
+from concent_warp.perception.tracking.cfg import AcceptCfg, TrackCfg
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
 from concent_warp.recording.load import load_recording
@@ -40,6 +41,8 @@ class Arguments:
     """Cameras to use; all with depth by default."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
+    unknown_surroundings: bool = False
+    """Accept poses whatever is beside the object: for objects on a table, or among others, that the scene lacks."""
     keep_measured: bool = False
     """Keep measured poses of the objects that are in the recording, rather than replace them."""
     images: bool = False
@@ -55,10 +58,12 @@ def run(arguments: Arguments) -> Tracked:
     claim_file(arguments.out, overwrite=arguments.overwrite)
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     scene = None if arguments.model is None else Model.load(arguments.model).scene
+    accept = AcceptCfg(max_unexplained=1.0) if arguments.unknown_surroundings else AcceptCfg()
     make_folder(arguments.out.parent)
     with progress_bar("tracking") as progress:
         found = track(
             recording,
+            TrackCfg(accept=accept),
             bodies=arguments.body or None,
             cameras=arguments.camera,
             pose=arguments.pose,
