@@ -82,7 +82,7 @@ WRONG = {
         "--checkpoint gone",
     ),
     "export": (
-        "--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what",
+        "--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what", "--recording recording.h5",
     ),
     "splat-fit": (
         "--points gone.ply", "--longest 0", "--device cuda:7", "--fit.degree 9", "--scale 0",

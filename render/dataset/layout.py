@@ -49,9 +49,9 @@ class EpisodeLayout:
         height, width = self.size
         if self.rate < 1 or self.rate != int(self.rate):
             raise RenderError("the rate of frames is not right", expected="a whole number of frames/s", found=self.rate)
-        if not ((self.cameras or self.more) and self.state and self.action):
-            found = f"{len(self.cameras)} cameras, {len(self.state)} numbers of state and {len(self.action)} of action"
-            raise RenderError("a data set needs images, a state and an action", found=found)
+        if not (self.state and self.action):
+            found = f"{len(self.state)} numbers of state and {len(self.action)} of action"
+            raise RenderError("a data set needs a state and an action", found=found)
         if height % 2 or width % 2 or height < 16 or width < 16:
             raise RenderError("images of this size make no video", expected="even, at least 16 x 16", found=self.size)
 
