@@ -152,7 +152,9 @@ def test_images_of_another_principal_point_are_resampled_to_the_first(scene):
 def test_gray_images_are_colours_of_one_kind(scene):
     (scene / "rgb").rename(scene / "gray")
     for path in (scene / "gray").iterdir():
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path), image)
     rgb = cw.import_log(scene)[0].image["camera"].rgb
     assert np.array_equal(rgb[..., 0], rgb[..., 2])
 
@@ -177,7 +179,8 @@ def test_a_textured_mesh_with_seams_is_closed(scene):
 
 def test_an_open_mesh_is_filled_and_one_that_cannot_be_is_named(scene):
     path = scene.parent.parent / "models" / "obj_000003.ply"
-    mesh = trimesh.load(path)
+    mesh = trimesh.load(path, force="mesh")
+    assert isinstance(mesh, trimesh.Trimesh)
     keep = np.ones(len(mesh.faces), bool)
     keep[0] = False
     mesh.update_faces(keep)

@@ -6,7 +6,7 @@ camera's frame is the world of the recording: the camera stands still, and the o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -138,8 +138,8 @@ def _with_truth(
     demonstration: Demonstration,
     model: mujoco.MjModel,
     instances: Sequence[BopInstance],
-    poses: dict[int, dict[BopInstance, np.ndarray]],
-    time: dict[int, float],
+    poses: Mapping[int, Mapping[BopInstance, np.ndarray]],
+    time: Mapping[int, float],
 ) -> Demonstration:
     """Return a demonstration with ground-truth poses as measurements and, if the first image has them, initial state.
 
