@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -212,6 +211,8 @@ def _view(
     renderer: RayRenderer, frame: _Frame, row: int, size: np.ndarray, cfg: RecordedViewsCfg
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """Return image, pose, intrinsics and known pixels of a frame, cropped to a size (width, height); None if hidden."""
+    import cv2
+
     stream, model = frame.stream, renderer.model
     renderer.set_state(frame.qpos)
     camera = _camera(renderer, stream)
