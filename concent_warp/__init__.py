@@ -49,7 +49,7 @@ _HOMES = {
     "perception.calibration.cfg": ("CalibrateCfg", "CalibrationTargetCfg"),
     "perception.calibration.result": ("Calibration", "CameraCalibration"),
     "perception.tracking.cfg": ("TrackCfg",),
-    "perception.tracking.result": ("BodyTrack", "Tracked"),
+    "perception.tracking.result": ("BodyTrack", "Tracked", "TrackQuality"),
     "perception.tracking.track": ("track",),
     "recording.formats.hdf5": ("write_hdf5",),
     "recording.load": ("load_recording",),
@@ -59,6 +59,8 @@ _HOMES = {
     "render.dataset.from_recording": ("WriteLeRobotCfg", "write_lerobot"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
+    "report.tracking.cfg": ("LiveTrackCfg", "TrackReportCfg"),
+    "report.tracking.report": ("write_track_report",),
     "scene.scene": ("Scene",),
     "scene.spheres.build": ("ContactGeometryCfg",),
     "scene.spheres.contact_geometry": ("ContactGeometry",),
@@ -115,7 +117,7 @@ if TYPE_CHECKING:
     from concent_warp.perception.calibration.cfg import CalibrateCfg, CalibrationTargetCfg
     from concent_warp.perception.calibration.result import Calibration, CameraCalibration
     from concent_warp.perception.tracking.cfg import TrackCfg
-    from concent_warp.perception.tracking.result import BodyTrack, Tracked
+    from concent_warp.perception.tracking.result import BodyTrack, Tracked, TrackQuality
     from concent_warp.perception.tracking.track import track
     from concent_warp.recording.formats.hdf5 import write_hdf5
     from concent_warp.recording.load import load_recording
@@ -125,6 +127,8 @@ if TYPE_CHECKING:
     from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
+    from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg
+    from concent_warp.report.tracking.report import write_track_report
     from concent_warp.scene.scene import Scene
     from concent_warp.scene.spheres.build import ContactGeometryCfg
     from concent_warp.scene.spheres.contact_geometry import ContactGeometry

@@ -64,7 +64,7 @@ class Grounded:
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("shape_sorter").run
+        >>> run = cw.load_policy("pick_align_insert").run
         >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
         >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
         >>> sorted(result.events)
@@ -117,7 +117,7 @@ def ground(
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("shape_sorter").run
+        >>> run = cw.load_policy("pick_align_insert").run
         >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
         >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
         >>> result.comparison.after

@@ -105,7 +105,8 @@ WRONG = {
         "--method magic", "--cameras nothing", "--tag-size 0", "--start 1 2", "--target-body nothing",
     ),
     "track": (
-        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml",
+        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml", "--report scene.xml",
+        "--live --view.host nowhere.invalid",
     ),
     "import": (
         "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",

@@ -73,7 +73,7 @@ WRITING = [
         "calibrate",
         f"calibrate {{inputs}}/{VIDEO} --method robot --out {{out}}/demo.h5 --picture {{out}}/picture.png",
     ),
-    Writing("track", f"track {{inputs}}/{VIDEO} --out {{out}}/tracked.h5"),
+    Writing("track", f"track {{inputs}}/{VIDEO} --out {{out}}/tracked.h5 --report {{out}}/track.html"),
     Writing(
         "geometry", f"geometry {{inputs}}/{RECORDING} --count {SPHERES} --out {{out}}/m.toml --export {{out}}/m.xml"
     ),

@@ -19,6 +19,7 @@ from concent_warp.estimation.rotations import (
     rotation_matrices,
     rotation_vectors,
 )
+from concent_warp.estimation.sample_noise import relative_whitening, whitened
 from concent_warp.estimation.sensors import LOCAL, Kind, body_of, kind_and_unit
 from concent_warp.recording.recording import Channel
 from concent_warp.simulate.replay import interpolate, predict
@@ -67,11 +68,19 @@ class Residual:
     """How far the measured values move: diagonal of the box that holds them, largest turn of an orientation."""
     local: bool = False
     """Whether `value` is in a frame that moves along with the body, rather than in the world frame."""
+    weight: np.ndarray | None = None
+    """How much more an error counts where the channel's covariances say that it is surer than on average, in the
+    error's own direction [-], shape (T,); None where all samples are alike."""
+
+    @property
+    def weighted(self) -> np.ndarray:
+        """Error as `noise` measures it, which is the error itself where all samples are alike, shape (T,)."""
+        return self.error if self.weight is None else self.error * self.weight
 
     @property
     def ratio(self) -> np.ndarray | None:
-        """Error over `noise` [-], shape (T,); root mean square 1 where only noise is left. None without noise."""
-        return self.error / self.noise if self.noise else None
+        """Error over noise [-], shape (T,); root mean square 1 where only noise is left. None without noise."""
+        return self.weighted / self.noise if self.noise else None
 
 
 def residuals(
@@ -150,7 +159,7 @@ def _sensor_residual(
     known = np.isfinite(channel.value)
     size = int(known.any(axis=0).sum()) if kind != "orientation" else value.shape[1]
     error = np.linalg.norm(value, axis=1) if kind == "orientation" else _norm(value, size)
-    if noise is None or channel.noise_std:
+    if noise is None or channel.noise_std or channel.covariance is not None:
         noise = channel_noise(channel, kind)
     std = noise.std if np.isfinite(noise.std) else None
     return Residual(
@@ -166,7 +175,23 @@ def _sensor_residual(
         source=noise.source,
         extent=_extent(channel.value, kind),
         local=int(compiled.sensor_type[row]) in LOCAL,
+        weight=_weight(value, channel),
     )
+
+
+def _weight(value: np.ndarray, channel: Channel) -> np.ndarray | None:
+    """Return the length of whitened residuals over theirs, shape (T,), 1 where there is none; None without covariances.
+
+    Args:
+        value: Residuals, shape (T, k).
+        channel: The channel.
+    """
+    matrices = relative_whitening(channel)
+    if matrices is None:
+        return None
+    length = np.linalg.norm(value, axis=1)
+    usable = np.isfinite(length) & (length > 0)
+    return np.where(usable, np.linalg.norm(whitened(value, matrices), axis=1) / np.where(usable, length, 1.0), 1.0)
 
 
 def _norm(value: np.ndarray, size: int) -> np.ndarray:

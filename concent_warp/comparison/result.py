@@ -203,7 +203,7 @@ class Comparison:
             p95=_statistic(lambda e: np.percentile(e, 95), pooled),
             max=_statistic(np.max, pooled),
             noise=noise,
-            ratio=noise_ratio(pooled, noise) if noise else None,
+            ratio=noise_ratio(np.concatenate([r.weighted[mask] for r, mask in found]), noise) if noise else None,
             source=sources[0] if sources else "unknown",
         )
 

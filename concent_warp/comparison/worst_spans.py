@@ -178,7 +178,7 @@ def _channel_spans(
         first, last = float(residual.time[lost.argmax()]), float(residual.time[-1])
         rows = np.flatnonzero(lost)
         yield _described(residual, rows, first, first, phases, partners, demonstration, cfg, last)
-    level = _smoothed(residual.time, np.where(lost, np.nan, residual.error) / floor, cfg)
+    level = _smoothed(residual.time, np.where(lost, np.nan, residual.weighted) / floor, cfg)
     above = level >= cfg.min_ratio
     taken = np.zeros(len(level), dtype=bool)
     for _ in range(cfg.max_similar):
@@ -262,7 +262,7 @@ def _described(
         onset=onset,
         error=rms,
         unit=residual.unit,
-        ratio=noise_ratio(error, residual.noise) if residual.noise else None,
+        ratio=noise_ratio(residual.weighted[rows], residual.noise) if residual.noise else None,
         against=touching.names if touching else (),
         point=touching.point if touching else None,
         direction=text if np.isfinite(rms) else "",

@@ -114,6 +114,8 @@ def _add(digest: Any, item: Any) -> None:
         digest.update(np.ascontiguousarray(item).tobytes())
     elif isinstance(item, Channel):
         _add(digest, [item.time, item.value, repr(item.noise_std)])
+        if item.covariance is not None:
+            _add(digest, item.covariance)
     elif is_dataclass(item) and not isinstance(item, type):
         _add(digest, [getattr(item, f.name) for f in fields(item)])
     elif isinstance(item, list | tuple):

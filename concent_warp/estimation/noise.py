@@ -20,6 +20,7 @@ import numpy as np
 
 from concent_warp.checks import MAX_COUNT, Bounds, Count, Factor, Share
 from concent_warp.estimation.rotations import rotation_vectors
+from concent_warp.estimation.sample_noise import covariance_std
 from concent_warp.estimation.sensors import Kind
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def pooled_noise(channels: Sequence[Channel], kind: Kind, cfg: NoiseCfg | None =
         cfg: Settings.
     """
     cfg = cfg or NoiseCfg()
-    stated = [c.noise_std for c in channels if c.noise_std]
+    stated = [std for c in channels if (std := c.noise_std or covariance_std(c))]
     if stated:
         return Noise(float(np.sqrt(np.mean(np.square(stated)))), "stated")
     if kind != "orientation" and any(map(_is_partial, channels)):

@@ -77,7 +77,7 @@ def fit_geometry(
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("shape_sorter").run
+        >>> run = cw.load_policy("pick_align_insert").run
         >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
         >>> fit.stopped
         'all 1 generations done'

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import socket
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import ConcentError
+from concent_warp.report.live_server import started_server
 from concent_warp.report.scene_data import SHAPES, VISIBLE_GROUPS, mesh_arrays
 from concent_warp.scene.spheres.contact_geometry import ContactGeometry
 
@@ -78,19 +78,11 @@ class LiveView:
         Raises:
             ConcentError: The address cannot be served on, or the speed is not among those of the page.
         """
-        import viser
-
         if not SPEEDS[0] <= speed <= SPEEDS[1]:
             raise ConcentError("the speed is not right", expected=f"{SPEEDS[0]:g} to {SPEEDS[1]:g}", found=speed)
         self.controls, self.changed = ViewerControls(speed=speed), threading.Event()
         self._geometry, self._kept = geometry, np.asarray(kept, dtype=bool)
-        try:
-            socket.create_server((host, 0)).close()  # viser would wait for ever
-        except OSError as error:
-            raise ConcentError("no page can be served at this address", where=host, found=error.strerror) from None
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
-            self._server = viser.ViserServer(host=host, port=port, label="ConCent", verbose=False)
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server = started_server(host, port)
         self._server.scene.set_up_direction("+z")
         # Viser's default lights desaturate colours.
         self._server.scene.configure_environment_map(environment_intensity=BRIGHTNESS)

@@ -45,7 +45,7 @@ def _opening(comparison: Comparison, model: str, demonstration: str) -> Opening:
         measured = np.flatnonzero(~np.isnan(residual.error))
         if not len(measured):
             continue
-        ratio = _noise_ratio(residual.error[measured], residual)
+        ratio = _noise_ratio(residual.weighted[measured], residual)
         if ratio > best.ratio:
             largest = measured[int(residual.error[measured].argmax())]
             best = Opening(residual.channel, float(residual.time[largest]), ratio)
@@ -53,7 +53,7 @@ def _opening(comparison: Comparison, model: str, demonstration: str) -> Opening:
 
 
 def _noise_ratio(error: np.ndarray, residual: Residual) -> float:
-    """Return the RMS of errors (n,) over the noise floor [-], 0 where the noise is unknown."""
+    """Return the RMS of weighted errors (n,) over the noise floor [-], 0 where the noise is unknown."""
     if not np.isfinite(error).all():
         return float("inf")
     return float(np.sqrt(np.mean(error**2)) / residual.noise) if residual.noise else 0.0

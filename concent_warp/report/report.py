@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping, Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from concent_warp.checks import check_settings
-from concent_warp.comparison.result import Comparison, finite
+from concent_warp.comparison.result import Comparison
 from concent_warp.diagnosis.forces.result import UnexplainedForces
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.events.sequence import ContactEventSequence
@@ -21,6 +18,7 @@ from concent_warp.report.diagnosis_section import bullet_list, diagnosis_section
 from concent_warp.report.headline import cards, headline_channel, verdict
 from concent_warp.report.page_data import kind_of, ordered_channels, page_data
 from concent_warp.report.tables import demonstration_table, error_table, provenance
+from concent_warp.report.template import filled, options, page_file, script_json
 from concent_warp.report.worst_spans import noise_words, shown_demonstrations, worst_span_list
 from concent_warp.version import __version__
 
@@ -79,8 +77,8 @@ def write_report(
         "subtitle": escape(_subtitle(recording, comparison, fitted)),
         "verdict": escape(verdict(comparison, fitted, overlap, cfg)),
         "cards": "\n".join(card.html() for card in cards(comparison, events, fitted, overlap, cfg)),
-        "demonstration_options": _options([d.name for d in chosen]),
-        "channel_options": _options(ordered_channels(comparison)),
+        "demonstration_options": options([d.name for d in chosen]),
+        "channel_options": options(ordered_channels(comparison)),
         "model_keys": "".join(
             f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
         )
@@ -93,12 +91,12 @@ def write_report(
             f"{_bands(comparison)}, found in the replay of the last model; numbers mark the worst spans. "
             "Click to move the replay to that instant."
         ),
-        "schedule": _page_file("schedule.html") if events else "",
+        "schedule": page_file("schedule.html") if events else "",
         "replay_about": (
             "The recorded commands, simulated open loop from the recorded initial state. "
             "Green: the measured pose of the objects, or the tracked points where no pose was measured."
         ),
-        "follow_options": _options(_follow_order(data, comparison)) + '<option value="">the scene</option>',
+        "follow_options": options(_follow_order(data, comparison)) + '<option value="">the scene</option>',
         "replay_views": _views("replay", comparison, shown_models),
         "sphere_switch": SPHERE_SWITCH if data["geometry"] else "",
         "forces": _forces_section(data["forces"], location),
@@ -112,11 +110,11 @@ def write_report(
         "tables": _tables(comparison, fitted, overlap),
         "provenance": provenance(settings or {}),
         "footer": escape(f"Written by concent {__version__}. {_left_out(comparison, cfg.max_demonstrations)}"),
-        "data": _script_safe(json.dumps(finite(data), allow_nan=False, separators=(",", ":"))),
-        "style": _page_file("style.css"),
-        "script": "\n".join(_page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
+        "data": script_json(data),
+        "style": page_file("style.css"),
+        "script": "\n".join(page_file(name) for name in ("scene3d.js", "charts.js", "timeline.js", "page.js")),
     }
-    write_text(path, _filled(_page_file("page.html"), parts))
+    write_text(path, filled(page_file("page.html"), parts))
 
 
 def _follow_order(data: Mapping[str, Any], comparison: Comparison) -> list[str]:
@@ -135,9 +133,7 @@ def _worst_spans_section(comparison: Comparison, shown: Sequence[str]) -> str:
         f"Every channel over time, coloured by its error over the measurement noise.{strips} Bands are "
         f"{_bands(comparison)}. Click a strip or a place to see it in the replay. {noise_words(comparison)}"
     )
-    return _filled(
-        _page_file("worst_spans.html"), {"about": escape(about), "places": worst_span_list(comparison, shown)}
-    )
+    return filled(page_file("worst_spans.html"), {"about": escape(about), "places": worst_span_list(comparison, shown)})
 
 
 def _bands(comparison: Comparison) -> str:
@@ -156,16 +152,16 @@ def _forces_section(arrows: Sequence[Mapping[str, Any]], location: Mapping[str, 
     if not location:
         return ""
     bodies = list(dict.fromkeys(arrow["body"] for arrow in arrows))
-    view = _filled(_page_file("forces_view.html"), {"bodies": _options(bodies)}) if bodies else ""
-    return _filled(_page_file("forces.html"), {"views": view, "sentences": bullet_list(location.get("sentences", ()))})
+    view = filled(page_file("forces_view.html"), {"bodies": options(bodies)}) if bodies else ""
+    return filled(page_file("forces.html"), {"views": view, "sentences": bullet_list(location.get("sentences", ()))})
 
 
 def _geometry_section(data: Mapping[str, Any], comparison: Comparison, models: Mapping[str, Model]) -> str:
     """Return the section of the contact geometry, empty where there is none to show."""
     if not data["geometry"]:
         return ""
-    bodies = _options(data["geometry"]["bodies"])
-    return _filled(_page_file("geometry.html"), {"bodies": bodies, "views": _views("geometry", comparison, models)})
+    bodies = options(data["geometry"]["bodies"])
+    return filled(page_file("geometry.html"), {"bodies": bodies, "views": _views("geometry", comparison, models)})
 
 
 def _fit_section(fit: FitResult | None) -> str:
@@ -177,7 +173,7 @@ def _fit_section(fit: FitResult | None) -> str:
         f"{len(fit.history)} generations, {last['simulations']:,} simulations in {last['seconds']:.0f} s; "
         f"ended because: {fit.stopped}. {int(fit.mask.sum())} of {len(fit.mask)} spheres have moved."
     )
-    return _filled(_page_file("fit.html"), {"text": escape(text)})
+    return filled(page_file("fit.html"), {"text": escape(text)})
 
 
 def _tables(comparison: Comparison, fitted: Sequence[str], overlap: Mapping[str, Mapping[str, float]]) -> str:
@@ -224,26 +220,6 @@ def _left_out(comparison: Comparison, most: int) -> str:
     """Return which demonstrations have no charts."""
     more = len(comparison.demonstrations) - most
     return f"Charts and replay show {most} demonstrations; {more} more are in the tables." if more > 0 else ""
-
-
-def _options(names: Sequence[str]) -> str:
-    """Return the options of a list to choose from."""
-    return "".join(f'<option value="{escape(name)}">{escape(name)}</option>' for name in names)
-
-
-def _page_file(name: str) -> str:
-    """Return a file of the page that comes with this package."""
-    return files("concent_warp.report").joinpath("page", name).read_text(encoding="utf-8")
-
-
-def _filled(template: str, parts: Mapping[str, str]) -> str:
-    """Return a template with every ``[[name]]`` replaced, in one pass: inserted text is not searched."""
-    return re.sub(r"\[\[(\w+)\]\]", lambda found: parts[found[1]], template)
-
-
-def _script_safe(text: str) -> str:
-    """Return JSON that cannot end the script element that it stands in."""
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 PLACE_SWITCH = '<label><input type="checkbox" id="mark" checked> worst spans</label>'

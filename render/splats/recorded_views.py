@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from concent_warp.checks import Count, Positive, PositiveDuration, Share, check_settings
 from concent_warp.errors import RenderError
+from concent_warp.perception.configuration import configurations
 from concent_warp.perception.pinhole import Pinhole, pixel_grid
-from concent_warp.perception.tracking.configuration import configurations
 from concent_warp.perception.tracking.geometry.ray_renderer import HIDDEN_GROUP, RayRenderer
 from concent_warp.recording.recording import Demonstration, ImageStream, Recording
 from concent_warp.render.splats.views import SplatViews

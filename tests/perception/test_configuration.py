@@ -3,7 +3,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from concent_warp.perception.tracking.configuration import configurations
+from concent_warp.perception.configuration import configurations
 from concent_warp.recording.recording import Channel, Demonstration
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -41,3 +41,19 @@ def test_joints_follow_sensors_tendons_couplings_and_commands():
     np.testing.assert_allclose(at["driven"], [0.01, 0.02])
     np.testing.assert_allclose(at["follower"], 0.1 + 2 * np.array([0.25, 0.75]))
     assert unknown == ["loose"]
+
+
+def test_positions_that_are_given_lead_the_others_and_commands_can_be_left_out():
+    time = np.array([0.0, 1.0])
+    demonstration = Demonstration(
+        "demo_0",
+        action={"drive": Channel(time, np.array([0.01, 0.02]))},
+        measured={"angle": Channel(time, np.array([[0.0], [1.0]]))},
+    )
+    hinge = MODEL.joint("hinge").id
+    qpos, unknown = configurations(MODEL, demonstration, time, {hinge: np.array([0.5, 0.6])}, commanded=False)
+    at = {MODEL.joint(j).name: qpos[:, MODEL.jnt_qposadr[j]] for j in range(MODEL.njnt)}
+    np.testing.assert_allclose(at["hinge"], [0.5, 0.6])
+    np.testing.assert_allclose(at["follower"], 0.1 + 2 * np.array([0.5, 0.6]))
+    np.testing.assert_array_equal(at["driven"], 0)
+    assert unknown == ["left", "right", "driven", "loose"]

@@ -15,8 +15,9 @@ from concent_warp.model import Model
 from concent_warp.recording.recording import Channel, Demonstration, Recording
 from concent_warp.report.headline import _overlap_note
 from concent_warp.report.opening import first_demonstration, openings
-from concent_warp.report.report import _filled, write_report
+from concent_warp.report.report import write_report
 from concent_warp.report.scene_data import scene_bodies
+from concent_warp.report.template import filled
 from concent_warp.report.worst_spans import numbered_spans, shown_demonstrations
 from concent_warp.scene.scene import Scene
 
@@ -257,7 +258,7 @@ def test_meshes_of_any_size_stay_small(tmp_path):
 
 
 def test_what_is_put_into_a_template_is_not_looked_at_again():
-    assert _filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"
+    assert filled("[[a]] [[b]]", {"a": "[[b]]", "b": "x"}) == "[[b]] x"
 
 
 def test_the_page_opens_on_the_channel_farthest_above_its_noise_at_its_largest_error(case):

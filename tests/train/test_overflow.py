@@ -46,7 +46,7 @@ def trained(run: TrainingRun, folder: Path | None, **options):
     return trainer, [str(one.message) for one in caught if "dropped" in str(one.message)]
 
 
-@pytest.mark.parametrize(("contacts", "constraints"), [(1, 200), (60, 4)])
+@pytest.mark.parametrize(("contacts", "constraints"), [(1, 200), pytest.param(60, 4, marks=pytest.mark.slow)])
 def test_training_goes_on_with_larger_buffers_and_says_so(tmp_path, contacts, constraints):
     trainer, said = trained(made(contacts, constraints, 8), tmp_path)
     shares = [point["overflow"] for point in read_curve(tmp_path)]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +15,16 @@ from rich.markup import escape
 
 from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
+from concent_warp.errors import ConcentError
+from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.perception.tracking.cfg import AcceptCfg, TrackCfg
+from concent_warp.perception.tracking.moment import TrackedMoment
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import claim_file, make_folder
+from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg
+from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
 
 @dataclass(frozen=True)
@@ -47,20 +54,30 @@ class Arguments:
     """Keep measured poses of the objects that are in the recording, rather than replace them."""
     images: bool = False
     """Keep the video in the written recording."""
+    report: Path | None = None
+    """Write a page (.html) with the video, the outlines of the tracked bodies in it and plots in step to this file."""
+    live: bool = False
+    """While it is tracked, show the newest frame and the states so far in the browser."""
     json: bool = False
     """Print one JSON object with the figures, in SI units, instead of sentences."""
     overwrite: bool = False
-    """Replace the file if it is there."""
+    """Replace files that are there."""
+    page: TrackReportCfg = field(default_factory=TrackReportCfg)
+    view: LiveTrackCfg = field(default_factory=LiveTrackCfg)
 
 
 def run(arguments: Arguments) -> Tracked:
     """Track, write, and say what was found."""
-    claim_file(arguments.out, overwrite=arguments.overwrite)
+    if arguments.report is not None and arguments.report.resolve() == arguments.out.resolve():
+        raise ConcentError("recording and page have the same name", where=arguments.out, fix="name them differently")
+    for path in (arguments.out, arguments.report):
+        if path is not None:
+            claim_file(path, overwrite=arguments.overwrite)
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     scene = None if arguments.model is None else Model.load(arguments.model).scene
     accept = AcceptCfg(max_unexplained=1.0) if arguments.unknown_surroundings else AcceptCfg()
     make_folder(arguments.out.parent)
-    with progress_bar("tracking") as progress:
+    with all_or_none(), _live_view(arguments) as watch, progress_bar("tracking") as progress:
         found = track(
             recording,
             TrackCfg(accept=accept),
@@ -72,14 +89,41 @@ def run(arguments: Arguments) -> Tracked:
             images=arguments.images,
             out=arguments.out,
             progress=progress,
+            watch=watch,
         )
+        if arguments.report is not None:
+            from concent_warp.report.tracking.report import write_track_report
+
+            settings = {"command": command_line(), "versions": versions(), "settings": plain(arguments)}
+            make_folder(arguments.report.parent)
+            write_track_report(arguments.report, recording, found, arguments.page, settings=settings)
     if arguments.json:
         print(json.dumps({"tracks": [_figures(t) for t in found.tracks], "remarks": list(found.remarks)}, indent=1))
         return found
     for line in (*found.remarks, *(t.sentence() for t in found.tracks)):
         say(escape(line))
-    say_written(arguments.out)
+    say_written(arguments.out, *([] if arguments.report is None else [arguments.report]))
     return found
+
+
+@contextmanager
+def _live_view(arguments: Arguments) -> Iterator[Callable[[TrackedMoment], None] | None]:
+    """Give what shows each moment in the browser, None where that is not asked for."""
+    if not arguments.live:
+        yield None
+        return
+    from concent_warp.report.tracking.live import LiveTrackView
+
+    view = LiveTrackView(arguments.view)
+    sentence = f"{view.address} shows the tracking until it ends"
+    if arguments.json:
+        print(sentence, file=sys.stderr)
+    else:
+        say(sentence)
+    try:
+        yield view.show
+    finally:
+        view.stop()
 
 
 def _figures(track: BodyTrack) -> dict[str, object]:

@@ -240,7 +240,7 @@ def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np
     """Return how far two sets of readings are apart in units of noise, shape (count,)."""
     found = np.empty(window.count)
     for r, a, b in zip(window.readings, first, second, strict=True):
-        found[r.rows] = r.residuals((turn(b, a) if r.orientation else a - b) / r.std)
+        found[r.rows] = r.in_noise(turn(b, a) if r.orientation else a - b)
     return found
 
 

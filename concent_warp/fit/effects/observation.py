@@ -19,6 +19,7 @@ import numpy as np
 from concent_warp.checks import Bounds, Count, Positive, PositiveDuration
 from concent_warp.errors import RecordingError
 from concent_warp.estimation.partial_state import PartialState, partial_state
+from concent_warp.estimation.sample_noise import covariance_std, relative_whitening, whitened
 from concent_warp.estimation.state_estimator import StateEstimator
 from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS, initial_state
 
@@ -111,6 +112,13 @@ class Reading:
     orientation: bool
     known: np.ndarray | None = None
     """Which components were measured, shape (T, dim) bool, where some were not; these have no residual."""
+    whitening: np.ndarray | None = field(default=None, repr=False)
+    """Matrices, shape (T, dim, dim), that make the noise of all samples alike (`relative_whitening`); None where it is
+    (dim 3 for orientations)."""
+
+    def in_noise(self, value: np.ndarray) -> np.ndarray:
+        """Return measured less predicted, shape (T, dim), in units of noise, for the components that were measured."""
+        return self.residuals(whitened(value, self.whitening) / self.std)
 
     def residuals(self, value: np.ndarray) -> np.ndarray:
         """Return what (T, dim) is for the components that were measured, one after the other."""
@@ -209,8 +217,10 @@ def first_part(w: Window, length: float) -> Window:
         each = len(here) // len(r.time) if r.known is None else r.known.sum(axis=1)
         here = here[np.repeat(inside, each)]
         known = None if r.known is None else r.known[inside]
+        whitening = None if r.whitening is None else r.whitening[inside]
         kept = slice(count, count + len(here))
-        readings.append(replace(r, rows=kept, time=r.time[inside], value=r.value[inside], known=known))
+        part = replace(r, rows=kept, time=r.time[inside], value=r.value[inside], known=known, whitening=whitening)
+        readings.append(part)
         rows.append(here)
         count += len(here)
     if not rows:
@@ -337,7 +347,12 @@ class ObservedRecording:
             known = None if finite.all() else finite
             size = dim * len(value) if known is None else int(known.sum())
             time = channel.time[inside]
-            readings.append(Reading(name, slice(count, count + size), time - start, value, std, orientation, known))
+            whitening = relative_whitening(channel)
+            if whitening is not None:
+                own = channel.noise_std or covariance_std(channel) or std
+                whitening = whitening[inside] * (std / own)
+            rows = slice(count, count + size)
+            readings.append(Reading(name, rows, time - start, value, std, orientation, known, whitening))
             clock.append(np.repeat(time, dim if known is None else known.sum(axis=1)))
             count += size
         if not count:

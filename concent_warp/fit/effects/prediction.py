@@ -307,7 +307,7 @@ class Prediction:
         for r in w.readings:
             predicted = read(r.channel, r.time + w.start)
             value = turn(predicted, r.value) if r.orientation else r.value - predicted
-            residual[r.rows] = r.residuals(np.nan_to_num(value / r.std, nan=most, posinf=most, neginf=-most))
+            residual[r.rows] = np.nan_to_num(r.in_noise(value), nan=most, posinf=most, neginf=-most)
         if w.scatter is not None:
             residual = w.scatter.whitened(np.clip(residual, -most, most))
         return np.clip(residual if w.defect is None else residual + w.defect.residual, -most, most)

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.interpolate import BSpline, make_lsq_spline
 
 from concent_warp.errors import RecordingError
-from concent_warp.recording.recording import Channel, Demonstration
+from concent_warp.perception.configuration import Readings, configurations, joint_readings
+from concent_warp.recording.recording import Demonstration
 from concent_warp.scene.scene import Scene
 
 FEWEST_READINGS = 5
@@ -60,15 +61,11 @@ class JointMotion:
             RecordingError: No joint has readings.
         """
         self.model, self.where = scene.model, f"{where}: {demonstration.name}"
-        self.data = mujoco.MjData(self.model)
-        self.rest = self.model.qpos0.copy() if demonstration.qpos is None else np.asarray(demonstration.qpos, float)
+        self.demonstration, self.data = demonstration, mujoco.MjData(self.model)
         self.readings: dict[int, JointReadings] = {}
-        for i in range(self.model.nsensor):
-            if self.model.sensor_type[i] != mujoco.mjtSensor.mjSENS_JOINTPOS:
-                continue
-            channel = demonstration.measured.get(self.model.sensor(i).name)
-            if channel is not None and (smoothed := _smoothed(channel)) is not None:
-                self.readings[int(self.model.sensor_objid[i])] = smoothed
+        for joint, readings in joint_readings(self.model, demonstration).items():
+            if (smoothed := _smoothed(readings)) is not None:
+                self.readings[joint] = smoothed
         if not self.readings:
             expected = [self.model.sensor(i).name for i in range(self.model.nsensor)][:8]
             raise RecordingError(
@@ -115,11 +112,12 @@ class JointMotion:
         return covered
 
     def angles(self, time: np.ndarray) -> np.ndarray:
-        """Return the generalised positions at times [s], shape (T,), with unread joints at rest, shape (T, nq)."""
-        qpos = np.repeat(self.rest[None], len(time), axis=0)
-        for joint, reading in self.readings.items():
-            qpos[:, self.model.jnt_qposadr[joint]] = reading.spline(time)
-        return qpos
+        """Return the generalised positions at times [s], shape (T,), shape (T, nq).
+
+        Joints without readings follow tendons and couplings, see `configurations`; else they rest.
+        """
+        smoothed = {joint: reading.spline(time) for joint, reading in self.readings.items()}
+        return configurations(self.model, self.demonstration, time, smoothed, commanded=False)[0]
 
     def poses(self, qpos: np.ndarray, body: str) -> np.ndarray:
         """Return the poses of a body at generalised positions (T, nq), shape (T, 4, 4)."""
@@ -156,11 +154,9 @@ class JointMotion:
         return list(groups.values())
 
 
-def _smoothed(channel: Channel) -> JointReadings | None:
+def _smoothed(readings: Readings) -> JointReadings | None:
     """Return the smoothed readings of a joint, None where there are too few."""
-    value = np.asarray(channel.value, float).reshape(len(channel.time), -1)[:, 0]
-    known = np.isfinite(value)
-    time, value = np.asarray(channel.time, float)[known], value[known]
+    time, value = readings.time, readings.value
     if len(time) < FEWEST_READINGS:
         return None
     best: tuple[float, BSpline, float] | None = None

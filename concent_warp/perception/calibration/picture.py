@@ -46,6 +46,11 @@ def _chosen(camera: CameraCalibration) -> list[FrameError]:
     return [good[row] for row in rows]
 
 
+def with_errors(camera: CameraCalibration) -> list[FrameError]:
+    """Return the frames in which something agreed, so that there are errors."""
+    return [f for f in camera.frames if len(f.errors)]
+
+
 def _size(frame: FrameError) -> float:
     """Return the root mean square error of a frame."""
     return float(np.sqrt(np.mean(frame.errors**2))) if len(frame.errors) else 0.0
@@ -77,21 +82,21 @@ def _draw_frame(axes: Any, calibration: Calibration, camera: CameraCalibration, 
 
 def _draw_radius(axes: Any, camera: CameraCalibration) -> None:
     """Draw errors over the distance from the principal point."""
-    centre = camera.intrinsics[:2, 2]
-    radius = [np.linalg.norm(f.pixels - centre, axis=1) for f in camera.frames]
+    centre, frames = camera.intrinsics[:2, 2], with_errors(camera)
+    radius = [np.linalg.norm(f.pixels - centre, axis=1) for f in frames]
     if camera.method == "robot":
-        values = [1e3 * f.errors[:, 0] for f in camera.frames]
+        values = [1e3 * f.errors[:, 0] for f in frames]
         axes.set_ylabel("depth error [mm]")
     else:
         # Along the radius, where distortion shows.
         values = [
             np.einsum("ni,ni->n", f.errors, (f.pixels - centre) / np.maximum(r, 1e-9)[:, None])
-            for f, r in zip(camera.frames, radius, strict=True)
+            for f, r in zip(frames, radius, strict=True)
         ]
         axes.set_ylabel("error outwards [px]")
-    for frame, r, v in zip(camera.frames, radius, values, strict=True):
+    for frame, r, v in zip(frames, radius, values, strict=True):
         axes.plot(r, v, ".", color=FOUND if frame.weight > 0.5 else LOST, markersize=2.5, alpha=0.6)
-    good = [v for f, v in zip(camera.frames, values, strict=True) if f.weight > 0.5 and len(v)]
+    good = [v for f, v in zip(frames, values, strict=True) if f.weight > 0.5]
     if good:
         limit = max(4 * float(np.std(np.concatenate(good))), 1e-3)
         axes.set_ylim(-limit, limit)
@@ -102,8 +107,11 @@ def _draw_radius(axes: Any, camera: CameraCalibration) -> None:
 def _draw_time(axes: Any, camera: CameraCalibration) -> None:
     """Draw the error of each frame over time."""
     unit = 1e3 if camera.method == "robot" else 1.0
-    for frame in camera.frames:
+    frames = with_errors(camera)
+    for frame in frames:
         axes.plot(frame.time, unit * _size(frame), "o", color=FOUND if frame.weight > 0.5 else LOST, markersize=4)
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("time [s], robot's clock; red: without weight")
+    missing = len(camera.frames) - len(frames)
+    left_out = f"; left out: {missing} of {len(camera.frames)} frames, in which nothing agrees" if missing else ""
+    axes.set_xlabel(f"time [s], robot's clock; red: little weight{left_out}")
     axes.set_ylabel("error of a frame (rms) [mm]" if camera.method == "robot" else "error of a frame (rms) [px]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -46,6 +47,10 @@ class BodyTracker:
         """Moments since it was seen."""
         self.fits: list[Fit | None] = []
         """One for each moment."""
+        self.reasons: list[str] = []
+        """Why no pose was accepted in each moment, in words; empty where one was."""
+        self.objections: list[str] = []
+        """What spoke against each pose that was tried in this moment."""
         self.textures = TextureMap(cfg.texture)
         """Keyframes."""
 
@@ -59,7 +64,8 @@ class BodyTracker:
         agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, self.cfg.accept)
         if agreed.accepted(self.cfg.accept) and self.certain(fit):
             self.pose, self.tracked, self.time = fit.pose, True, time
-            self.fits.append(self.settled(renderer, views, fit))
+            self.fits.append(replace(self.settled(renderer, views, fit), agreement=agreed))
+            self.reasons.append("")
         renderer.place(self.shape.row, self.pose)
         return agreed
 
@@ -71,12 +77,14 @@ class BodyTracker:
         rng: np.random.Generator,
     ) -> None:
         """Process one moment."""
-        fit = None
+        fit, self.objections = None, []
         if self.pose is not None and (self.tracked or self.misses < MAX_TRIES):
             fit = self.followed(renderer, time, views)
         if fit is None and not self.tracked and time - self.searched >= self.cfg.search.interval:
             fit = self.recovered(renderer, time, views, rng)
+        self.reasons.append("" if fit is not None else (self.objections or [self.reason or "not searched yet"])[-1])
         if fit is None:
+            self.reason = self.reasons[-1]
             self.tracked, self.speed, self.misses = False, np.zeros(6), self.misses + 1
             renderer.place(self.shape.row, None)
         else:
@@ -117,12 +125,23 @@ class BodyTracker:
             renderer, views, self.shape, start, cfg.align,
             prior=FREE if rough else NEARBY, keyframes=keyframes, texture=cfg.texture, rough=rough,
         )  # fmt: skip
-        if fit is None or not self.certain(fit):
+        if fit is None:
+            self.objections.append("it is out of the image")
+            return None
+        if not self.certain(fit):
+            std, most = 1e3 * fit.position_std(), 1e3 * cfg.accept.max_translation_std
+            known = f"its position is known to {std:.0f} mm only (at most {most:g})"
+            self.objections.append(known if std < 10 * most else "too little of it is seen to determine its position")
             return None
         if np.isfinite(fit.texture_correlation) and fit.texture_correlation < cfg.accept.min_texture:
+            correlation, least = fit.texture_correlation, cfg.accept.min_texture
+            self.objections.append(f"its texture is not seen there (correlation {correlation:.2f}, at least {least:g})")
             return None
         agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, cfg.accept)
-        return fit if agreed.accepted(cfg.accept) else None
+        if against := agreed.objections(cfg.accept):
+            self.objections.append("; ".join(against))
+            return None
+        return replace(fit, agreement=agreed)
 
     def certain(self, fit: Fit) -> bool:
         """Return whether a fit's position is known well enough."""
@@ -171,7 +190,8 @@ class BodyTracker:
         best = None
         for view in views:
             found = find_pose(renderer, view, self.shape, self.symmetry, self.cfg, rng)
-            self.reason = found.reason
+            if found.reason:
+                self.objections.append(found.reason)
             if found.fit is not None and (best is None or found.score > best.score):
                 best = found
         if best is None or best.fit is None:

@@ -28,6 +28,8 @@ class AlignCfg:
     """Difference between measured and predicted depth above which a pixel is left out [m]."""
     first_depth_gate: Positive = 0.04
     """The same at the start of a rough pose [m]."""
+    gate_noise: Positive = 4.0
+    """The same over the noise of depth at the object's distance, where that is more, as for a camera far away [-]."""
     min_depth_std: Positive = 2e-4
     """Least scatter of depth that is believed [m]: of the order of a sensor's step."""
     min_edge_std: Positive = 0.25
@@ -120,6 +122,8 @@ class SearchCfg:
     """Distance in front of robot and static scene from which on a pixel belongs to an object [m]."""
     depth_jump: Positive = 0.02
     """Difference of depth between neighbouring pixels that separates two objects [m]."""
+    foreground_noise: Positive = 4.0
+    """Both of them over the noise of depth there, where that is more, as for a camera far away [-]."""
     min_cluster: Count = 12
     """Least number of such pixels of an object."""
     orientations: Count = 160

@@ -13,7 +13,8 @@ from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import symmetry_of
-from concent_warp.perception.tracking.result import BodyTrack
+from concent_warp.perception.tracking.moment import BodyState, TrackedMoment
+from concent_warp.perception.tracking.result import BRIDGED, FILLED, LOST, TRACKED, BodyTrack, TrackQuality
 from concent_warp.perception.tracking.smooth import smooth
 from concent_warp.perception.tracking.video import Video
 from concent_warp.scene.scene import Scene
@@ -31,6 +32,7 @@ def track_bodies(
     name: str,
     where: str,
     progress: Callable[[float], None] | None,
+    watch: Callable[[TrackedMoment], None] | None = None,
 ) -> list[BodyTrack]:
     """Return the tracks of bodies in one demonstration.
 
@@ -43,6 +45,7 @@ def track_bodies(
         name: The demonstration's name.
         where: File and demonstration, for messages.
         progress: Called with the share done, 0..1.
+        watch: Called after each moment.
 
     Raises:
         RecordingError: A given first pose does not agree with the video.
@@ -66,11 +69,14 @@ def track_bodies(
             tracker.advance(renderer, float(time), views, rng)
             if moment == 0 and given is not None and tracker.tracked:
                 _check_correction(tracker, given, where)
+        if watch is not None:
+            states = [BodyState(t.shape, t.pose if t.tracked else None, t.reasons[moment]) for t in trackers]
+            watch(TrackedMoment(name, moment, count, float(time), video.shown(moment, views), states, renderer))
         if progress is not None:
             progress(0.9 * (moment + 1) / count)
     for tracker in trackers:
         _fill_backward(tracker, trackers, renderer, video)
-    tracks = [_smoothed(tracker, video.time, cfg, name) for tracker in trackers]
+    tracks = [_smoothed(tracker, video, cfg, name) for tracker in trackers]
     if progress is not None:
         progress(1.0)
     return tracks
@@ -134,8 +140,9 @@ def _fill_backward(tracker: BodyTracker, others: list[BodyTracker], renderer: Ra
         fits[moment] = tracker.followed(renderer, tracker.time, views)
 
 
-def _smoothed(tracker: BodyTracker, time: np.ndarray, cfg: TrackCfg, name: str) -> BodyTrack:
+def _smoothed(tracker: BodyTracker, video: Video, cfg: TrackCfg, name: str) -> BodyTrack:
     """Return the smoothed track of a body, NaN in gaps."""
+    time = video.time
     pose = np.full((len(time), 4, 4), np.nan)
     covariance = np.full((len(time), 6, 6), np.nan)
     seen = np.array([fit is not None for fit in tracker.fits])
@@ -148,4 +155,25 @@ def _smoothed(tracker: BodyTracker, time: np.ndarray, cfg: TrackCfg, name: str) 
         shared = np.array([bundle.common[part[np.abs(part - t).argmin()]] for t in range(part[0], part[-1] + 1)])
         pose[span], covariance[span] = poses, covariances + shared
     textured = any(fit is not None and fit.texture for fit in tracker.fits)
-    return BodyTrack(name, tracker.shape.name, time, pose, covariance, tracker.symmetry.name, textured, tracker.reason)
+    quality = _quality(tracker, np.isfinite(pose[:, 0, 0]))
+    return BodyTrack(
+        name, tracker.shape.name, time, pose, covariance, tracker.symmetry.name, textured, tracker.reason, quality,
+        tuple(video.cameras),
+    )  # fmt: skip
+
+
+def _quality(tracker: BodyTracker, known: np.ndarray) -> TrackQuality:
+    """Return what the frames say about each moment's pose, which is known or not, shape (T,) bool."""
+    state = []
+    for fit, reason, has_pose in zip(tracker.fits, tracker.reasons, known, strict=True):
+        if fit is not None:
+            state.append(FILLED if reason else TRACKED)
+        else:
+            state.append(BRIDGED if has_pose else LOST)
+    values = np.full((6, len(known)), np.nan)
+    for t, fit in enumerate(tracker.fits):
+        if fit is not None:
+            agreed = fit.agreement
+            values[:4, t] = fit.depth_std, fit.edge_std, fit.texture_std, fit.texture_correlation
+            values[4:, t] = (np.nan, np.nan) if agreed is None else (agreed.share, min(agreed.visible, 1.0))
+    return TrackQuality(tuple(state), tuple(tracker.reasons), *values)

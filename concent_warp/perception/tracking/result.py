@@ -8,6 +8,45 @@ import numpy as np
 
 from concent_warp.recording.recording import Recording
 
+TRACKED, FILLED, BRIDGED, LOST = "tracked", "filled", "bridged", "lost"
+"""States of a body in a moment."""
+
+
+@dataclass(frozen=True)
+class TrackQuality:
+    """What the frames of each moment say about the pose of a body.
+
+    Residuals are those of the pose of this moment alone, before smoothing. Of several cameras that see the body, the
+    largest scatter is given.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> import numpy as np
+        >>> one = np.ones(1)
+        >>> quality = cw.TrackQuality(("tracked",), ("",), 1e-3 * one, one, one, 0.9 * one, 0.95 * one, one)
+        >>> quality.state
+        ('tracked',)
+    """
+
+    state: tuple[str, ...]
+    """State of the body in each moment, T of them: "tracked"; "filled", found backward from a later moment; "bridged",
+    interpolated by the smoothing over a short gap; "lost"."""
+    reason: tuple[str, ...]
+    """Why no pose was accepted in each moment as the video went on, T of them; empty where one was."""
+    depth_residual: np.ndarray
+    """Scatter of measured minus predicted depth [m], shape (T,), robust (1.48 times the median of the absolute
+    differences); NaN, as all that follows, where the pose was not found in the moment's frames."""
+    edge_residual: np.ndarray
+    """The same of the image's edges, along the normals of contour and creases [px], shape (T,)."""
+    texture_residual: np.ndarray
+    """The same of texture points [px], shape (T,); NaN without texture."""
+    texture_correlation: np.ndarray
+    """Mean correlation of a keyframe's visible patches with the image [-], shape (T,); NaN without texture."""
+    agreement: np.ndarray
+    """Share of the body's pixels with depth, of those that nothing known covers, that agree [-], shape (T,)."""
+    visible: np.ndarray
+    """Share of the outline that nothing known covers [-], shape (T,)."""
+
 
 @dataclass(frozen=True)
 class BodyTrack:
@@ -37,6 +76,10 @@ class BodyTrack:
     """Whether texture was found, which fixes rotations that the shape leaves open."""
     reason: str = ""
     """Why the body was not found last, where it was lost."""
+    quality: TrackQuality | None = None
+    """What the frames of each moment say about the pose; `track` gives it."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that the body was tracked with; empty where that is not known."""
 
     @property
     def lost(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from concent_warp.perception.tracking.cfg import TrackCfg
 from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.first_pose import first_poses
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.moment import TrackedMoment
 from concent_warp.perception.tracking.output import with_pose_sensors, written
 from concent_warp.perception.tracking.result import Tracked
 from concent_warp.perception.tracking.video import Video
@@ -36,6 +37,7 @@ def track(
     images: bool = False,
     out: str | Path | None = None,
     progress: Callable[[float], None] | None = None,
+    watch: Callable[[TrackedMoment], None] | None = None,
 ) -> Tracked:
     """Return the recording with the poses of its movable objects tracked in its RGB-D video.
 
@@ -56,6 +58,7 @@ def track(
         images: Whether the result keeps the video.
         out: File to write the recording to, whole or not at all.
         progress: Called with the share done, 0..1.
+        watch: Called after each moment, with its frames and what was found in them.
 
     Raises:
         RecordingError: There is no video with depth, no such body or camera, a first pose disagrees with the image, or
@@ -89,7 +92,7 @@ def track(
             )
         first = first_poses(pose, scene, demonstration, shapes, where)
         step = None if progress is None else lambda share, k=k: progress((k + share) / count)
-        found = track_bodies(scene, video, shapes, first, cfg, demonstration.name, where, step)
+        found = track_bodies(scene, video, shapes, first, cfg, demonstration.name, where, step, watch)
         if all(t.lost.all() for t in found):
             reasons = "; ".join(f"{t.body}: {t.reason or 'hidden'}" for t in found)
             raise RecordingError(

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RecordingError
+from concent_warp.perception.configuration import configurations
 from concent_warp.perception.pinhole import Pinhole
-from concent_warp.perception.tracking.configuration import configurations
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.view import View
 from concent_warp.recording.recording import Demonstration, ImageStream
@@ -29,6 +29,8 @@ class Video:
     """Robot's configuration, shape (T, nq)."""
     unmeasured: list[str]
     """Joints that nothing tells about."""
+    cameras: list[str]
+    """Names of the streams' cameras."""
 
     @staticmethod
     def of(
@@ -62,7 +64,12 @@ class Video:
                 groups.append([frame])
         time = np.array([np.mean([f[0] for f in group]) for group in groups])
         qpos, unmeasured = configurations(model, demonstration, time)
-        return Video(time, [[(c, k) for _, c, k in group] for group in groups], streams, qpos, unmeasured)
+        frames = [[(c, k) for _, c, k in group] for group in groups]
+        return Video(time, frames, streams, qpos, unmeasured, with_depth)
+
+    def shown(self, moment: int, views: list[View]) -> list[tuple[str, View]]:
+        """Return the camera of each view of a moment, with the view."""
+        return [(self.cameras[c], view) for (c, _), view in zip(self.frames[moment], views, strict=True)]
 
     def views(self, moment: int, renderer: RayRenderer) -> list[View]:
         """Return the frames of a moment; the renderer is in its state."""

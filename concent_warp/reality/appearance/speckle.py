@@ -23,7 +23,7 @@ TEXTURE = "speckle"
 
 
 def dress(spec: mujoco.MjSpec, bodies: tuple[str, ...]) -> mujoco.MjSpec:
-    """Return a copy of a world whose bodies carry a pattern: boxes and convex meshes; other geoms stay plain.
+    """Return a copy of a world whose bodies carry a pattern: boxes, spheres and convex meshes; others stay plain.
 
     Joints, names of bodies and their order are those of `spec`, so a state of the one is a state of the other.
     """
@@ -41,10 +41,16 @@ def dress(spec: mujoco.MjSpec, bodies: tuple[str, ...]) -> mujoco.MjSpec:
 
 
 def _hull_corners(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> np.ndarray | None:
-    """Return the corners of a box or of a mesh given by its vertices [m], geom frame, shape (n, 3); None for others."""
+    """Return the corners of a box, the vertices of a mesh given by them, or 2,562 points of a sphere [m], geom frame,
+    shape (n, 3); None for others.
+    """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         return signs * np.array(geom.size)
+    if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
+        import trimesh
+
+        return np.asarray(trimesh.creation.icosphere(subdivisions=4, radius=geom.size[0]).vertices)
     if geom.type == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = spec.mesh(geom.meshname)
         vertices = np.array(mesh.uservert).reshape(-1, 3) * np.array(mesh.scale)

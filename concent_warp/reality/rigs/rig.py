@@ -144,6 +144,8 @@ class TrueMotion:
     """Times [s], shape (K,)."""
     sensordata: np.ndarray
     """Noise-free sensor readings, shape (K, nsensordata)."""
+    qpos: np.ndarray
+    """Generalised positions of Reality, shape (K, nq)."""
 
 
 def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: int = 1, seed: int = 0) -> Recording:
@@ -165,7 +167,7 @@ def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: i
         trial = rig.plan(rng, k)
         motion, qpos, qvel = perform(model, trial, effects, rig.physics)
         estimate = _estimated_start(rig, model, qpos, qvel, rng) if rig.start != "unknown" else (None, None)
-        measured = _sensor_channels(rig, model, motion, effects, rng)
+        measured = sensor_channels(rig, model, motion, effects, rng)
         action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
         taken.append(Demonstration(f"demo_{k}", rig.name, None, *estimate, action=action, measured=measured))
     return Recording(rig.scene.xml, tuple(taken), source=f"reality rig {rig.name}")
@@ -182,7 +184,7 @@ def perform(
     steps = round(trial.duration / dt)
     forces = [f for f in (physics.force, *(effect.force for effect in effects)) if f is not None]
     ctrl = _commands_at(model, trial, np.maximum(np.arange(-before, steps + 1) * dt + physics.lead, 0))
-    readings = np.empty((steps + 1, model.nsensordata))
+    readings, states = np.empty((steps + 1, model.nsensordata)), np.empty((steps + 1, model.nq))
     qpos, qvel = data.qpos.copy(), data.qvel.copy()
     data.time = -before * dt
     for k in range(before + steps + 1):
@@ -199,12 +201,14 @@ def perform(
         data.xfrc_applied[:] = 0
         for force in forces:
             force(model, data)
+        if k >= before:
+            states[k - before] = data.qpos
         mujoco.mj_step(model, data)  # sensors are those of the state before the step
         if k >= before:
             readings[k - before] = data.sensordata
     if not np.isfinite(readings).all() or data.warning.number.any():
         raise RuntimeError(f"Reality diverged at {data.time:.3f} s")
-    return TrueMotion(np.arange(steps + 1) * dt, readings), qpos, qvel
+    return TrueMotion(np.arange(steps + 1) * dt, readings, states), qpos, qvel
 
 
 def _commands_at(model: mujoco.MjModel, trial: RigTrial, time: np.ndarray) -> np.ndarray:
@@ -253,7 +257,7 @@ def _estimated_start(
     return estimate, rate
 
 
-def _sensor_channels(
+def sensor_channels(
     rig: Rig, model: mujoco.MjModel, motion: TrueMotion, effects: Sequence[HiddenEffect], rng: np.random.Generator
 ) -> dict[str, Channel]:
     """Return the readings of every nominal sensor with noise and hidden effects, by name."""

@@ -38,7 +38,19 @@ const Chart = {
     });
     return out;
   },
+  /** A shaded interval with a bar at its top, and its name where there is room. */
+  span(span, x, top, bottom) {
+    const a = x(Math.max(span.start, x.low)), width = Math.max(x(Math.min(span.end, x.high)) - a, 2);
+    const name = width > 7 * span.name.length ? `<text class="span-name ${span.kind}" x="${a + width / 2}" y="${top + 15}" text-anchor="middle">${Chart.escape(span.name)}</text>` : "";
+    return `<rect class="span ${span.kind}" x="${a}" y="${top}" width="${width}" height="${bottom - top}"/><rect class="span-bar ${span.kind}" x="${a}" y="${top}" width="${width}" height="4"/>${name}`;
+  },
 };
+
+/** Arrays travel as base64 of little-endian 32-bit numbers. */
+function numbers(packed) {
+  const bytes = Uint8Array.from(atob(packed.data), (c) => c.charCodeAt(0));
+  return new (packed.type === "i" ? Int32Array : Float32Array)(bytes.buffer);
+}
 
 /** A linear or logarithmic map from values to pixels. */
 function scale(low, high, from, to, log) {
@@ -49,7 +61,8 @@ function scale(low, high, from, to, log) {
   return map;
 }
 
-/** Lines over a common axis. spec: {x: [low, high], xlabel, unit, series: [{name, kind, time, value}], noise, phases, places, log}. */
+/** Lines over a common axis. spec: {x: [low, high], xlabel, unit, series: [{name, kind, time, value}], noise, phases, places, log};
+ * further, optional: {signed, areas: [{kind, time, low, high}], spans: [{start, end, kind, name}], limit: {value, name}}. */
 class LineChart {
   constructor(host, pick) {
     this.host = host; this.pick = pick; this.cursor = null;
@@ -66,10 +79,13 @@ class LineChart {
   range() {
     const s = this.spec, values = [];
     for (const line of s.series) for (const v of line.value) if (Number.isFinite(v)) values.push(v);
+    for (const area of s.areas || []) for (const edge of [area.low, area.high]) for (const v of edge) if (Number.isFinite(v)) values.push(v);
     if (s.noise) values.push(s.noise);
+    if (s.limit) values.push(s.limit.value);
     if (!values.length) return [0.1, 1];
     let high = values.reduce((a, b) => Math.max(a, b), 0);
-    if (!s.log) return [0, high * 1.06 || 1];
+    const least = s.signed ? values.reduce((a, b) => Math.min(a, b), 0) : 0, margin = 0.06 * (high - least);
+    if (!s.log) return [least && least - margin, high + margin || 1];
     const sorted = values.filter((v) => v > 0).sort((a, b) => a - b);
     const low = sorted[Math.floor(sorted.length * 0.01)] || high / 100;
     return [low, Math.max(high * 1.15, low * 3)];
@@ -81,7 +97,7 @@ class LineChart {
     const [low, high] = this.range();
     const x = this.x = scale(s.x[0], s.x[1], left, right), y = this.y = scale(low, high, bottom, top, s.log);
     let out = Chart.phases(s.phases || [], x, top, bottom, true);
-    for (const v of s.log ? Chart.logTicks(low, high) : Chart.ticks(low, high, Math.max(3, (bottom - top) / 50))) {
+    for (const v of s.log ? Chart.logTicks(low, high) : Chart.ticks(low, high, Math.max(4, (bottom - top) / 50))) {
       out += `<line class="grid" x1="${left}" x2="${right}" y1="${y(v)}" y2="${y(v)}"/><text class="tick" x="${left - 7}" y="${y(v) + 4}" text-anchor="end">${Chart.tick(v)}</text>`;
     }
     for (const v of Chart.ticks(x.low, x.high, (right - left) / 80)) out += `<text class="tick" x="${x(v)}" y="${bottom + 17}" text-anchor="middle">${Chart.tick(v)}</text>`;
@@ -89,6 +105,9 @@ class LineChart {
     if (s.noise && s.noise >= low && s.noise <= high) {
       out += `<rect class="floor" x="${left}" width="${right - left}" y="${y(s.noise)}" height="${Math.max(bottom - y(s.noise), 0)}"/><line class="noise" x1="${left}" x2="${right}" y1="${y(s.noise)}" y2="${y(s.noise)}"/>`;
     }
+    for (const span of s.spans || []) out += Chart.span(span, x, top, bottom);
+    for (const area of s.areas || []) out += `<path class="area ${area.kind}" d="${this.area(area)}"/>`;
+    if (s.limit) out += `<line class="noise" x1="${left}" x2="${right}" y1="${y(s.limit.value)}" y2="${y(s.limit.value)}"/><text class="noise-name" x="${left + 5}" y="${y(s.limit.value) + 13}">${Chart.escape(s.limit.name)}</text>`;
     for (const p of s.places || []) {
       const a = x(Math.max(p.start, x.low)), b = x(Math.min(p.end, x.high));
       out += `<rect class="place" x="${a}" y="${top}" width="${Math.max(b - a, 3)}" height="${bottom - top}"/>`;
@@ -106,7 +125,21 @@ class LineChart {
       const v = line.value[i];
       if (!Number.isFinite(v)) { pen = false; continue; }
       out += `${pen ? "L" : "M"}${this.x(line.time[i]).toFixed(1)} ${this.y(Math.max(v, low)).toFixed(1)}`;
+      if (!pen && !Number.isFinite(line.value[i + 1])) out += "h0"; // a dot
       pen = true;
+    }
+    return out;
+  }
+  /** Closed outlines of an area, one for each stretch without gaps. */
+  area(area) {
+    let out = "", start = -1;
+    for (let i = 0; i <= area.time.length; i++) {
+      const here = i < area.time.length && Number.isFinite(area.low[i]) && Number.isFinite(area.high[i]);
+      if (here && start < 0) start = i;
+      if (here || start < 0) continue;
+      const rows = Array.from({ length: i - start }, (_, k) => start + k), at = (edge) => (k) => `${this.x(area.time[k]).toFixed(1)} ${this.y(edge[k]).toFixed(1)}`;
+      out += `M${rows.map(at(area.low)).join("L")}L${rows.reverse().map(at(area.high)).join("L")}Z`;
+      start = -1;
     }
     return out;
   }
@@ -131,7 +164,7 @@ class LineChart {
       const i = nearest(line.time, time);
       return `<span class="key ${line.kind}"></span>${Chart.escape(line.name)} <b>${Chart.number(line.value[i])}</b> ${s.unit}`;
     });
-    const phase = (s.phases || []).find((p) => time >= p.start && time < p.end);
+    const phase = [...(s.phases || []), ...(s.spans || [])].find((p) => time >= p.start && time < p.end);
     tip.innerHTML = `<div class="when">${Chart.escape(s.at(time))}${phase ? " · " + Chart.escape(phase.name) : ""}</div>` + rows.map((r) => `<div>${r}</div>`).join("");
     const box = this.host.getBoundingClientRect(), px = e.clientX - box.left;
     tip.style.left = `${Math.min(Math.max(px + 14, 0), box.width - tip.offsetWidth - 4)}px`;

@@ -4,11 +4,6 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 
-/** Arrays travel as base64 of little-endian 32-bit numbers. */
-function numbers(packed) {
-  const bytes = Uint8Array.from(atob(packed.data), (c) => c.charCodeAt(0));
-  return new (packed.type === "i" ? Int32Array : Float32Array)(bytes.buffer);
-}
 const meshes = Object.fromEntries(Object.entries(data.meshes).map(([name, m]) => [name, { vertices: numbers(m.vertices), faces: numbers(m.faces) }]));
 const shown = data.shown;
 const state = { demonstration: data.demonstrations[0], time: 0, playing: false, spheres: false, log: false, ghost: true, mark: true };

@@ -38,6 +38,12 @@ class Fit:
     """Share of the contour at which the image has an edge."""
     texture_correlation: float
     """Mean correlation of the keyframe's patches."""
+    edge_std: float
+    """Scatter of edges [px]."""
+    texture_std: float
+    """Scatter of texture points [px]."""
+    agreement: Agreement | None = None
+    """How the frames agree with the pose, where that was asked."""
 
     def position_std(self) -> float:
         """Return the standard deviation of the position along the worst direction [m], common errors aside."""
@@ -69,11 +75,38 @@ class Agreement:
 
     def accepted(self, cfg: AcceptCfg) -> bool:
         """Return whether this is agreement enough."""
-        seen = self.pixels >= cfg.min_pixels and self.visible >= cfg.min_visible
-        clear = self.behind <= cfg.max_behind and self.unexplained <= cfg.max_unexplained
-        smooth = self.misfit <= max(cfg.max_misfit, cfg.max_misfit_share * self.depth_std)
-        free = self.penetration <= cfg.max_penetration
-        return seen and clear and smooth and free and self.share >= cfg.min_agreement
+        return not self.objections(cfg)
+
+    def objections(self, cfg: AcceptCfg) -> list[str]:
+        """Return what speaks against the pose, in words; nothing where this is agreement enough."""
+        misfit = max(cfg.max_misfit, cfg.max_misfit_share * self.depth_std)
+        checks = (
+            (
+                self.visible >= cfg.min_visible,
+                f"known bodies leave {self.visible:.0%} of it in view (at least {cfg.min_visible:.0%})",
+            ),
+            (
+                self.share >= cfg.min_agreement,
+                f"{self.share:.0%} of its pixels agree with the depth (at least {cfg.min_agreement:.0%})",
+            ),
+            (self.behind <= cfg.max_behind, f"{self.behind:.0%} see through it (at most {cfg.max_behind:.0%})"),
+            (
+                self.unexplained <= cfg.max_unexplained,
+                f"{self.unexplained:.0%} of its surroundings are unexplained (at most {cfg.max_unexplained:.0%})",
+            ),
+            (
+                self.misfit <= misfit,
+                f"its surface is off by {1e3 * self.misfit:.1f} mm (at most {1e3 * misfit:.1f})",
+            ),
+            (
+                self.penetration <= cfg.max_penetration,
+                f"it is {1e3 * self.penetration:.1f} mm inside others (at most {1e3 * cfg.max_penetration:g})",
+            ),
+        )
+        found = [words for passed, words in checks if not passed]
+        if not found and not self.pixels >= cfg.min_pixels:
+            found.append(f"{self.pixels} pixels agree (at least {cfg.min_pixels})")
+        return found
 
     def text(self) -> str:
         """Return this in words."""
@@ -179,6 +212,7 @@ def _linearised(
     """Return all residuals at a pose."""
     renderer.place(shape.row, pose)
     total, textures, scatters, found, searched, correlations = Normal(), [], [], 0, 0, []
+    edge_scatters, texture_scatters = [], []
     seen = False
     for v, view in enumerate(views):
         crop = rendered_crop(renderer, view, shape, pose, cfg.max_pixels)
@@ -189,19 +223,26 @@ def _linearised(
         edge = edge_rows(renderer, view, shape, pose, reach, cfg)
         total = total + normal + edge.normal
         scatters.append(scatter)
+        edge_scatters.append(edge.scatter)
         found, searched = found + edge.found, searched + edge.searched
         chosen = keyframes[v] if v < len(keyframes) else None
         if chosen is not None and texture is not None:
-            rows, count, correlation = texture_rows(renderer, view, shape, pose, chosen[1], texture, cfg)
+            rows, count, correlation, scatter = texture_rows(renderer, view, shape, pose, chosen[1], texture, cfg)
             correlations.append(correlation)
+            texture_scatters.append(scatter)
             if count >= 4:
                 textures.append((chosen[0], rows))
     if not seen:
         return None
     share = found / searched if searched else np.nan
-    finite = [s for s in scatters if np.isfinite(s)]
     correlation = float(np.mean(correlations)) if correlations else np.nan
-    return Fit(pose, total, textures, max(finite) if finite else np.nan, share, correlation)
+    depth_std, edge_std, texture_std = (_largest(s) for s in (scatters, edge_scatters, texture_scatters))
+    return Fit(pose, total, textures, depth_std, share, correlation, edge_std, texture_std)
+
+
+def _largest(values: Sequence[float]) -> float:
+    """Return the largest of those that are finite, NaN where none is."""
+    return max((v for v in values if np.isfinite(v)), default=np.nan)
 
 
 def agreement(

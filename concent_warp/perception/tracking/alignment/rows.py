@@ -152,7 +152,7 @@ def depth_rows(
         crop: What the camera should see.
         view: What it sees.
         pose: Of the body, shape (4, 4).
-        gate: Difference above which a pixel is left out [m].
+        gate: Difference above which a pixel is left out [m], unless the frame's noise is larger.
         cfg: Settings.
         final: Whether the covariance counts, so that the correlation of the noise is estimated.
     """
@@ -162,6 +162,8 @@ def depth_rows(
     mask = inner if inner.sum() > 0.4 * crop.own.sum() else crop.own
     slope = -np.einsum("hwk,hwk->hw", crop.normal, crop.rays)
     difference = np.where(mask, crop.measured - np.where(mask, crop.depth, 0.0), 0.0)
+    if mask.any():
+        gate = max(gate, cfg.gate_noise * float(view.depth_noise(crop.depth[mask].mean())))
     used = mask & (crop.measured > 0) & (np.abs(difference) < gate)
     used &= slope > cfg.slant * np.linalg.norm(crop.rays, axis=2)
     count = int(used.sum())

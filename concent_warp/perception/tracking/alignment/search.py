@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from concent_warp.perception.pinhole import pixel_grid
@@ -62,8 +63,11 @@ def find_pose(
         rng: Source of orientations and of samples.
     """
     renderer.place(shape.row, None)
-    clusters = foreground_clusters(renderer, view, cfg.search)
-    clusters = [c for c in clusters if _fits(c, shape)]
+    clusters: list[Cluster] = []
+    stride = max(1, round(cfg.search.stride * view.shape[1] / 640))
+    while stride >= 1 and not clusters:  # an object that is far away covers few pixels
+        clusters = [c for c in foreground_clusters(renderer, view, cfg.search, stride) if _fits(c, shape)]
+        stride //= 2
     if not clusters:
         return Found(None, 0.0, "nothing unknown of its size is seen in front of robot and static scene")
     starts: list[tuple[float, np.ndarray, Cluster]] = []
@@ -107,12 +111,11 @@ def find_pose(
     return Found(best, score, "")
 
 
-def foreground_clusters(renderer: RayRenderer, view: View, cfg: SearchCfg) -> list[Cluster]:
-    """Return what is measured in front of all that the renderer knows, largest first."""
+def foreground_clusters(renderer: RayRenderer, view: View, cfg: SearchCfg, stride: int) -> list[Cluster]:
+    """Return what is measured in front of all that the renderer knows, largest first, in every `stride`-th pixel."""
     import cv2
 
     height, width = view.shape
-    stride = max(1, round(cfg.stride * width / 640))
     grid = pixel_grid(height, width)[stride // 2 :: stride, stride // 2 :: stride]
     size = grid.shape[:2]
     pixels = grid.reshape(-1, 2)
@@ -120,17 +123,18 @@ def foreground_clusters(renderer: RayRenderer, view: View, cfg: SearchCfg) -> li
     expected = hits.depth.reshape(size)
     columns, rows = grid[..., 0].astype(int), grid[..., 1].astype(int)
     measured = view.depth[rows, columns].astype(float)
-    # The rims of what is known are not where they should be by a pixel or so.
-    flat = np.where(np.isfinite(expected), expected, 1e3)
-    rim = cv2.morphologyEx(flat.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > cfg.depth_jump
-    front = (measured > 0) & (measured < expected - cfg.foreground) & ~rim
+    rim = _rim(expected, cfg.depth_jump)
+    noise = cfg.foreground_noise * view.depth_noise(measured)
+    front = (measured > 0) & (measured < expected - np.maximum(cfg.foreground, noise)) & ~rim
     front = cv2.morphologyEx(front.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
     # Where depth jumps from pixel to pixel, one thing ends and another begins.
     shown = np.where(measured > 0, measured, np.nan)
     jump = np.zeros(size, dtype=bool)
     with np.errstate(invalid="ignore"):
-        jump[:, 1:] |= np.abs(np.diff(shown, axis=1)) > cfg.depth_jump
-        jump[1:] |= np.abs(np.diff(shown, axis=0)) > cfg.depth_jump
+        # The noise of a difference is that of a depth times the root of 2.
+        step = np.maximum(cfg.depth_jump, np.sqrt(2) * noise)
+        jump[:, 1:] |= np.abs(np.diff(shown, axis=1)) > step[:, 1:]
+        jump[1:] |= np.abs(np.diff(shown, axis=0)) > step[1:]
     count, label = cv2.connectedComponents((front & ~jump).astype(np.uint8), connectivity=4)
     found = []
     for k in range(1, count):
@@ -139,6 +143,22 @@ def foreground_clusters(renderer: RayRenderer, view: View, cfg: SearchCfg) -> li
             at = grid[inside]
             found.append(Cluster(view.camera.lift(at, measured[inside]), at, stride))
     return sorted(found, key=lambda c: -len(c.points))[:6]
+
+
+def _rim(depth: np.ndarray, jump: float) -> np.ndarray:
+    """Return the rims of what is known, which are not where they should be by a pixel or so, shape (h, w).
+
+    They are where depth [m], infinite beside everything, deviates from a plane by more than `jump` [m] from pixel to
+    pixel; inverse depth is linear on a plane, however slanted.
+    """
+    inverse = 1 / depth
+    nearest = maximum_filter(inverse, 3)
+    rim = np.zeros(depth.shape, dtype=bool)
+    for axis in (0, 1):
+        edge = np.pad(inverse, [(1, 1) if a == axis else (0, 0) for a in (0, 1)], mode="reflect", reflect_type="odd")
+        second = np.abs(np.diff(edge, 2, axis=axis))
+        rim |= second > jump * nearest**2
+    return rim
 
 
 def _fits(cluster: Cluster, shape: TrackedShape) -> bool:
@@ -175,9 +195,8 @@ def _score(agreed: Agreement, fit: Fit, shape: TrackedShape, cluster: Cluster, c
     points = cluster.points
     near = points[np.linalg.norm(points - _middle(fit.pose, shape), axis=1) < 1.5 * shape.reach]
     local = (near - fit.pose[:3, 3]) @ fit.pose[:3, :3]
-    explained = (
-        float((np.abs(shape.surface.signed_distance(local)) < cfg.accept.depth_tolerance).mean()) if len(near) else 0.0
-    )
+    tolerance = max(cfg.accept.depth_tolerance, 4 * fit.depth_std if np.isfinite(fit.depth_std) else 0.0)
+    explained = float((np.abs(shape.surface.signed_distance(local)) < tolerance).mean()) if len(near) else 0.0
     edge = fit.edge_share if np.isfinite(fit.edge_share) else 0.0
     fair = max(agreed.share - agreed.behind, 0.0) * (1 - agreed.unexplained)
     smooth = 1 / (1 + (agreed.misfit / cfg.accept.max_misfit) ** 2)

@@ -159,9 +159,9 @@ def texture_rows(
     keyframe: Keyframe,
     cfg: TextureCfg,
     align: AlignCfg,
-) -> tuple[Normal, int, float]:
-    """Return the normal equations of a keyframe's points, their number, and the mean correlation of all visible
-    patches.
+) -> tuple[Normal, int, float, float]:
+    """Return the normal equations of a keyframe's points, their number, the mean correlation of all visible patches,
+    and the scatter of the points [px], NaN where there are too few.
     """
     points = keyframe.points @ pose[:3, :3].T + pose[:3, 3]
     pixels, depth, projection = view.pixel_rows(points)
@@ -178,20 +178,20 @@ def texture_rows(
     )
     rows = np.flatnonzero(seen)
     if len(rows) < 4:
-        return Normal(), 0, 0.0
+        return Normal(), 0, 0.0, np.nan
     grid = keyframe.grid[rows] @ pose[:3, :3].T + pose[:3, 3]
     places = view.pixel_rows(grid.reshape(-1, 3))[0].reshape(*grid.shape[:2], 2)
     shift, correlation = _shifts(view.grey, places, keyframe.patches[rows], cfg.max_shift)
     good = (correlation > cfg.min_correlation) & (np.abs(shift).max(axis=1) < cfg.max_shift)
     mean = float(np.clip(correlation, 0, 1).mean())
     if good.sum() < 4:
-        return Normal(), int(good.sum()), mean
+        return Normal(), int(good.sum()), mean, np.nan
     rows, shift = rows[good], shift[good]
     jacobian = np.concatenate(
         [point_jacobian(points[rows], pose[:3, 3], projection[rows, axis]) for axis in (0, 1)], axis=0
     )
-    normal, weight, _ = weighted(jacobian, shift.T.ravel(), align.min_texture_std, align)
-    return normal, int((weight > 0.1).sum() // 2), mean
+    normal, weight, scatter = weighted(jacobian, shift.T.ravel(), align.min_texture_std, align)
+    return normal, int((weight > 0.1).sum() // 2), mean, scatter
 
 
 def _shifts(image: np.ndarray, places: np.ndarray, patches: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:

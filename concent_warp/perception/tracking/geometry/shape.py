@@ -36,6 +36,8 @@ class Edges:
     """Whether the faces meet at an angle that is seen, shape (n,) bool."""
     edge: np.ndarray
     """Number of the edge, shape (n,)."""
+    half: np.ndarray
+    """Half the length of edge that each point stands for [m], shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,8 @@ def _edges(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> Edges:
     edge = np.repeat(np.arange(len(count)), count)
     share = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[edge]
     point = start[edge] + (share * length[edge])[:, None] * direction[edge]
-    return Edges(point, direction[edge], normal[edge], inward[edge], crease[edge], edge)
+    half = (length / count)[edge] / 2
+    return Edges(point, direction[edge], normal[edge], inward[edge], crease[edge], edge, half)
 
 
 def _joined(parts: list[Edges]) -> Edges:
@@ -158,6 +161,7 @@ def _joined(parts: list[Edges]) -> Edges:
         np.concatenate([p.inward for p in parts]),
         np.concatenate([p.crease for p in parts]),
         np.concatenate(number),
+        np.concatenate([p.half for p in parts]),
     )
 
 
@@ -168,5 +172,5 @@ def _outer(edges: Edges, surface: Surface, step: float) -> Edges:
     free &= surface.signed_distance(edges.point + step * second - step / 2 * first) > 0
     return Edges(
         edges.point[free], edges.direction[free], edges.normals[free], edges.inward[free], edges.crease[free],
-        edges.edge[free],
+        edges.edge[free], edges.half[free],
     )  # fmt: skip

@@ -9,6 +9,12 @@ import numpy as np
 
 from concent_warp.perception.pinhole import Pinhole
 
+MAD = 1.4826
+"""Standard deviation over median absolute deviation of normal noise [-]."""
+DEPTH_SPACING = 4
+"""Distance of the pixels whose depths are compared for their noise, beyond that over which sensors average [px]."""
+MIN_TRIPLES = 100
+"""Least number of such comparisons; with fewer, nothing is said of the noise."""
 NOISE_KERNEL = np.array([[1.0, -2.0, 1.0]], dtype=np.float32)
 """Mask that is blind to even shading (as in Immerkaer, "Fast noise variance estimation", CVIU 64(2), 1996)."""
 
@@ -43,7 +49,24 @@ class View:
 
         part = self.grey[:: max(1, self.shape[0] // 60)]
         response = cv2.filter2D(part, cv2.CV_32F, NOISE_KERNEL)
-        return max(float(1.4826 * np.median(np.abs(response)) / np.sqrt((NOISE_KERNEL**2).sum())), 0.5)
+        return max(float(MAD * np.median(np.abs(response)) / np.sqrt((NOISE_KERNEL**2).sum())), 0.5)
+
+    @cached_property
+    def inverse_depth_noise(self) -> float:
+        """Standard deviation of the noise of inverse depth [1/m], about the same at all distances for stereo and
+        structured light; 0 where too little is measured. Of a plane inverse depth is linear in the image, so that its
+        second differences show the noise alone.
+        """
+        part = self.depth[:: max(1, self.shape[0] // 60)].astype(float)
+        inverse = np.divide(1.0, part, out=np.full(part.shape, np.nan), where=part > 0)
+        step = DEPTH_SPACING
+        second = inverse[:, 2 * step :] - 2 * inverse[:, step:-step] + inverse[:, : -2 * step]
+        second = second[np.isfinite(second)]
+        return float(MAD * np.median(np.abs(second)) / np.sqrt(6)) if len(second) >= MIN_TRIPLES else 0.0
+
+    def depth_noise(self, depth: np.ndarray | float) -> np.ndarray:
+        """Return the standard deviation of the noise of measured depths [m], any shape."""
+        return self.inverse_depth_noise * np.square(depth)
 
     def sample(self, pixels: np.ndarray) -> np.ndarray:
         """Return the brightness between pixels (..., 2) [px], shape (...); the border's outside."""

@@ -1,0 +1,1 @@
+"""The page of a tracked video, and its live view."""
