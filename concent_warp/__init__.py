@@ -67,6 +67,7 @@ _HOMES = {
     "recording.logs.cfg": ("ImportCfg",),
     "recording.logs.import_log": ("import_log",),
     "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "render.dataset.from_recording": ("WriteLeRobotCfg", "write_lerobot"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
     "report.tracking.cfg": ("LiveTrackCfg", "TrackReportCfg"),
@@ -153,6 +154,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.logs.cfg import ImportCfg
     from concent_warp.recording.logs.import_log import import_log
     from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
     from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from concent_warp.errors import RenderError
+from concent_warp.recording.logs.readers.calibration import Calibration
 from concent_warp.recording.recording import ImageStream
 from concent_warp.scene.scene import Scene
 
@@ -98,3 +99,18 @@ def place_cameras(spec: mujoco.MjSpec, cameras: Sequence[Camera]) -> None:
                 "the body that carries a camera is not in the scene", where=camera.name, found=camera.body
             )
         body.add_camera(name=camera.name, pos=list(camera.position), quat=list(camera.quaternion), fovy=camera.fovy)
+
+
+def scene_calibration(model: mujoco.MjModel, name: str, size: tuple[int, int]) -> Calibration:
+    """Return the calibration of a camera of a compiled scene for images of a size (height, width) [px]."""
+    row = model.camera(name).id
+    height, width = size
+    focal = height / 2 / np.tan(np.radians(model.cam_fovy[row]) / 2)
+    matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    pose, rotation = np.eye(4), np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.cam_quat[row])
+    # MuJoCo's cameras look along -z and have y up.
+    pose[:3, :3] = rotation.reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = model.cam_pos[row]
+    body = None if model.cam_bodyid[row] == 0 else model.body(int(model.cam_bodyid[row])).name
+    return Calibration(matrix, np.zeros(0), pose, body, size)

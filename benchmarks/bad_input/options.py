@@ -82,10 +82,10 @@ WRONG = {
         "--checkpoint gone",
     ),
     "export": (
-        "--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what",
+        "--pretrained nobody", "--checkpoint gone", "-o scene.xml", "-o out.what", "--recording recording.h5",
     ),
     "splat-fit": (
-        "--points gone.ply", "--longest 0", "--device cuda:7", "--fit.degree 9", "--scale 0",
+        "--points gone.ply", "--longest 0", "--device cuda:7", "--fit.degree 9", "--scale 0", "--body block",
     ),
     "render-train": (
         "--cameras nobody", "--device cuda:7", "--steps 0", "--network.size 63", "--network.factors", "--flow.ema 1",

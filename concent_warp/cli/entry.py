@@ -20,7 +20,7 @@ GROUPS = {
     "start": {
         "demo": "record in Reality, a simulated world, then fit, compare and report",
         "record": "record demonstrations in Reality",
-        "import": "read the log of another system: LeRobot, MCAP, ROS bag, images",
+        "import": "read the log of another system: LeRobot, MCAP, ROS bag, images, BOP",
     },
     "from a video to a recording": {
         "calibrate": "find camera poses and clock offset from tags or the robot in view",
@@ -42,7 +42,7 @@ GROUPS = {
         "train": "train a policy under the contact events of a demonstration",
         "evaluate": "count how often a policy succeeds, in simulation and Reality",
         "play": "show a policy live in the browser",
-        "export": "write a policy as ONNX or TorchScript",
+        "export": "write a policy as ONNX, or a recording as a LeRobot data set",
     },
     "images": {
         "splat-fit": "fit Gaussian splats to posed images of an object",

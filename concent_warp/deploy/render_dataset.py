@@ -159,7 +159,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
         raise RenderError("a video needs a whole number of frames per second", found=1 / environment.control_step)
     camera, model = _hybrid_camera(cfg, task.model, worlds, to.device)
     joints, layout = _addressed(model, camera, rate)
-    writer = _dataset_writer(to, layout)
+    writer = _dataset_writer(to, layout, model)
     filming = _new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
     left = [row for row in range(cfg.episodes) if not writer.has(row)]
     physics, length = environment.physics, int(environment.max_episode_length)
@@ -197,7 +197,7 @@ def _film_recording(recording: Recording, to: Destination, progress: Callable[[f
     engine = MujocoEngine(model, threads=1)
     camera, compiled = _hybrid_camera(cfg, model, 1, to.device)
     joints, layout = _addressed(compiled, camera, cfg.rate)
-    writer = _dataset_writer(to, layout)
+    writer = _dataset_writer(to, layout, compiled)
     filming = _new_filming(to, camera, writer, cfg.task or recording[0].task or "do the task", cfg.rate)
     with _leaving(filming):
         for k, demonstration in enumerate(recording.demonstrations):
@@ -282,12 +282,16 @@ def _addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[
     return model.jnt_qposadr[joints], layout
 
 
-def _dataset_writer(to: Destination, layout: EpisodeLayout) -> DatasetWriter:
-    """Return the data set, new or to be continued."""
+def _dataset_writer(to: Destination, layout: EpisodeLayout, model: mujoco.MjModel) -> DatasetWriter:
+    """Return the data set of cameras in a model, new or to be continued, with their calibration beside it."""
     settings = {"format": to.format, "out": str(to.out), **plain(to.cfg)}
     if to.resume:
         check_unchanged(to.out / SETTINGS, settings, FREE)
     write_settings(to.out, settings)
+    from concent_warp.recording.logs.readers.calibration import FILE, write_calibration
+    from concent_warp.render.cameras import scene_calibration
+
+    write_calibration(to.out / FILE, {name: scene_calibration(model, name, layout.size) for name in layout.cameras})
     if to.format == "robomimic":
         from concent_warp.render.dataset.robomimic import RobomimicWriter
 

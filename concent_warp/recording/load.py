@@ -18,7 +18,8 @@ KINDS = (
     "of a servo or a folder of logs"
 )
 
-LOGS = {"lerobot": "a LeRobot data set", "ros": "a ROS bag or MCAP file", "images": "a folder of images"}
+LOGS = {"lerobot": "a LeRobot data set", "ros": "a ROS bag or MCAP file", "images": "a folder of images",
+        "bop": "a BOP data set"}  # fmt: skip
 
 
 def load_recording(path: Path | str) -> Recording:
@@ -38,7 +39,8 @@ def load_recording(path: Path | str) -> Recording:
     """
     path = Path(path)
     if (kind := log_kind(path)) is not None and not (path / "scene.xml").exists():
-        fix = f"read it with `concent import {path} --model robot.xml --map robot.toml -o demo.h5`"
+        options = "" if kind == "bop" else " --model robot.xml --map robot.toml"
+        fix = f"read it with `concent import {path}{options} -o demo.h5`"
         raise RecordingError(f"this is {LOGS[kind]}, not yet a recording", where=path, fix=fix)
     if path.is_dir():
         if any(path.glob("*.pt")):

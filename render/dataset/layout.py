@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -40,14 +40,18 @@ class EpisodeLayout:
     """Names of the action's numbers."""
     robot: str = "arm"
     """Kind of robot."""
+    depths: tuple[str, ...] = ()
+    """Cameras with depth."""
+    more: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    """Names of other features, each with the names of its numbers, which may be NaN."""
 
     def __post_init__(self) -> None:
         height, width = self.size
         if self.rate < 1 or self.rate != int(self.rate):
             raise RenderError("the rate of frames is not right", expected="a whole number of frames/s", found=self.rate)
-        if not (self.cameras and self.state and self.action):
-            found = f"{len(self.cameras)} cameras, {len(self.state)} numbers of state and {len(self.action)} of action"
-            raise RenderError("a data set needs images, a state and an action", found=found)
+        if not (self.state and self.action):
+            found = f"{len(self.state)} numbers of state and {len(self.action)} of action"
+            raise RenderError("a data set needs a state and an action", found=found)
         if height % 2 or width % 2 or height < 16 or width < 16:
             raise RenderError("images of this size make no video", expected="even, at least 16 x 16", found=self.size)
 
@@ -68,6 +72,10 @@ class EpisodeLayout:
                 raise RenderError(
                     f"a frame's {name} is not right", expected=f"{len(names)} finite numbers", found=value
                 )
+
+    def described(self) -> dict[str, Any]:
+        """Return the layout as plain data, without what a data set of images does not have."""
+        return {name: value for name, value in asdict(self).items() if name not in ("depths", "more") or value}
 
 
 class EpisodeWriter(Protocol):

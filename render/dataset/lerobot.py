@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from concent_warp.recording.logs.readers.video import DepthCodes
 from concent_warp.render.dataset.layout import EpisodeLayout, Staging, published, replace_text
 from concent_warp.render.dataset.statistics import ImageHistogram, Statistics, merged_statistics, statistics_of_values
-from concent_warp.render.dataset.video import PIXELS, Codec, VideoWriter, join_videos
+from concent_warp.render.dataset.video import DEPTH_PIXELS, PIXELS, Codec, VideoWriter, join_videos
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,7 +57,7 @@ class LeRobotWriter:
         self.folder, self.layout = Path(folder), layout
         self.codec: Codec = codec
         self._full = video_mb * MEGABYTE
-        self._staging = Staging(self.folder, {"format": VERSION, "codec": codec, **asdict(layout)})
+        self._staging = Staging(self.folder, {"format": VERSION, "codec": codec, **layout.described()})
         self._episodes = self._packed()
         done = {int(row[KEY]) for row in self._episodes}
         self._staging.forget([key for key in self._staging.numbers() if key in done])
@@ -101,7 +101,8 @@ class LeRobotWriter:
         number = 1 + max(numbers, default=-1)
         where = {"chunk_index": number // FILES_PER_CHUNK, "file_index": number % FILES_PER_CHUNK}
         lengths = [note["length"] for note in notes]
-        for camera in self.layout.cameras:
+        names = (*self.layout.cameras, *map(_depth_name, self.layout.depths))
+        for camera in names:
             out = self.folder / _video_path(camera, where)
             videos = [self._staging.path(k) / f"{camera}.mp4" for k in keys]
             with published(out) as partial:
@@ -117,7 +118,7 @@ class LeRobotWriter:
             row |= {f"data/{name}": value for name, value in where.items()}
             row |= {"dataset_from_index": index, "dataset_to_index": index + length}
             until = seconds + length / self.layout.rate
-            for camera in self.layout.cameras:
+            for camera in names:
                 prefix = f"videos/{_image_key(camera)}"
                 row |= {f"{prefix}/{name}": value for name, value in where.items()}
                 row |= {f"{prefix}/from_timestamp": seconds, f"{prefix}/to_timestamp": until}
@@ -162,7 +163,21 @@ class LeRobotWriter:
                     "video.is_depth_map": False, "video.fps": self.layout.rate, "video.channels": 3, "has_audio": False,
                 },
             }  # fmt: skip
-        for name, names in (("observation.state", self.layout.state), ("action", self.layout.action)):
+        for camera in self.layout.depths:
+            codes = DepthCodes()
+            found[_image_key(_depth_name(camera))] = {
+                "dtype": "video",
+                "shape": [height, width, 1],
+                "names": ["height", "width", "channels"],
+                "info": {
+                    "video.height": height, "video.width": width, "video.codec": "hevc",
+                    "video.pix_fmt": DEPTH_PIXELS, "video.fps": self.layout.rate, "video.channels": 1,
+                    "has_audio": False, "is_depth_map": True, "video.depth_min": codes.smallest,
+                    "video.depth_max": codes.largest, "video.shift": codes.shift, "video.use_log": codes.logarithmic,
+                },
+            }  # fmt: skip
+        numbers = (("observation.state", self.layout.state), ("action", self.layout.action), *self.layout.more)
+        for name, names in numbers:
             found[name] = {"dtype": "float32", "shape": [len(names)], "names": list(names)}
         found["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         return found | {name: {"dtype": "int64", "shape": [1], "names": None} for name in INDICES}
@@ -246,14 +261,33 @@ class LeRobotEpisode:
             camera: VideoWriter(self._folder / f"{camera}.mp4", layout.rate, layout.size, writer.codec)
             for camera in layout.cameras
         }
-        every = max(1, min(layout.size) // STATISTICS_PIXELS)
+        self._depths = {
+            camera: VideoWriter(self._folder / f"{_depth_name(camera)}.mp4", layout.rate, layout.size, "depth")
+            for camera in layout.depths
+        }
+        self._metres: dict[str, list[np.ndarray]] = {camera: [] for camera in layout.depths}
+        self._every = every = max(1, min(layout.size) // STATISTICS_PIXELS)
         self._seen = {camera: ImageHistogram(every) for camera in layout.cameras}
         self._state: list[np.ndarray] = []
         self._action: list[np.ndarray] = []
+        self._more: dict[str, list[np.ndarray]] = {name: [] for name, _ in layout.more}
 
-    def add(self, images: Mapping[str, np.ndarray], state: np.ndarray, action: np.ndarray) -> None:
-        """See `EpisodeWriter.add`."""
+    def add(
+        self,
+        images: Mapping[str, np.ndarray],
+        state: np.ndarray,
+        action: np.ndarray,
+        depths: Mapping[str, np.ndarray] | None = None,
+        more: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """See `EpisodeWriter.add`; `depths` [m], shape (H, W), and `more` are those that the layout names."""
         self._writer.layout.check(images, state, action)
+        for camera, video in self._depths.items():
+            depth = np.asarray((depths or {})[camera])
+            video.add(DepthCodes().codes(depth))
+            self._metres[camera].append(depth[:: 4 * self._every, :: 4 * self._every].ravel())
+        for name, values in self._more.items():
+            values.append(np.asarray((more or {})[name], dtype=np.float32))
         for camera, image in images.items():
             self._videos[camera].add(image)
             self._seen[camera].add(image)
@@ -269,11 +303,13 @@ class LeRobotEpisode:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        for video in self._videos.values():
+        for video in (*self._videos.values(), *self._depths.values()):
             video.close()
         state, action = np.stack(self._state), np.stack(self._action)
         time = np.arange(len(state), dtype=np.float32) / np.float32(self._writer.layout.rate)
+        more = {name: np.stack(values) for name, values in self._more.items()}
         columns = {"observation.state": _fixed(state), "action": _fixed(action), "timestamp": pa.array(time)}
+        columns |= {name: _fixed(values) for name, values in more.items()}
         pq.write_table(pa.table(columns), self._folder / "data.parquet")
         stats: dict[str, Statistics] = {_image_key(c): seen.statistics() for c, seen in self._seen.items()}
         stats |= {
@@ -281,6 +317,12 @@ class LeRobotEpisode:
             "action": statistics_of_values(action),
             "timestamp": statistics_of_values(time[:, None]),
         }
+        stats |= {name: statistics_of_values(_known_rows(values)) for name, values in more.items()}
+        for camera, values in self._metres.items():
+            named = statistics_of_values(np.concatenate(values)[:, None])
+            count = {"count": np.array([len(state)])}
+            key = _image_key(_depth_name(camera))
+            stats[key] = {name: value.reshape(1, 1, 1) for name, value in named.items() if name != "count"} | count
         plain = {feature: {name: value.tolist() for name, value in named.items()} for feature, named in stats.items()}
         note = {"task": self._task, "length": len(state), "stats": plain}
         (self._folder / "episode.json").write_text(json.dumps(note))
@@ -300,7 +342,7 @@ class LeRobotEpisode:
 
     def _abandon(self) -> None:
         """Close the videos, which are to be removed."""
-        for video in self._videos.values():
+        for video in (*self._videos.values(), *self._depths.values()):
             video.abandon()
 
 
@@ -309,6 +351,17 @@ def _fixed(values: np.ndarray) -> pa.Array:
     import pyarrow as pa
 
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+
+
+def _known_rows(values: np.ndarray) -> np.ndarray:
+    """Return the rows of values (T, n) without NaN, a row of zeros where there is none."""
+    kept = values[np.isfinite(values).all(axis=1)]
+    return kept if len(kept) else np.zeros((1, values.shape[1]))
+
+
+def _depth_name(camera: str) -> str:
+    """Return the name of a camera's depths."""
+    return f"{camera}_depth"
 
 
 def _image_key(camera: str) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ class RobomimicWriter:
             RenderError: It was begun with other settings.
         """
         self.folder, self.layout = Path(folder), layout
-        self._staging = Staging(self.folder, {"format": "robomimic", **asdict(layout)})
+        self._staging = Staging(self.folder, {"format": "robomimic", **layout.described()})
         self._done = self._packed() | set(self._staging.numbers()) | self._staging.dropped()
 
     def has(self, key: int) -> bool:

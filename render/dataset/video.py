@@ -12,26 +12,29 @@ import numpy as np
 from concent_warp.files import DiskFile
 
 Codec = Literal["h264", "av1"]
+"""How colours are encoded."""
 ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     # A key frame every second frame lets readers that pick frames at random decode little, as LeRobot has it.
     "h264": ("libx264", {"g": "2", "crf": "20", "preset": "veryfast", "bf": "0"}),
     "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "8", "svtav1-params": "pred-struct=1"}),
+    # Depths are codes, of which no bit may change.
+    "depth": ("libx265", {"preset": "veryfast", "x265-params": "lossless=1:keyint=2:bframes=0:log-level=none"}),
 }
 """Encoder and its options, by codec. Pictures come in their order, so that videos can be joined."""
-PIXELS = "yuv420p"
+PIXELS, DEPTH_PIXELS = "yuv420p", "gray12le"
 
 
 class VideoWriter:
     """One video that grows frame by frame."""
 
-    def __init__(self, path: Path, rate: int, size: tuple[int, int], codec: Codec = "h264") -> None:
+    def __init__(self, path: Path, rate: int, size: tuple[int, int], codec: Codec | Literal["depth"] = "h264") -> None:
         """Open it.
 
         Args:
             path: File to write.
             rate: Frames a second.
             size: Height and width [px], even.
-            codec: How frames are encoded.
+            codec: How frames are encoded; "depth" for codes of 12 bits.
         """
         import av
 
@@ -40,19 +43,20 @@ class VideoWriter:
         self._container = av.open(self._disk, "w", format="mp4")
         stream: Any = self._container.add_stream(name, rate=rate, options=options)
         stream.height, stream.width = size
-        stream.pix_fmt = PIXELS
+        self._format = DEPTH_PIXELS if codec == "depth" else "rgb24"
+        stream.pix_fmt = DEPTH_PIXELS if codec == "depth" else PIXELS
         stream.codec_context.thread_count = 1
         self._stream = stream
 
     def add(self, image: np.ndarray) -> None:
-        """Add a frame, shape (H, W, 3) uint8.
+        """Add a frame, shape (H, W, 3) uint8, or codes of depths, shape (H, W) uint16.
 
         Raises:
             OSError: The file cannot be written, as on a full disk.
         """
         import av
 
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=self._format)
         self._container.mux(self._stream.encode(frame))
         self._disk.check()
 

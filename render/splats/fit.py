@@ -75,6 +75,9 @@ class SplatFit:
         rgba = torch.from_numpy(views.rgba).to(self.device).float() / 255
         self._mask = rgba[..., 3].contiguous()
         self._rgb = (rgba[..., :3] * rgba[..., 3:]).contiguous()
+        self._known = None if views.known is None else torch.from_numpy(views.known).to(self.device).float()
+        if self._known is not None:
+            self._mask, self._rgb = self._mask * self._known, self._rgb * self._known[..., None]
         self._poses = torch.tensor(views.camera_poses(), dtype=torch.float32, device=self.device)
         self._intrinsics = torch.tensor(views.intrinsics, dtype=torch.float32, device=self.device)
         self._still = torch.tensor([[IDENTITY_POSE]], device=self.device)
@@ -139,6 +142,8 @@ class SplatFit:
             [self.splats()], self._still, self._poses[which][None], self._intrinsics[which][None]
         )
         rgb, alpha = layer.rgb[0], layer.alpha[0]
+        if self._known is not None:
+            rgb, alpha = rgb * self._known[which][..., None], alpha * self._known[which]
         loss = (1 - self.cfg.ssim) * (rgb - self._rgb[which]).abs().mean()
         if self.cfg.ssim > 0:
             images = (t.permute(0, 3, 1, 2) for t in (rgb, self._rgb[which]))
@@ -219,6 +224,9 @@ class SplatFit:
             layer = rasteriser.render(self._still, self._poses[v], self._intrinsics[v])
             error = (layer.rgb[0, 0].clamp(0, 1) - self._rgb[v]).square().mean(dim=-1)
             covered = (layer.alpha[0, 0] > 0.01) | (self._mask[v] > 0)
+            if self._known is not None:
+                tells = self._known[v] > 0
+                error, covered = error[tells], covered[tells]
             ratios = [float(-10 * torch.log10(part.mean().clamp(min=1e-10))) for part in (error, error[covered])]
             scores.append(Score(v, *ratios))
         return scores
@@ -236,7 +244,9 @@ class SplatFit:
 
     def signature(self) -> int:
         """Return a checksum of the images."""
-        parts = (self.views.rgba, self.views.poses, self.views.intrinsics)
+        parts = [self.views.rgba, self.views.poses, self.views.intrinsics]
+        if self.views.known is not None:
+            parts.append(self.views.known)
         return zlib.crc32(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
 
     def save(self, path: Path) -> None:

@@ -33,7 +33,7 @@ def fit_splats(
     folder: Path,
     cfg: SplatFitCfg | None = None,
     *,
-    points: Path | None = None,
+    points: Path | np.ndarray | None = None,
     scale: float = 1.0,
     device: str | None = None,
     resume: bool = False,
@@ -45,9 +45,9 @@ def fit_splats(
         views: Posed images.
         folder: Folder to write to, which exists.
         cfg: Settings.
-        points: Mesh or point cloud to start from, in the frame of the object; by default the hull that the masks
-            agree on.
-        scale: Factor from the unit of the points to metres.
+        points: Mesh or point cloud to start from, in the frame of the object, or its points [m], shape (n, 3); by
+            default the hull that the masks agree on.
+        scale: Factor from the unit of a file of points to metres.
         device: torch's name of the device; the first CUDA device by default where there is one.
         resume: Whether to continue from the checkpoint in the folder, if there is one.
         progress: Called after steps.
@@ -67,7 +67,10 @@ def fit_splats(
             "no such device", expected='"cpu" or "cuda:0"', found=f"{device!r} ({str(error).splitlines()[0]})"
         ) from None
     rng = np.random.default_rng(cfg.seed)
-    start = visual_hull(views, cfg.start, rng) if points is None else read_start(points, cfg.start, scale, rng)
+    if isinstance(points, np.ndarray):
+        start = points[rng.permutation(len(points))[: cfg.start]]
+    else:
+        start = visual_hull(views, cfg.start, rng) if points is None else read_start(points, cfg.start, scale, rng)
     fit, checkpoint = SplatFit(views, start, cfg, device=device), folder / CHECKPOINT
     if resume and checkpoint.exists():
         fit.resume(checkpoint)

@@ -41,6 +41,9 @@ class SplatViews:
     """Pinhole matrices [px], (0, 0) the centre of the first pixel, shape (V, 3, 3)."""
     masked: bool
     """Whether alpha separates the object from the background."""
+    known: np.ndarray | None = None
+    """Whether a pixel tells anything of the object, bool, shape (V, H, W): what hides it does not. All by default;
+    files have no place for it."""
 
     def __len__(self) -> int:
         return len(self.rgba)
@@ -77,7 +80,12 @@ class SplatViews:
         for k, (new, old) in enumerate(zip(size, (width, height), strict=True)):
             intrinsics[:, k] *= new / old
             intrinsics[:, k, 2] += 0.5 * new / old - 0.5
-        return SplatViews(rgba, self.poses, intrinsics, self.masked)
+        known = self.known
+        if known is not None:
+            # A pixel is known where all that it is made of is.
+            share = [cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_AREA) for one in known]
+            known = np.array(share) > 0.999
+        return SplatViews(rgba, self.poses, intrinsics, self.masked, known)
 
     def write(self, folder: Path) -> None:
         """Write the images as PNG and the file that lists them; this comes last."""

@@ -9,8 +9,14 @@ import small_arm
 from small_arm import ball
 from small_dataset import read_frames
 
+import concent_warp as cw
 from concent_warp.cli.entry import main
 from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.recording.logs.readers.calibration import read_calibration
+from concent_warp.recording.recording import ImageStream
+from concent_warp.render.cameras import Camera
+from concent_warp.scene.cameras import with_cameras
+from concent_warp.scene.scene import Scene
 
 TRAIN = [
     "--network.size", "16", "--network.width", "16", "--network.factors", "1", "2", "--flow.batch", "8",
@@ -148,3 +154,17 @@ def test_policy_is_rendered_to_the_frames_of_its_episodes(tmp_path, capsys):
     }
     assert len(info["features"]["action"]["names"]) == 8
     assert frames(out, "wrist").shape == (120, 32, 32, 3)
+    # The calibration beside it is that of the scene's cameras.
+    calibrations = read_calibration(out / "calibration.json")
+    assert set(calibrations) == {"base", "wrist"}
+    scene = Scene(cw.load_policy("shape_sorter").run.recording.scene)
+    true = with_cameras(scene, list(calibrations))
+    for name, one in calibrations.items():
+        assert one.size == (32, 32)
+        assert one.pose is not None
+        blank = np.zeros((1, 32, 32))
+        stream = ImageStream(blank[:, 0, 0], blank[..., None], blank, one.intrinsics, one.pose, one.body)
+        found, expected = Camera.of(name, stream), Camera.in_scene(true, name)
+        assert found.body == expected.body
+        assert found.position == pytest.approx(expected.position, abs=1e-6)
+        assert found.fovy == pytest.approx(expected.fovy, abs=1e-6)

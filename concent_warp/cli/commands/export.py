@@ -1,39 +1,49 @@
-"""``concent export``: a trained policy as ONNX or TorchScript, or as one that comes with the package."""
+"""``concent export``: a trained policy as ONNX or TorchScript, or a recording as a LeRobot data set."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy
 from concent_warp.cli.options import OptionalOutPath
-from concent_warp.cli.terminal import say, say_written
+from concent_warp.cli.terminal import progress_bar, say, say_written
+from concent_warp.errors import RenderError
+from concent_warp.recording.load import load_recording
+from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
 from concent_warp.run_folder import check_folder, claim_file, make_folder
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write a policy, without exploration, as ONNX or TorchScript.
+    """Write a policy, without exploration, as ONNX or TorchScript, or a recording as a LeRobot v3 data set.
 
     Names, order and units of observation and action, scales, limits and the control period are in its metadata.
-    With --as-pretrained, write a run folder reduced to what running the policy takes.
+    With --as-pretrained, write a run folder reduced to what running the policy takes. A data set has tracked poses as
+    features, and calibration.json, scene.xml and map.toml beside it, by which concent import reads it back.
     """
 
     checkpoint: Path | None = None
     """Run folder of a training, or its checkpoint file."""
     pretrained: Pretrained = None
     """Export a policy that comes with the package, shape_sorter where no name is given."""
+    recording: Path | None = None
+    """Write this recording as a LeRobot data set instead."""
     out: OptionalOutPath = None
-    """File to write: .onnx for ONNX, .pt for TorchScript; policy.onnx by default. With --as-pretrained a folder."""
+    """File to write: .onnx for ONNX, .pt for TorchScript; policy.onnx by default. With --as-pretrained and --recording
+    a folder; lerobot by default for a recording."""
     as_pretrained: bool = False
     """Write a folder as they are for --pretrained."""
     overwrite: bool = False
     """Replace existing files."""
+    lerobot: WriteLeRobotCfg = field(default_factory=WriteLeRobotCfg)
 
 
 def run(arguments: Arguments) -> dict[str, Any]:
     """Export and return the metadata."""
+    if arguments.recording is not None:
+        return _data_set(arguments, arguments.recording)
     check_policy(arguments.checkpoint, arguments.pretrained)
     if arguments.as_pretrained:
         folder = Path("pretrained") if arguments.out is None else arguments.out
@@ -56,3 +66,19 @@ def run(arguments: Arguments) -> dict[str, Any]:
     say(f"{observations} observations to {actions} actions every {1e3 * described['control period']:g} ms")
     say_written(out)
     return described
+
+
+def _data_set(arguments: Arguments, path: Path) -> dict[str, Any]:
+    """Write a recording as a data set.
+
+    Raises:
+        RenderError: A policy is given as well, or the folder is not empty.
+    """
+    if arguments.checkpoint is not None or arguments.pretrained is not None or arguments.as_pretrained:
+        raise RenderError("one thing is to be exported", expected="either --recording or a policy")
+    out = Path("lerobot") if arguments.out is None else arguments.out
+    with progress_bar("writing") as progress:
+        count = write_lerobot(load_recording(path), out, arguments.lerobot, progress=progress)
+    say(f"the data set holds {count} episode{'s' * (count != 1)}")
+    say_written(out)
+    return {"episodes": count}

@@ -16,7 +16,7 @@ from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written, table_width
 from concent_warp.errors import RecordingError
 from concent_warp.files import write_text
-from concent_warp.recording.logs.cfg import ImportCfg, PlausibilityCfg
+from concent_warp.recording.logs.cfg import BopCfg, ImportCfg, PlausibilityCfg
 from concent_warp.recording.logs.episode import ReadChannel
 from concent_warp.recording.logs.import_log import import_log, inspect_log
 from concent_warp.recording.logs.suggest import suggest_map
@@ -29,15 +29,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Arguments:
-    """Read a LeRobot data set, an MCAP file, a ROS bag or a folder of images as a recording, with a map of names,
-    units and signs: --suggest writes a first map, --dry-run shows and checks what it makes of the log.
+    """Read LeRobot data sets, MCAP files, ROS bags or folders of images as a recording, with a map of names, units and
+    signs: --suggest writes a first map, --dry-run shows and checks what it makes of the log. A scene of a BOP data set
+    needs neither model nor map.
     """
 
-    source: tyro.conf.Positional[Path]
-    """LeRobot v3 data set, .mcap, .bag, folder of a ROS 2 bag, or folder with color, depth and intrinsics.json."""
-    model: Path
+    source: tyro.conf.Positional[tuple[Path, ...]]
+    """LeRobot v3 data set, .mcap, .bag, folder of a ROS 2 bag, or folder with color, depth and intrinsics.json; several
+    of them, or a folder of them; or a scene of a BOP data set."""
+    model: Path | None = None
     """MJCF of the scene: robot and objects with named actuators and sensors."""
-    mapping: Annotated[Path, tyro.conf.arg(name="map")]
+    mapping: Annotated[Path | None, tyro.conf.arg(name="map")] = None
     """Map (.toml) from channels of the log to actuators, sensors, bodies and cameras of the scene."""
     out: OptionalOutPath = None
     """Recording file (.h5) to write."""
@@ -56,6 +58,7 @@ class Arguments:
     max_pair_delay: float = ImportCfg.max_pair_delay
     """Time between colour and depth of one frame above which they are no pair [s]."""
     plausibility: PlausibilityCfg = field(default_factory=PlausibilityCfg)
+    bop: BopCfg = field(default_factory=BopCfg)
 
 
 def run(arguments: Arguments) -> Recording | None:
@@ -64,6 +67,10 @@ def run(arguments: Arguments) -> Recording | None:
         raise RecordingError("--suggest and --dry-run exclude one another", fix="suggest a map first, then check it")
     numbers = episode_numbers(arguments.episodes)
     if arguments.suggest:
+        if arguments.model is None or arguments.mapping is None:
+            raise RecordingError(
+                "--suggest needs a scene and a file for the map", fix="add --model robot.xml --map robot.toml"
+            )
         claim_file(arguments.mapping, overwrite=arguments.overwrite)
         text = suggest_map(arguments.source, arguments.model, numbers[0] if numbers else None)
         make_folder(arguments.mapping.parent)
@@ -78,6 +85,7 @@ def run(arguments: Arguments) -> Recording | None:
         depth_from=arguments.depth_from,
         max_pair_delay=arguments.max_pair_delay,
         plausibility=arguments.plausibility,
+        bop=arguments.bop,
     )
     if arguments.dry_run:
         _dry_run(arguments, cfg)
@@ -137,7 +145,7 @@ def _dry_run(arguments: Arguments, cfg: ImportCfg) -> None:
     for k, (sentence, names) in enumerate(wrong.items()):
         say(escape(f"{k + 1}. {names[0]}{', ...' * (len(names) > 1)}: {sentence}"))
     if wrong:
-        raise RecordingError(f"{len(wrong)} things are wrong", where=arguments.source, fix="see the list above")
+        raise RecordingError(f"{len(wrong)} things are wrong", where=arguments.source[0], fix="see the list above")
     say("nothing is wrong; leave out --dry-run and add -o demo.h5 to import it")
 
 

@@ -25,6 +25,7 @@ from concent_warp.perception.backends.named import (
     named_masker,
     named_point_tracker,
 )
+from concent_warp.perception.tracking.cfg import AcceptCfg, TrackCfg
 from concent_warp.perception.tracking.moment import TrackedMoment
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
@@ -67,6 +68,8 @@ class Arguments:
     points_weights: Path | None = None
     """Checkpoint of TAPIR for torch."""
     device: DeviceOption = None
+    unknown_surroundings: bool = False
+    """Accept poses whatever is beside the object: for objects on a table, or among others, that the scene lacks."""
     keep_measured: bool = False
     """Keep measured poses of the objects that are in the recording, rather than replace them."""
     images: bool = False
@@ -97,10 +100,12 @@ def run(arguments: Arguments) -> Tracked:
     )
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     scene = None if arguments.model is None else Model.load(arguments.model).scene
+    accept = AcceptCfg(max_unexplained=1.0) if arguments.unknown_surroundings else AcceptCfg()
     make_folder(arguments.out.parent)
     with all_or_none(), _live_view(arguments) as watch, progress_bar("tracking") as progress:
         found = track(
             recording,
+            TrackCfg(accept=accept),
             bodies=arguments.body or None,
             cameras=arguments.camera,
             pose=arguments.pose,

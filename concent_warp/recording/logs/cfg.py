@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Count, Factor, Length, Positive, PositiveDuration, Share
+from concent_warp.checks import Bounds, Count, Factor, Length, Positive, PositiveDuration, Rate, Share
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,26 @@ class PlausibilityCfg:
     """Share of the depths that must be of the scene for this judgement [-]."""
 
 
+ImageNumber = Annotated[int, Bounds(0, 999_999)]
+"""Number of an image of a BOP scene."""
+
+
+@dataclass(frozen=True)
+class BopCfg:
+    """How a scene of a BOP data set is read."""
+
+    first_image: ImageNumber = 0
+    """Number of the first image that is read."""
+    last_image: ImageNumber = 999_999
+    """Number of the last one."""
+    rate: Rate = 30.0
+    """Images a second, numbers that are left out counted [Hz]: the format has no times."""
+    models: str | None = None
+    """Folder of the meshes in the data set; ``models`` by default, or what stands for it."""
+    truth: bool = True
+    """Whether poses of the ground truth become measurements, and those of the first image the initial state."""
+
+
 @dataclass(frozen=True)
 class ImportCfg:
     """How a log is read.
@@ -67,3 +87,5 @@ class ImportCfg:
     """Frames of each camera that are compared with the scene."""
     plausibility: PlausibilityCfg = field(default_factory=PlausibilityCfg)
     """Thresholds of the checks."""
+    bop: BopCfg = field(default_factory=BopCfg)
+    """Scenes of BOP data sets."""

@@ -1,38 +1,50 @@
-"""A log of others as a recording: read, mapped to a scene, checked, and written."""
+"""Logs of others as a recording: read, mapped to a scene, checked, and written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
 
 from concent_warp.checks import check_settings
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.hdf5 import write_hdf5
+from concent_warp.recording.logs.bop.import_bop import BopImport, open_bop
 from concent_warp.recording.logs.cfg import ImportCfg
-from concent_warp.recording.logs.episode import ReadEpisode, read_episode
+from concent_warp.recording.logs.episode import ReadChannel, ReadEpisode, read_episode
 from concent_warp.recording.logs.log_map import LogMap, read_map
 from concent_warp.recording.logs.readers.calibration import FILE, Calibration, read_calibration
+from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Log
 from concent_warp.recording.logs.readers.open_log import open_log
+from concent_warp.recording.naming import PREFIX
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
+Given = TypeVar("Given")
+Source = Path | str | Sequence[Path | str]
+"""A log, a folder of logs, or several of them."""
+
 
 def import_log(
-    source: Path | str,
-    model: Path | str | Scene,
+    source: Source,
+    model: Path | str | Scene | None = None,
     cfg: ImportCfg | None = None,
     *,
-    mapping: Path | str | LogMap,
+    mapping: Path | str | LogMap | None = None,
     out: Path | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Recording:
-    """Read a log of another system as a recording.
+    """Read logs of another system as a recording.
 
     Args:
-        source: LeRobot v3 data set, MCAP file, ROS bag, or folder of colour and depth images.
+        source: LeRobot v3 data set, MCAP file, ROS bag, or folder of colour and depth images; several of them, or a
+            folder of them; or one scene of a BOP data set, which needs neither model nor mapping.
         model: Scene, or MJCF file of it, with named actuators and sensors.
         cfg: Settings.
         mapping: Map of names, units and signs, or a TOML file of it.
@@ -40,10 +52,11 @@ def import_log(
         progress: Called with the share done, 0..1.
 
     Returns:
-        One demonstration per episode, named ``demo_<number>``.
+        One demonstration per episode, named ``demo_<number>``; numbered from 0 through all logs where there are
+        several.
 
     Raises:
-        RecordingError: The log cannot be read, does not fit the map, or contradicts the scene or itself.
+        RecordingError: A log cannot be read, does not fit the map, or contradicts the scene or itself.
         SceneError: The scene cannot be read.
 
     Example:
@@ -56,10 +69,55 @@ def import_log(
     """
     cfg = cfg or ImportCfg()
     check_settings(cfg, RecordingError)
-    log = open_log(source)
-    scene = scene_of(model)
+    sources = log_sources(source)
+    if (bop := _bop_of(sources, model, mapping, cfg)) is not None:
+        recording = bop.recording(None if progress is None else lambda share: progress(0.9 * share))
+    else:
+        recording = _mapped(sources, model, mapping, cfg, progress)
+    validate(recording)
+    if out is not None:
+        write_hdf5(recording, out)
+    if progress is not None:
+        progress(1.0)
+    return recording
+
+
+def inspect_log(
+    source: Source,
+    model: Path | str | Scene | None = None,
+    cfg: ImportCfg | None = None,
+    *,
+    mapping: Path | str | LogMap | None = None,
+) -> Iterator[ReadEpisode]:
+    """Yield what each episode of the logs would become, with all that is wrong with it; a few images are decoded.
+
+    Arguments are those of `import_log`.
+
+    Raises:
+        RecordingError: A log or the map cannot be read at all.
+        SceneError: The scene cannot be read.
+    """
+    cfg = cfg or ImportCfg()
+    check_settings(cfg, RecordingError)
+    sources = log_sources(source)
+    if (bop := _bop_of(sources, model, mapping, cfg)) is not None:
+        yield _inspected(bop, cfg)
+        return
+    for _, episode in _read(sources, model, mapping, cfg)[1]:
+        yield episode
+
+
+def _mapped(
+    sources: Sequence[Path],
+    model: Path | str | Scene | None,
+    mapping: Path | str | LogMap | None,
+    cfg: ImportCfg,
+    progress: Callable[[float], None] | None,
+) -> Recording:
+    """Return the recording of logs that a map ties to a scene."""
+    scene, episodes = _read(sources, model, mapping, cfg)
     read: list[ReadEpisode] = []
-    for share, episode in _read(log, scene, mapping, cfg):
+    for share, episode in episodes:
         if episode.problems:
             first, *others = episode.problems
             if others:
@@ -69,7 +127,8 @@ def import_log(
         read.append(episode)
         if progress is not None:
             progress(0.3 * share)
-    _check_size(read, log.source)
+    named = str(sources[0]) + (f" and {len(sources) - 1} more" if len(sources) > 1 else "")
+    _check_size(read, named)
     total = sum(len(camera.time) for episode in read for camera in episode.cameras)
     before = 0
     demonstrations = []
@@ -83,34 +142,35 @@ def import_log(
 
         demonstrations.append(episode.with_images(tick))
         before += sum(len(camera.time) for camera in episode.cameras)
-    recording = Recording(scene.xml, tuple(demonstrations), str(log.source))
-    validate(recording)
-    if out is not None:
-        write_hdf5(recording, out)
-    if progress is not None:
-        progress(1.0)
-    return recording
+    return Recording(scene.xml, tuple(demonstrations), named)
 
 
-def inspect_log(
-    source: Path | str, model: Path | str | Scene, cfg: ImportCfg | None = None, *, mapping: Path | str | LogMap
-) -> Iterator[ReadEpisode]:
-    """Yield what each episode of a log would become, with all that is wrong with it; a few images are decoded.
-
-    Arguments are those of `import_log`.
-
-    Raises:
-        RecordingError: The log or the map cannot be read at all.
-        SceneError: The scene cannot be read.
-    """
-    for _, episode in _read(open_log(source), scene_of(model), mapping, cfg or ImportCfg()):
-        yield episode
+def _read(
+    sources: Sequence[Path], model: Path | str | Scene | None, mapping: Path | str | LogMap | None, cfg: ImportCfg
+) -> tuple[Scene, Iterator[tuple[float, ReadEpisode]]]:
+    """Return the scene, and an iterator over the share of episodes done and each of them, checked."""
+    logs = [open_log(source) for source in sources]
+    scene = scene_of(_needed(model, "scene", "--model robot.xml"))
+    mapping = _needed(mapping, "map", "--map robot.toml, which --suggest writes")
+    mapping = mapping if isinstance(mapping, LogMap) else read_map(Path(mapping))
+    if len(logs) > 1 and cfg.episodes:
+        raise RecordingError("episodes are of one log", found=f"{len(logs)} logs", fix="import the logs one by one")
+    return scene, _counted(logs, scene, mapping, cfg)
 
 
-def _read(log: Log, scene: Scene, mapping: Path | str | LogMap, cfg: ImportCfg) -> Iterator[tuple[float, ReadEpisode]]:
-    """Yield the share of episodes done and each of them, checked."""
-    if not isinstance(mapping, LogMap):
-        mapping = read_map(Path(mapping))
+def _counted(logs: Sequence[Log], scene: Scene, mapping: LogMap, cfg: ImportCfg) -> Iterator[tuple[float, ReadEpisode]]:
+    """Yield the share done and each episode; those of several logs are numbered from 0."""
+    count = 0
+    for k, log in enumerate(logs):
+        for share, episode in _episodes(log, scene, mapping, cfg):
+            if len(logs) > 1:
+                episode = replace(episode, demonstration=replace(episode.demonstration, name=f"{PREFIX}{count}"))
+            count += 1
+            yield (k + share) / len(logs), episode
+
+
+def _episodes(log: Log, scene: Scene, mapping: LogMap, cfg: ImportCfg) -> Iterator[tuple[float, ReadEpisode]]:
+    """Yield the share of the episodes of a log done and each of them, checked."""
     file = _calibration(log, mapping, cfg)
     numbers = list(cfg.episodes) or list(log.numbers)
     if unknown := sorted(set(numbers) - set(log.numbers)):
@@ -127,6 +187,52 @@ def _read(log: Log, scene: Scene, mapping: Path | str | LogMap, cfg: ImportCfg) 
             except RecordingError as error:
                 read.problems.append(error)
         yield (k + 1) / len(numbers), read
+
+
+def _needed(given: Given | None, what: str, fix: str) -> Given:
+    """Return what is given, or refuse that it is missing."""
+    if given is None:
+        raise RecordingError(f"a log needs a {what}", fix=f"add {fix}")
+    return given
+
+
+def _bop_of(
+    sources: Sequence[Path], model: Path | str | Scene | None, mapping: Path | str | LogMap | None, cfg: ImportCfg
+) -> BopImport | None:
+    """Return the scene of a BOP data set that is to be imported, None where there is another log."""
+    scenes = [source for source in sources if source.exists() and log_kind(source) == "bop"]
+    if not scenes:
+        return None
+    if len(sources) > 1:
+        fix = "import the scenes one by one: each has objects of its own"
+        raise RecordingError("a scene of a BOP data set among other logs", where=scenes[0], fix=fix)
+    if model is not None or mapping is not None or cfg.episodes:
+        raise RecordingError(
+            "a scene of a BOP data set needs neither model, map nor episodes", where=scenes[0], fix="leave them out"
+        )
+    return open_bop(scenes[0], cfg)
+
+
+def _inspected(bop: BopImport, cfg: ImportCfg) -> ReadEpisode:
+    """Return what a scene of a BOP data set becomes; a few images are decoded."""
+    count = len(bop.numbers)
+    rows = np.unique(np.linspace(0, count - 1, min(cfg.checked_frames, count)).round().astype(int))
+    stream = bop.stream(rows.tolist())
+    depths = stream.depth[stream.depth > 0]
+    problems = [] if depths.size else [RecordingError("every depth is missing", where=bop.bop.folder)]
+    low, high = (float(depths.min()), float(depths.max())) if depths.size else (float("nan"), float("nan"))
+    height, width = bop.size
+    lines = [
+        ReadChannel(
+            f"measured/{name}", "scene_gt.json", len(one.time), cfg.bop.rate, float(one.value.min()),
+            float(one.value.max()), "m" if one.value.shape[1] == 3 else "",
+        )
+        for name, one in bop.demonstration.measured.items()
+    ]  # fmt: skip
+    first = bop.bop.images[bop.numbers[0]]
+    source = f"{first.color.parent.name}, {first.depth.parent.name}"
+    lines += [ReadChannel("image/camera", source, count, cfg.bop.rate, low, high, "m", None, f"{width} x {height}")]
+    return ReadEpisode(bop.demonstration, 0.0, lines, [], problems)
 
 
 def scene_of(model: Path | str | Scene) -> Scene:
@@ -149,7 +255,7 @@ def _calibration(log: Log, mapping: LogMap, cfg: ImportCfg) -> dict[str, Calibra
     return {} if path is None else read_calibration(path)
 
 
-def _check_size(read: list[ReadEpisode], source: Path) -> None:
+def _check_size(read: list[ReadEpisode], source: str) -> None:
     """Refuse images that do not fit in memory before any is decoded."""
     size = sum(camera.bytes for episode in read for camera in episode.cameras)
     if size > limits().recording_bytes:

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from concent_warp.recording.logs.import_log import scene_of
+from concent_warp.errors import RecordingError
+from concent_warp.recording.logs.import_log import Source, scene_of
+from concent_warp.recording.logs.readers.kinds import log_kind, log_sources
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 from concent_warp.recording.logs.readers.open_log import open_log
 from concent_warp.recording.logs.targets import Target, body_sensors, targets_of
@@ -39,11 +41,11 @@ class _Choice:
     """Why it may be wrong; empty where the names agree."""
 
 
-def suggest_map(source: Path | str, model: Path | str | Scene, episode: int | None = None) -> str:
+def suggest_map(source: Source, model: Path | str | Scene, episode: int | None = None) -> str:
     """Return a map for a log and a scene as TOML, to be read and corrected by its user; guesses are marked.
 
     Args:
-        source: See `import_log`.
+        source: See `import_log`; of several logs the first is looked at.
         model: See `import_log`.
         episode: Episode that is looked at; the first by default.
 
@@ -51,13 +53,16 @@ def suggest_map(source: Path | str, model: Path | str | Scene, episode: int | No
         RecordingError: The log cannot be read.
         SceneError: The scene cannot be read.
     """
-    log = open_log(source)
+    first = log_sources(source)[0]
+    if first.exists() and log_kind(first) == "bop":
+        raise RecordingError("a scene of a BOP data set needs no map", where=first, fix="import it with -o demo.h5")
+    log = open_log(first)
     m = scene_of(model).model
     found = log.episode(log.numbers[0] if episode is None else episode)
     actuators, sensors = targets_of(m)
     commands = [one for one in found.signals.values() if one.command]
     readings = [one for one in found.signals.values() if not one.command]
-    lines = [f"# Map from {Path(source).name} ({log.kind}): check every line, above all units and signs.", ""]
+    lines = [f"# Map from {first.name} ({log.kind}): check every line, above all units and signs.", ""]
     chosen = _matched(list(actuators.values()), commands)
     lines += _section("action", list(actuators.values()), chosen)
     joints = [one for one in sensors.values() if one.size == 1]

@@ -13,6 +13,7 @@ is in OpenCV's order, 4, 5 or 8 numbers; it and all but the intrinsics may be le
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 
 from concent_warp.documents import is_number, read_json
 from concent_warp.errors import RecordingError
+from concent_warp.files import write_text
 
 FILE = "calibration.json"
 KEYS = ("intrinsics", "distortion", "distortion_model", "pose", "body", "width", "height")
@@ -75,6 +77,28 @@ def read_calibration(path: Path) -> dict[str, Calibration]:
     if not isinstance(cameras, dict) or not cameras:
         raise RecordingError("not a calibration", where=path, expected='{"cameras": {"<name>": {"intrinsics": ...}}}')
     return {str(name): _camera(entry, f"{path}, camera {name!r}") for name, entry in cameras.items()}
+
+
+def write_calibration(path: Path, cameras: Mapping[str, Calibration]) -> None:
+    """Write a ``calibration.json`` of cameras by name, as `read_calibration` reads it, whole or not at all.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    entries = {}
+    for name, one in cameras.items():
+        entry: dict[str, Any] = {}
+        if one.size is not None:
+            entry |= {"width": one.size[1], "height": one.size[0]}
+        entry["intrinsics"] = np.asarray(one.intrinsics, float).tolist()
+        if len(one.distortion):
+            entry |= {"distortion": one.distortion.tolist(), "distortion_model": "opencv"}
+        if one.pose is not None:
+            entry["pose"] = np.asarray(one.pose, float).tolist()
+        if one.body is not None:
+            entry["body"] = one.body
+        entries[name] = entry
+    write_text(path, json.dumps({"cameras": entries}, indent=1) + "\n")
 
 
 def distortion_of(model: str, coefficients: Any, where: object) -> np.ndarray:

@@ -23,13 +23,13 @@ from concent_warp.documents import is_number, read_json
 from concent_warp.errors import RecordingError
 from concent_warp.limits import limits, raising
 from concent_warp.recording.logs.readers.calibration import Calibration, distortion_of, numbers
+from concent_warp.recording.logs.readers.image_files import SUFFIXES, read_image
 from concent_warp.recording.logs.readers.kinds import COLOUR_FOLDERS, DEPTH_FOLDERS, INTRINSICS
 from concent_warp.recording.logs.readers.log import Episode, Images, Signal
 
 CAMERA = "camera"
 """Name of the calibration, where the folder has one camera."""
 STAMPS = "timestamps.csv"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 NUMBER = re.compile(r"\d+(?:[.]\d+)?")
 NESTED = ("color", "colour", "rgb", "rgb_intrinsic", "color_intrinsics", "intrinsics", "camera")
 """Entries of ``intrinsics.json`` that may hold those of the colour camera, to which depths are registered."""
@@ -144,7 +144,7 @@ def _images(folder: Path, stamps: Mapping[str, float], scale: float | None, *, d
     if len(paths) > limits().samples:
         raise RecordingError("too many images", where=folder, expected=limits().samples, fix=raising("samples"))
     timed = sorted((_time_of(path, stamps), path) for path in paths)
-    first = _read(timed[0][1], depth=depth)
+    first = read_image(timed[0][1], depth=depth)
     return Images(
         folder.name,
         np.array([time for time, _ in timed]),
@@ -158,27 +158,8 @@ def _images(folder: Path, stamps: Mapping[str, float], scale: float | None, *, d
 def _frames(paths: Sequence[Path], scale: float | None, *, depth: bool) -> Iterator[np.ndarray]:
     """Yield images; depths in metres where their scale is known."""
     for path in paths:
-        image = _read(path, depth=depth)
+        image = read_image(path, depth=depth)
         yield (image * np.float32(scale)).astype(np.float32) if depth and scale is not None else image
-
-
-def _read(path: Path, *, depth: bool) -> np.ndarray:
-    """Return an image: colours (H, W, 3) uint8, or depths (H, W) as they are stored."""
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise RecordingError("an image cannot be decoded", where=path, expected="PNG or JPEG")
-    if depth:
-        if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
-            raise RecordingError(
-                "an image of depths is not one", where=path, expected="one channel of 16 bits",
-                found=f"{image.shape} {image.dtype}", fix="export depths raw, not as a picture in colours",
-            )  # fmt: skip
-        return image
-    if image.dtype != np.uint8:
-        raise RecordingError("an image of colours has not 8 bits a channel", where=path, found=str(image.dtype))
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
 
 
 def _time_of(path: Path, stamps: Mapping[str, float]) -> float:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-LogKind = Literal["lerobot", "ros", "images"]
+from concent_warp.errors import RecordingError
+
+LogKind = Literal["lerobot", "ros", "images", "bop"]
 KINDS = (
     "a LeRobot v3 data set (folder with meta/info.json), an MCAP file (.mcap), a ROS bag (.bag, .db3, or folder with "
-    "metadata.yaml), or a folder with intrinsics.json and folders of colour and depth images"
+    "metadata.yaml), a folder with intrinsics.json and folders of colour and depth images, a scene of a BOP data set "
+    "(folder with scene_camera.json), or a folder of logs"
 )
 BAGS = (".mcap", ".bag", ".db3")
 COLOUR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left")
 DEPTH_FOLDERS = ("depth", "aligned_depth", "aligned_depth_to_color", "depth_aligned")
 INTRINSICS = ("intrinsics.json", "camera_intrinsic.json", "intrinsic.json", "camera_intrinsics.json")
+BOP_CAMERAS = "scene_camera.json"
 
 
 def log_kind(path: Path) -> LogKind | None:
@@ -23,8 +28,29 @@ def log_kind(path: Path) -> LogKind | None:
             return "lerobot"
         if (path / "metadata.yaml").exists():
             return "ros"
+        if (path / BOP_CAMERAS).exists() or any(path.glob(f"*/*/{BOP_CAMERAS}")):
+            return "bop"
         folders = {one.name.lower() for one in path.iterdir() if one.is_dir()}
         if folders & {*COLOUR_FOLDERS, *DEPTH_FOLDERS} or any((path / name).exists() for name in INTRINSICS):
             return "images"
         return None
     return "ros" if path.suffix.lower() in BAGS and path.exists() else None
+
+
+def log_sources(source: Path | str | Sequence[Path | str]) -> list[Path]:
+    """Return the logs that are meant: a folder that is no log stands for the logs in it, in the order of their names.
+
+    Raises:
+        RecordingError: None is named, or one is named twice.
+    """
+    named = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
+    found: list[Path] = []
+    for path in named:
+        inside = sorted(path.iterdir()) if path.is_dir() and log_kind(path) is None else []
+        found += [one for one in inside if log_kind(one) is not None] or [path]
+    if not found:
+        raise RecordingError("no log is named", expected=KINDS)
+    resolved = [path.resolve() for path in found]
+    if twice := [path for k, path in enumerate(found) if resolved.index(resolved[k]) < k]:
+        raise RecordingError("a log is named twice", where=twice[0], fix="name it once")
+    return found

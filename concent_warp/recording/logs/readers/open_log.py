@@ -28,6 +28,8 @@ def open_log(path: Path | str) -> Log:
         return RosLog(path)
     if kind == "images":
         return ImageFolder(path)
+    if kind == "bop":
+        raise RecordingError("a scene of a BOP data set is no log with a map", where=path, fix="import it without one")
     if path.suffix in (".h5", ".hdf5", ".pt"):
         raise RecordingError("this is no log to import", where=path, fix="every command reads it as it is")
     found = path.suffix or ("another folder" if path.is_dir() else "no suffix")

@@ -57,6 +57,17 @@ class DepthCodes:
             raise RecordingError("the codes of the depths make no sense", where=where, found=stated)
         return DepthCodes(float(a), float(b), float(s), bool(stated["use_log"]))
 
+    def codes(self, metres: np.ndarray) -> np.ndarray:
+        """Return the nearest codes of depths [m] of any shape, uint16; 0, missing, for those out of range."""
+        kept = np.isfinite(metres) & (metres > self.smallest) & (metres < self.largest)
+        inside = np.where(kept, metres, self.smallest).astype(float)
+        if self.logarithmic:
+            low, high = math.log(self.smallest + self.shift), math.log(self.largest + self.shift)
+            share = (np.log(inside + self.shift) - low) / (high - low)
+        else:
+            share = (inside - self.smallest) / (self.largest - self.smallest)
+        return np.where(kept, np.clip(np.rint(CODES * share), 1, CODES - 1), 0).astype(np.uint16)
+
     def metres(self, codes: np.ndarray) -> np.ndarray:
         """Return depths [m] float32 of codes of any shape; 0 for the first and the last code."""
         every = np.arange(CODES + 1) / CODES

@@ -1,0 +1,1 @@
+"""Scenes of data sets of the BOP benchmark as recordings."""
