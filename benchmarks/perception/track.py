@@ -319,8 +319,8 @@ def _shapes(rows: list[dict[str, Any]]) -> str:
             lines.append((name, view, str(len(found)), *counts))
     return (
         "**First pose of other shapes without prior**: dropped onto a table and filmed at rest, untextured, alone or\n"
-        "behind a post that hides 30 to 60 %. Several of these views look the same from two poses (a wedge's end, a mug\n"
-        f"whose handle is hidden) and have to be refused:\n\n{table(head, lines)}"
+        "behind a post that hides 30 to 60 %. Several of these views look the same from two poses (a wedge's end, a\n"
+        f"mug whose handle is hidden) and have to be refused:\n\n{table(head, lines)}"
     )
 
 

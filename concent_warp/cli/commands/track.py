@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -12,11 +14,15 @@ from rich.markup import escape
 
 from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
+from concent_warp.errors import ConcentError
 from concent_warp.model import Model
+from concent_warp.perception.tracking.checkpoint import state_path
+from concent_warp.perception.tracking.prompts import written_prompts
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
 from concent_warp.recording.load import load_recording
-from concent_warp.run_folder import claim_file, make_folder
+from concent_warp.resumable_file import claim_resumable, say_how_to_resume
+from concent_warp.run_folder import make_folder
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,13 @@ class Arguments:
     pose: str = "initial"
     """First poses: initial (the recording's initial state; a search where it has none), none (a search), or a TOML or
     JSON file with position and quaternion of each body."""
+    click: tuple[str, ...] = ()
+    """Pixels on bodies in the first frame, at which they are searched: BODY=COLUMN,ROW, with @CAMERA where there are
+    several."""
+    box: tuple[str, ...] = ()
+    """Boxes around bodies in the first frame, BODY=LEFT,TOP,RIGHT,BOTTOM, with @CAMERA where there are several."""
+    prompts: Path | None = None
+    """TOML or JSON file of clicks and boxes, by body, or by demonstration and body."""
     body: tuple[str, ...] = ()
     """Bodies to track; all with a free joint by default."""
     camera: tuple[str, ...] = ()
@@ -46,26 +59,31 @@ class Arguments:
     """Keep the video in the written recording."""
     json: bool = False
     """Print one JSON object with the figures, in SI units, instead of sentences."""
+    resume: bool = False
+    """Continue an interrupted tracking; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace the file if it is there."""
 
 
 def run(arguments: Arguments) -> Tracked:
     """Track, write, and say what was found."""
-    claim_file(arguments.out, overwrite=arguments.overwrite)
+    claim_resumable(arguments.out, state_path(arguments.out), overwrite=arguments.overwrite, resume=arguments.resume)
+    prompts = _prompts(arguments)
     recording = load_recording(arguments.recording).only(arguments.demonstrations)
     scene = None if arguments.model is None else Model.load(arguments.model).scene
     make_folder(arguments.out.parent)
-    with progress_bar("tracking") as progress:
+    with progress_bar("tracking") as progress, say_how_to_resume(state_path(arguments.out)):
         found = track(
             recording,
             bodies=arguments.body or None,
             cameras=arguments.camera,
             pose=arguments.pose,
             scene=scene,
+            prompts=prompts,
             keep_measured=arguments.keep_measured,
             images=arguments.images,
             out=arguments.out,
+            resume=arguments.resume,
             progress=progress,
         )
     if arguments.json:
@@ -75,6 +93,14 @@ def run(arguments: Arguments) -> Tracked:
         say(escape(line))
     say_written(arguments.out)
     return found
+
+
+def _prompts(arguments: Arguments) -> Mapping[str, Any] | Path | None:
+    """Return the clicks and boxes, or the file of them."""
+    written = written_prompts(arguments.click, arguments.box)
+    if written and arguments.prompts is not None:
+        raise ConcentError("--prompts cannot be given with --click or --box", fix="write all of them into the file")
+    return written or arguments.prompts
 
 
 def _figures(track: BodyTrack) -> dict[str, object]:

@@ -145,6 +145,8 @@ class SearchCfg:
     scores."""
     min_majority: PositiveShare = 0.7
     """Least excess of those pixels that are nearer to the one pose over those nearer to the other [-]."""
+    min_divided_margin: Positive = 0.2
+    """Least advantage in score, whatever known bodies cover, where such pixels are divided between two poses [-]."""
     same_translation: Positive = 0.006
     """Distance below which two poses are the same [m]."""
     same_rotation: Angle = 8.0

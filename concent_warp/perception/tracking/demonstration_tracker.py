@@ -10,9 +10,11 @@ from concent_warp.errors import RecordingError
 from concent_warp.perception.tracking.body_tracker import BodyTracker
 from concent_warp.perception.tracking.bundle import bundled
 from concent_warp.perception.tracking.cfg import TrackCfg
+from concent_warp.perception.tracking.checkpoint import TrackCheckpoint
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import symmetry_of
+from concent_warp.perception.tracking.prompts import Prompt
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.smooth import smooth
 from concent_warp.perception.tracking.video import Video
@@ -31,6 +33,9 @@ def track_bodies(
     name: str,
     where: str,
     progress: Callable[[float], None] | None,
+    *,
+    prompts: Mapping[str, Prompt] | None = None,
+    checkpoint: TrackCheckpoint | None = None,
 ) -> list[BodyTrack]:
     """Return the tracks of bodies in one demonstration.
 
@@ -43,6 +48,8 @@ def track_bodies(
         name: The demonstration's name.
         where: File and demonstration, for messages.
         progress: Called with the share done, 0..1.
+        prompts: Where a user says that bodies without first pose are, by body.
+        checkpoint: State that the tracking continues from, and is written to now and then.
 
     Raises:
         RecordingError: A given first pose does not agree with the video.
@@ -50,15 +57,20 @@ def track_bodies(
     renderer = RayRenderer(scene.model)
     trackers = [BodyTracker(s, symmetry_of(s, cfg.symmetry_tolerance), cfg) for s in shapes]
     rng = np.random.default_rng(cfg.seed)
-    count = len(video.time)
-    for moment, time in enumerate(video.time):
+    count, prompts = len(video.time), prompts or {}
+    done = 0 if checkpoint is None else checkpoint.begin(name, trackers, rng)
+    # Bodies that a user pointed at are found first, so that they are known to the search for others like them.
+    ordered = sorted(trackers, key=lambda t: t.shape.name not in prompts)
+    for moment in range(done, count):
+        time = video.time[moment]
         renderer.set_state(video.qpos[moment])
         for tracker in trackers:
             here = first.get(tracker.shape.name) if moment == 0 else tracker.pose if tracker.tracked else None
             renderer.place(tracker.shape.row, here)
         views = video.views(moment, renderer)
-        for tracker in trackers:
-            given = first.get(tracker.shape.name)
+        for tracker in ordered:
+            given, prompt = first.get(tracker.shape.name), prompts.get(tracker.shape.name)
+            tracker.regions = () if prompt is None or tracker.pose is not None else prompt.regions(video.frames[moment])
             if moment == 0 and given is not None:
                 _begin(tracker, renderer, float(time), views, given, where)
                 if tracker.tracked:
@@ -66,6 +78,8 @@ def track_bodies(
             tracker.advance(renderer, float(time), views, rng)
             if moment == 0 and given is not None and tracker.tracked:
                 _check_correction(tracker, given, where)
+        if checkpoint is not None:
+            checkpoint.advance(name, moment + 1, trackers, rng)
         if progress is not None:
             progress(0.9 * (moment + 1) / count)
     for tracker in trackers:

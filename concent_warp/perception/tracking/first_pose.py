@@ -51,6 +51,11 @@ def _pose(entry: Any, where: str) -> np.ndarray:
     return pose_of(values["position"], values["quaternion"])
 
 
+def is_pose_file(given: object) -> bool:
+    """Return whether first poses are given as a file."""
+    return isinstance(given, str | Path) and given not in ("none", "initial")
+
+
 def first_poses(
     given: str | Path | Mapping[str, np.ndarray],
     scene: Scene,

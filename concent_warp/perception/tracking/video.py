@@ -29,6 +29,8 @@ class Video:
     """Robot's configuration, shape (T, nq)."""
     unmeasured: list[str]
     """Joints that nothing tells about."""
+    names: tuple[str, ...] = ()
+    """Cameras of the streams."""
 
     @staticmethod
     def of(
@@ -62,7 +64,9 @@ class Video:
                 groups.append([frame])
         time = np.array([np.mean([f[0] for f in group]) for group in groups])
         qpos, unmeasured = configurations(model, demonstration, time)
-        return Video(time, [[(c, k) for _, c, k in group] for group in groups], streams, qpos, unmeasured)
+        return Video(
+            time, [[(c, k) for _, c, k in group] for group in groups], streams, qpos, unmeasured, tuple(with_depth)
+        )
 
     def views(self, moment: int, renderer: RayRenderer) -> list[View]:
         """Return the frames of a moment; the renderer is in its state."""

@@ -69,6 +69,11 @@ class _Candidate:
     agreed: Agreement
     score: float
 
+    @property
+    def quality(self) -> float:
+        """Score of what is seen of it, whatever known bodies cover [-]."""
+        return self.score / max(min(self.agreed.visible, 1.0), 1e-3)
+
 
 def find_pose(
     renderer: RayRenderer,
@@ -165,15 +170,21 @@ class _Search:
         return Found(best.fit, best.score, "")
 
     def _advantage(self, first: _Candidate, second: _Candidate) -> float:
-        """Return by how much one pose is better than another [-]: by the scores, or, where pixels at which they differ
-        are enough and nearly all agree, by these; 0 where pixels and scores contradict one another.
+        """Return by how much one pose is better than another [-].
+
+        Few pixels at which they differ leave it to the scores. Where nearly all of them speak for one pose, it is the
+        better one unless the scores say otherwise. Where they are divided, each pose explains what the other does not,
+        as with two equal objects: one is better only if it fits what is seen of it much better.
         """
         cfg, lead = self.cfg.search, first.score - second.score
         share, count = preference(self.renderer, self.view, self.shape, first.fit, second.fit)
         majority = 2 * share - 1
-        if count < cfg.min_votes or abs(majority) < cfg.min_majority:
+        if count < cfg.min_votes:
             return lead
-        return majority if majority * lead >= 0 else 0.0
+        if abs(majority) >= cfg.min_majority:
+            return majority if majority * lead >= 0 else 0.0
+        quality = first.quality - second.quality
+        return quality if abs(quality) >= cfg.min_divided_margin and quality * lead > 0 else 0.0
 
     def _turns_unseen(self, best: _Candidate) -> bool:
         """Return whether a turn that would make it another pose changes nothing that is seen."""
