@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from concent_warp.array_file import write_arrays
+from concent_warp.array_file import read_arrays, write_arrays
 from concent_warp.errors import RecordingError
 from concent_warp.perception.tracking.alignment.align import Fit
 from concent_warp.perception.tracking.alignment.rows import BIASES, Normal
@@ -70,14 +71,13 @@ class TrackCheckpoint:
         if not resume or not path.exists():
             path.unlink(missing_ok=True)
             return TrackCheckpoint(path, key)
+        arrays = read_arrays(path, _names(path), kind="the state of a tracking", error=RecordingError)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
             tree = json.loads(str(arrays.pop("tree")))
             found = TrackCheckpoint(path, str(tree["key"]))
             found.finished = {name: _tracks(part, arrays) for name, part in tree["finished"].items()}
             found.begun = None if tree["begun"] is None else _begun(tree["begun"], arrays)
-        except Exception as error:  # NumPy, zipfile and json raise whatever their parsers do
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
             raise RecordingError(
                 "not the state of a tracking", where=path, found=" ".join(str(error).split())[:200],
                 fix="delete it to start anew",
@@ -147,6 +147,14 @@ class TrackCheckpoint:
         write_arrays(self.path, {"tree": np.array(json.dumps(tree)), **arrays})
         self.written = time.monotonic()
         self.cost = self.written - begun
+
+
+def _names(path: Path) -> list[str]:
+    """Return the names of the arrays in a file; none where it is no archive."""
+    if not zipfile.is_zipfile(path):
+        return ["tree"]
+    with zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def _is_resumable(trackers: Sequence[BodyTracker]) -> bool:

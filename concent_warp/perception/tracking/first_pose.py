@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def _pose(entry: Any, where: str) -> np.ndarray:
     return pose_of(values["position"], values["quaternion"])
 
 
-def is_pose_file(given: object) -> bool:
+def is_pose_file(given: object) -> TypeGuard[str | Path]:
     """Return whether first poses are given as a file."""
     return isinstance(given, str | Path) and given not in ("none", "initial")
 

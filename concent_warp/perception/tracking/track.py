@@ -110,9 +110,14 @@ def track(
         step = None if progress is None else lambda share, k=k: progress(share_of(k, share))
         found = None if kept is None else kept.finished.get(demonstration.name)
         if found is None:
-            found = track_bodies(
-                scene, video, shapes, first, cfg, demonstration.name, where, step, prompts=pointed, checkpoint=kept
-            )
+            try:
+                found = track_bodies(
+                    scene, video, shapes, first, cfg, demonstration.name, where, step, prompts=pointed, checkpoint=kept
+                )
+            except RecordingError:  # it would end in the same way again
+                if kept is not None:
+                    kept.remove()
+                raise
         if all(t.lost.all() for t in found):
             reasons = "; ".join(f"{t.body}: {t.reason or 'hidden'}" for t in found)
             if kept is not None:

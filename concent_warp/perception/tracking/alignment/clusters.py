@@ -85,7 +85,7 @@ def _in_box(pixels: np.ndarray, box: tuple[float, float, float, float], slack: f
     """Return which pixels (n, 2) lie in a box that is widened on each side by a share of its size, shape (n,)."""
     low, high = np.array(box[:2]), np.array(box[2:])
     wider = slack * (high - low)
-    return ((pixels >= low - wider) & (pixels <= high + wider)).all(axis=1)
+    return np.asarray(((pixels >= low - wider) & (pixels <= high + wider)).all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ the image, and be clearly better than the next that no symmetry of the shape exp
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -96,12 +96,20 @@ def find_pose(
         region: Where a user says that it is; anywhere by default.
     """
     renderer.place(shape.row, None)
-    found = _Search(renderer, view, shape, symmetry, cfg, rng, region).outcome()
+    front = foreground(renderer, view, shape, cfg)
+    clusters, where = front.clusters, "seen in front of robot and static scene"
+    if region is not None and clusters:
+        clusters = [c for c in region.restricted(clusters, view, shape) if len(c.points) >= cfg.search.min_cluster]
+        where = f"seen at {region.text()}"
+    if not clusters:
+        return Found(None, 0.0, f"nothing unknown of its size is {where}")
+    points = np.unique(np.concatenate([c.points for c in clusters]), axis=0)
+    found = _Search(renderer, view, shape, symmetry, cfg, rng, region, front, clusters, points).outcome()
     renderer.place(shape.row, None)
     return found
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Search:
     """One search."""
 
@@ -112,32 +120,26 @@ class _Search:
     cfg: TrackCfg
     rng: np.random.Generator
     region: Region | None
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    front: Foreground
+    clusters: list[Cluster]
+    """Those in which the body may be."""
+    points: np.ndarray
     """Points of all clusters [m], shape (n, 3)."""
 
     def outcome(self) -> Found:
         """Return what is found."""
         cfg = self.cfg.search
-        front = foreground(self.renderer, self.view, self.shape, self.cfg)
-        clusters, where = front.clusters, "seen in front of robot and static scene"
-        if self.region is not None and clusters:
-            clusters = self.region.restricted(clusters, self.view, self.shape)
-            clusters = [c for c in clusters if len(c.points) >= cfg.min_cluster]
-            where = f"seen at {self.region.text()}"
-        if not clusters:
-            return Found(None, 0.0, f"nothing unknown of its size is {where}")
-        self.points = np.unique(np.concatenate([c.points for c in clusters]), axis=0)
         turns = Rotation.random(cfg.orientations, rng=self.rng).as_matrix()
-        starts = [pose for cluster in clusters for pose in self._aligned(cluster, turns)]
-        tried = self._refined(self._best(front, starts, [], cfg.kept))
+        starts = [pose for cluster in self.clusters for pose in self._aligned(cluster, turns)]
+        tried = self._refined(self._best(starts, [], cfg.kept))
         if not tried:
             return Found(None, 0.0, "no start led to a pose that the image determines")
         finals = self._settled(self._distinct(tried)[: cfg.finalists])
         for _ in range(RIVAL_ROUNDS):
             best = (self._accepted(finals) or finals or tried)[0]
             known = [c.fit.pose for c in (*finals, *tried)]
-            for group in self._rivals(best, clusters):
-                rivals = self._best(front, group, known, cfg.rivals)
+            for group in self._rivals(best):
+                rivals = self._best(group, known, cfg.rivals)
                 known += rivals
                 finals += self._settled(self._distinct(self._refined(rivals)))
             finals = self._distinct(sorted(finals, key=lambda c: -c.score))
@@ -219,11 +221,11 @@ class _Search:
         cost, poses = closest_points(many, eye, self.shape, poses[best], cfg.rounds // FEWER)
         return [poses[k] for k in self._unlike(cost, poses, cfg.looked_at)]
 
-    def _rivals(self, best: _Candidate, clusters: list[Cluster]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _rivals(self, best: _Candidate) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return poses at which the shape might show nearly what it shows at the best one: turned in its place, and
         moved to the points again, by turns of a box and by smaller turns.
         """
-        cluster, turned = _nearest(best, clusters, self.shape), best.fit.pose @ rival_turns(self.shape)
+        cluster, turned = _nearest(best, self.clusters, self.shape), best.fit.pose @ rival_turns(self.shape)
         box, fine = turned[:BOX_TURNS], turned[BOX_TURNS:]
         anew = self._aligned(cluster, box[:, :3, :3])
         return [*box, *self._moved(cluster, box), *anew], [*fine, *self._moved(cluster, fine)]
@@ -240,12 +242,10 @@ class _Search:
                 found.append(int(k))
         return found
 
-    def _best(
-        self, front: Foreground, starts: list[np.ndarray], known: list[np.ndarray], most: int
-    ) -> list[np.ndarray]:
+    def _best(self, starts: list[np.ndarray], known: list[np.ndarray], most: int) -> list[np.ndarray]:
         """Return the starts, at most so many, that explain most of the depth and are unlike known poses (4, 4)."""
         gains = [
-            front.gain(self.renderer, self.view, self.shape, pose) if self._admitted(pose) else -np.inf
+            self.front.gain(self.renderer, self.view, self.shape, pose) if self._admitted(pose) else -np.inf
             for pose in starts
         ]
         chosen: list[np.ndarray] = []
