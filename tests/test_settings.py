@@ -31,6 +31,7 @@ CHANGED_IN_PLACE = {
     "RunFolder",
     "Iteration",
     "_Claims",
+    "TrackCheckpoint",
 }
 """Dataclasses that hold a state, or that grow while they are filled."""
 

@@ -109,6 +109,9 @@ WRONG = {
         "--masker sam2 --masker-weights gone", "--masker-weights gone", "--points magic", "--points tapir",
         "--points tapir --points-checkout gone --points-weights gone", "--points-weights gone", "--device gpu",
         "--report scene.xml", "--live --view.host nowhere.invalid",
+        "--body nothing", "--camera nothing", "--pose gone.toml", "--model gone.xml", "--click block",
+        "--click block=1,2,3", "--click block=9999,5", "--click lid=5,5", "--click block=5,5@left",
+        "--box block=9,9,5,5", "--box block=1,2", "--prompts gone.toml",
     ),
     "import": (
         "--episodes 5-3", "--episodes first", "--episodes 7", "--suggest --dry-run", "--calibration gone.json",

@@ -19,6 +19,8 @@ from scipy.stats import chi2
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import FOLDER, machine, machine_line, table, write_page
+from benchmarks.perception.track_shapes import SHAPES, VIEWS
+from benchmarks.perception.track_shapes import measure as measure_shape
 from concent_warp.errors import RecordingError
 from concent_warp.perception.tracking.alignment.search import find_pose
 from concent_warp.perception.tracking.cfg import TrackCfg
@@ -37,7 +39,7 @@ from concent_warp.scene.scene import Scene
 
 NAME = "track"
 BODY = "block"
-SEEDS = tuple(range(12))
+SEEDS = tuple(range(20))
 """Seeds from 1000 on were used while the tracker was developed."""
 START, STOP, RATE = 2.0, 4.0, 20.0
 """Span in which the block is grasped, lifted and carried [s], and frames a second."""
@@ -52,6 +54,8 @@ SETS = {
 """Cameras; the gripper hides 49 % of what the last would see of the block, and 20 % of what the others would."""
 OFFSETS = {"off by 5 mm, 5 degrees": (0.005, 5.0), "off by 10 mm, 8 degrees": (0.01, 8.0), "off by 50 mm": (0.05, 0.0)}
 """First poses that are wrong [m, degrees], in a random direction."""
+SHAPE_SEEDS = tuple(range(10))
+"""Seeds of the other shapes."""
 SEARCHED = 5
 """Frames of each video that are searched without prior."""
 GOOD = (0.002, 3.0)
@@ -225,6 +229,11 @@ def main() -> None:
             for name in SETS:
                 if kept.wanted(f"{name}, seed {seed}", 45.0):
                     kept.add(f"{name}, seed {seed}", {**measure(seed, name), "machine": machine()})
+        for seed in SHAPE_SEEDS if args.seeds == SEEDS else args.seeds:
+            for name in SHAPES:
+                if kept.wanted(f"{name}, seed {seed}", 10.0):
+                    found = measure_shape(name, seed, SETS["untextured"])
+                    kept.add(f"{name}, seed {seed}", {"shape": name, "seed": seed, "views": found})
         kept.close()
     if args.data.parent == FOLDER / "data":
         write_page(NAME, page(kept.rows))
@@ -240,6 +249,7 @@ def page(rows: dict[str, Any]) -> str:
         machine_line(measured[-1]["machine"]) + "\n",
         _accuracy(measured),
         _first(measured),
+        _shapes([row for row in rows.values() if "shape" in row]),
     ]
     if "speed" in rows:
         row = rows["speed"]
@@ -295,6 +305,22 @@ def _first(rows: list[dict[str, Any]]) -> str:
     second = ("video", "given first pose", "pulled to within 2 mm, 3 deg", "refused", "accepted wrongly")
     return f"**First pose without prior** (bar: 95 % found, the rest refused):\n\n{table(head, searched)}\n" + (
         f"**Wrong first pose:**\n\n{table(second, wrong)}"
+    )
+
+
+def _shapes(rows: list[dict[str, Any]]) -> str:
+    """Return the table of first poses of other shapes."""
+    head = ("shape", "view", "frames searched", "found within 2 mm, 3 deg", "refused", "wrong")
+    lines = []
+    for name in SHAPES:
+        for view in VIEWS:
+            found = [row["views"][view]["result"] for row in rows if row["shape"] == name]
+            counts = (str(found.count(k)) for k in ("found", "refused", "wrong"))
+            lines.append((name, view, str(len(found)), *counts))
+    return (
+        "**First pose of other shapes without prior**: dropped onto a table and filmed at rest, untextured, alone or\n"
+        "behind a post that hides 30 to 60 %. Several of these views look the same from two poses (a wedge's end, a\n"
+        f"mug whose handle is hidden) and have to be refused:\n\n{table(head, lines)}"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 import time
@@ -123,7 +124,18 @@ def _no_native_output() -> Iterator[None]:
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
     """Show a bar with an estimate of the time left; what is given is to be called with the share done, 0..1."""
     with status_bar(title) as update:
-        yield lambda share: update(share, "", None)
+        first: tuple[float, float] | None = None
+
+        def show(share: float) -> None:
+            # What was done before, by a run that is continued, took none of this time.
+            nonlocal first
+            now = time.monotonic()
+            first = first or (share, now)
+            done = share - first[0]
+            known = done > 0.02 * (1 - first[0])
+            update(share, "", (now - first[1]) * (1 - share) / done if known else math.nan)
+
+        yield show
 
 
 @contextmanager
@@ -178,4 +190,6 @@ def _time_left(share: float, spent: float, left: float | None) -> str:
         if share <= 0.02:
             return ""
         left = spent * (1 - share) / share
+    if math.isnan(left):
+        return ""
     return f", {left / 60:.0f} min left" if left > 90 else f", {left:.0f} s left"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -26,11 +27,14 @@ from concent_warp.perception.backends.named import (
     named_point_tracker,
 )
 from concent_warp.perception.tracking.cfg import AcceptCfg, TrackCfg
+from concent_warp.perception.tracking.checkpoint import state_path
 from concent_warp.perception.tracking.moment import TrackedMoment
+from concent_warp.perception.tracking.prompts import written_prompts
 from concent_warp.perception.tracking.result import BodyTrack, Tracked
 from concent_warp.perception.tracking.track import track
 from concent_warp.recording.load import load_recording
 from concent_warp.report.tracking.cfg import LiveTrackCfg, TrackReportCfg
+from concent_warp.resumable_file import claim_resumable, say_how_to_resume
 from concent_warp.run_folder import claim_file, command_line, make_folder, plain, versions
 
 
@@ -49,6 +53,13 @@ class Arguments:
     pose: str = "initial"
     """First poses: initial (the recording's initial state; a search where it has none), none (a search), or a TOML or
     JSON file with position and quaternion of each body."""
+    click: tuple[str, ...] = ()
+    """Pixels on bodies in the first frame, at which they are searched: BODY=COLUMN,ROW, with @CAMERA where there are
+    several."""
+    box: tuple[str, ...] = ()
+    """Boxes around bodies in the first frame, BODY=LEFT,TOP,RIGHT,BOTTOM, with @CAMERA where there are several."""
+    prompts: Path | None = None
+    """TOML or JSON file of clicks and boxes, by body, or by demonstration and body."""
     body: tuple[str, ...] = ()
     """Bodies to track; all with a free joint by default."""
     camera: tuple[str, ...] = ()
@@ -80,6 +91,8 @@ class Arguments:
     """While it is tracked, show the newest frame and the states so far in the browser."""
     json: bool = False
     """Print one JSON object with the figures, in SI units, instead of sentences."""
+    resume: bool = False
+    """Continue an interrupted tracking; the result is the same as without the interruption."""
     overwrite: bool = False
     """Replace files that are there."""
     page: TrackReportCfg = field(default_factory=TrackReportCfg)
@@ -90,9 +103,10 @@ def run(arguments: Arguments) -> Tracked:
     """Track, write, and say what was found."""
     if arguments.report is not None and arguments.report.resolve() == arguments.out.resolve():
         raise ConcentError("recording and page have the same name", where=arguments.out, fix="name them differently")
-    for path in (arguments.out, arguments.report):
-        if path is not None:
-            claim_file(path, overwrite=arguments.overwrite)
+    claim_resumable(arguments.out, state_path(arguments.out), overwrite=arguments.overwrite, resume=arguments.resume)
+    if arguments.report is not None:
+        claim_file(arguments.report, overwrite=arguments.overwrite)
+    prompts = _prompts(arguments)
     check_device(arguments.device)
     masker = named_masker(arguments.masker, arguments.masker_weights, arguments.device)
     points = named_point_tracker(
@@ -102,7 +116,12 @@ def run(arguments: Arguments) -> Tracked:
     scene = None if arguments.model is None else Model.load(arguments.model).scene
     accept = AcceptCfg(max_unexplained=1.0) if arguments.unknown_surroundings else AcceptCfg()
     make_folder(arguments.out.parent)
-    with all_or_none(), _live_view(arguments) as watch, progress_bar("tracking") as progress:
+    with (
+        all_or_none(),
+        _live_view(arguments) as watch,
+        progress_bar("tracking") as progress,
+        say_how_to_resume(state_path(arguments.out)),
+    ):
         found = track(
             recording,
             TrackCfg(accept=accept),
@@ -112,9 +131,11 @@ def run(arguments: Arguments) -> Tracked:
             scene=scene,
             masker=masker,
             points=points,
+            prompts=prompts,
             keep_measured=arguments.keep_measured,
             images=arguments.images,
             out=arguments.out,
+            resume=arguments.resume,
             progress=progress,
             watch=watch,
         )
@@ -151,6 +172,14 @@ def _live_view(arguments: Arguments) -> Iterator[Callable[[TrackedMoment], None]
         yield view.show
     finally:
         view.stop()
+
+
+def _prompts(arguments: Arguments) -> Mapping[str, Any] | Path | None:
+    """Return the clicks and boxes, or the file of them."""
+    written = written_prompts(arguments.click, arguments.box)
+    if written and arguments.prompts is not None:
+        raise ConcentError("--prompts cannot be given with --click or --box", fix="write all of them into the file")
+    return written or arguments.prompts
 
 
 def _figures(track: BodyTrack) -> dict[str, object]:

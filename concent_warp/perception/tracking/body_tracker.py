@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from concent_warp.perception.tracking.alignment.align import FREE, Agreement, Fit, agreement, refine
+from concent_warp.perception.tracking.alignment.clusters import Region
 from concent_warp.perception.tracking.alignment.registration import relocated
 from concent_warp.perception.tracking.alignment.rows import bias_stds, rendered_crop
 from concent_warp.perception.tracking.alignment.search import find_pose
@@ -51,6 +52,8 @@ class BodyTracker:
         """Why no pose was accepted in each moment, in words; empty where one was."""
         self.objections: list[str] = []
         """What spoke against each pose that was tried in this moment."""
+        self.regions: tuple[Region | None, ...] = ()
+        """Where a user says that it is, in each view of the moment; None in views that are not searched."""
         self.textures = TextureMap(cfg.texture)
         """Keyframes."""
 
@@ -187,10 +190,15 @@ class BodyTracker:
         rng: np.random.Generator,
     ) -> Fit | None:
         """Return the fit of a search in all views, in the representative that follows on from what was known."""
+        regions = self.regions or (None,) * len(views)
+        if self.regions and not any(regions):
+            return None
         self.searched = time
         best = None
-        for view in views:
-            found = find_pose(renderer, view, self.shape, self.symmetry, self.cfg, rng)
+        for view, region in zip(views, regions, strict=True):
+            if self.regions and region is None:
+                continue
+            found = find_pose(renderer, view, self.shape, self.symmetry, self.cfg, rng, region)
             if found.reason:
                 self.objections.append(found.reason)
             if found.fit is not None and (best is None or found.score > best.score):

@@ -116,15 +116,16 @@ class SearchCfg:
     reach: Positive = 0.06
     """Distance around the predicted pose in which points are looked for before the object counts as lost [m]."""
 
-    stride: Count = 4
-    """Distance of the pixels that the search looks at, per 640 pixels of the image's width [px]."""
+    across: Count = 40
+    """Pixels across the whole object, at the scene's median depth, that the search looks at; where the image has more,
+    a regular grid of them."""
     foreground: Positive = 0.006
     """Distance in front of robot and static scene from which on a pixel belongs to an object [m]."""
     depth_jump: Positive = 0.02
     """Difference of depth between neighbouring pixels that separates two objects [m]."""
     foreground_noise: Positive = 4.0
     """Both of them over the noise of depth there, where that is more, as for a camera far away [-]."""
-    min_cluster: Count = 12
+    min_cluster: Count = 24
     """Least number of such pixels of an object."""
     orientations: Count = 160
     """Orientations that are tried."""
@@ -132,10 +133,24 @@ class SearchCfg:
     """Measured points of a cluster that are compared with the shape."""
     rounds: Count = 15
     """Iterations of each start."""
+    looked_at: Count = 48
+    """Aligned starts of a cluster, the best ones that differ, that are compared with the depth image."""
     kept: Count = 12
     """Starts, the best ones that differ, that are refined against the image."""
+    finalists: Count = 5
+    """Refined poses, the best ones that differ, that are refined until they no longer move, and compared."""
+    rivals: Count = 8
+    """Large turns of the best pose, and as many small ones, those that explain most of the depth, that are refined and
+    compared with it."""
     min_margin: Positive = 0.06
     """Least advantage in score of the best pose over the next that no symmetry of the shape explains [-]."""
+    min_votes: Count = 30
+    """Least number of pixels at which two poses predict different depths that decide between them, whatever the
+    scores."""
+    min_majority: PositiveShare = 0.7
+    """Least excess of those pixels that are nearer to the one pose over those nearer to the other [-]."""
+    min_divided_margin: Positive = 0.2
+    """Least advantage in score, whatever known bodies cover, where such pixels are divided between two poses [-]."""
     same_translation: Positive = 0.006
     """Distance below which two poses are the same [m]."""
     same_rotation: Angle = 8.0

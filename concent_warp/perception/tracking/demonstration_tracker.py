@@ -10,11 +10,13 @@ from concent_warp.errors import RecordingError
 from concent_warp.perception.tracking.body_tracker import BodyTracker
 from concent_warp.perception.tracking.bundle import bundled
 from concent_warp.perception.tracking.cfg import TrackCfg
+from concent_warp.perception.tracking.checkpoint import TrackCheckpoint
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import Symmetry, symmetry_of
 from concent_warp.perception.tracking.masks import BodyMasks
 from concent_warp.perception.tracking.moment import BodyState, TrackedMoment
+from concent_warp.perception.tracking.prompts import Prompt
 from concent_warp.perception.tracking.result import BRIDGED, FILLED, LOST, TRACKED, BodyTrack, TrackQuality
 from concent_warp.perception.tracking.smooth import smooth
 from concent_warp.perception.tracking.video import Video
@@ -37,6 +39,8 @@ def track_bodies(
     *,
     make: Callable[[TrackedShape, Symmetry, TrackCfg], BodyTracker] = BodyTracker,
     masks: BodyMasks | None = None,
+    prompts: Mapping[str, Prompt] | None = None,
+    checkpoint: TrackCheckpoint | None = None,
 ) -> list[BodyTrack]:
     """Return the tracks of bodies in one demonstration.
 
@@ -52,6 +56,8 @@ def track_bodies(
         watch: Called after each moment.
         make: Creates the tracker of a body.
         masks: Pixels of the bodies, where they are known.
+        prompts: Where a user says that bodies without first pose are, by body.
+        checkpoint: State that the tracking continues from, and is written to now and then.
 
     Raises:
         RecordingError: A given first pose does not agree with the video.
@@ -60,16 +66,21 @@ def track_bodies(
     trackers = [make(s, symmetry_of(s, cfg.symmetry_tolerance), cfg) for s in shapes]
     masks = masks or BodyMasks()
     rng = np.random.default_rng(cfg.seed)
-    count = len(video.time)
-    for moment, time in enumerate(video.time):
+    count, prompts = len(video.time), prompts or {}
+    done = 0 if checkpoint is None else checkpoint.begin(name, trackers, rng)
+    # Bodies that a user pointed at are found first, so that they are known to the search for others like them.
+    ordered = sorted(trackers, key=lambda t: t.shape.name not in prompts)
+    for moment in range(done, count):
+        time = video.time[moment]
         renderer.set_state(video.qpos[moment])
         for tracker in trackers:
             here = first.get(tracker.shape.name) if moment == 0 else tracker.pose if tracker.tracked else None
             renderer.place(tracker.shape.row, here)
         all_views = video.views(moment, renderer)
-        for tracker in trackers:
+        for tracker in ordered:
             views = masks.on(all_views, video.frames[moment], tracker.shape.name)
-            given = first.get(tracker.shape.name)
+            given, prompt = first.get(tracker.shape.name), prompts.get(tracker.shape.name)
+            tracker.regions = () if prompt is None or tracker.pose is not None else prompt.regions(video.frames[moment])
             if moment == 0 and given is not None:
                 _begin(tracker, renderer, float(time), views, given, where)
                 if tracker.tracked:
@@ -80,6 +91,8 @@ def track_bodies(
         if watch is not None:
             states = [BodyState(t.shape, t.pose if t.tracked else None, t.reasons[moment]) for t in trackers]
             watch(TrackedMoment(name, moment, count, float(time), video.shown(moment, all_views), states, renderer))
+        if checkpoint is not None:
+            checkpoint.advance(name, moment + 1, trackers, rng)
         if progress is not None:
             progress(0.9 * (moment + 1) / count)
     for tracker in trackers:

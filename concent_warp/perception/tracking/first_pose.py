@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -49,6 +49,11 @@ def _pose(entry: Any, where: str) -> np.ndarray:
             "the quaternion is not of unit length", where=where, expected="norm 1", found=f"{norm:.3g}"
         )
     return pose_of(values["position"], values["quaternion"])
+
+
+def is_pose_file(given: object) -> TypeGuard[str | Path]:
+    """Return whether first poses are given as a file."""
+    return isinstance(given, str | Path) and given not in ("none", "initial")
 
 
 def first_poses(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -11,12 +11,14 @@ import numpy as np
 from concent_warp.perception.backends.protocols import Masker, PointTracker
 from concent_warp.perception.tracking.body_tracker import BodyTracker
 from concent_warp.perception.tracking.cfg import TrackCfg
+from concent_warp.perception.tracking.checkpoint import TrackCheckpoint
 from concent_warp.perception.tracking.demonstration_tracker import track_bodies
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
 from concent_warp.perception.tracking.geometry.symmetry import Symmetry
 from concent_warp.perception.tracking.masks import body_masks, camera_frames
 from concent_warp.perception.tracking.moment import TrackedMoment
 from concent_warp.perception.tracking.points.point_body_tracker import PointBodyTracker
+from concent_warp.perception.tracking.prompts import Prompt
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.video import Video
 from concent_warp.scene.scene import Scene
@@ -46,6 +48,10 @@ class TrackingInput:
     """File and demonstration, for messages."""
     watch: Callable[[TrackedMoment], None] | None = None
     """Called after each moment, with its frames and what was found in them."""
+    prompts: Mapping[str, Prompt] = field(default_factory=dict)
+    """Where a user says that bodies without first pose are, by body."""
+    checkpoint: TrackCheckpoint | None = None
+    """State that the tracking continues from and is written to now and then; a tracker may ignore it."""
 
 
 @runtime_checkable
@@ -95,7 +101,7 @@ class ModelToFrameTracker:
             masks = body_masks(self.masker, given.scene, given.video, given.shapes, given.first, self.cfg)
         return track_bodies(
             given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
-            given.watch, masks=masks,
+            given.watch, masks=masks, prompts=given.prompts, checkpoint=given.checkpoint,
         )  # fmt: skip
 
 
@@ -132,5 +138,5 @@ class PointPoseTracker:
 
         return track_bodies(
             given.scene, given.video, given.shapes, given.first, self.cfg, given.name, given.where, progress,
-            given.watch, make=make, masks=masks,
+            given.watch, make=make, masks=masks, prompts=given.prompts, checkpoint=given.checkpoint,
         )  # fmt: skip
