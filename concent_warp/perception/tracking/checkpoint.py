@@ -226,8 +226,9 @@ def _tracks(parts: list[dict[str, Any]], arrays: Mapping[str, np.ndarray]) -> li
         quality = part["quality"]
         if quality is not None:
             quality = _unpacked(quality, arrays)
-            texts = {name: tuple(quality[name]) for name in ("state", "reason")}
-            quality = TrackQuality(**(quality | texts))
+            for name in ("state", "reason"):
+                quality[name] = tuple(quality[name])
+            quality = TrackQuality(**quality)
         rest = _unpacked({name: value for name, value in part.items() if name not in ("quality", "cameras")}, arrays)
         found.append(BodyTrack(**rest, quality=quality, cameras=tuple(part["cameras"])))
     return found
@@ -283,9 +284,11 @@ def _unpacked_fits(prefix: str, arrays: Mapping[str, np.ndarray]) -> list[Fit | 
         if not is_known:
             found.append(None)
             continue
-        scalars = map(float, arrays[f"{prefix}/scalars"][k])
+        scalars = dict(zip(SCALARS, map(float, arrays[f"{prefix}/scalars"][k]), strict=True))
         row = arrays[f"{prefix}/agreement"][k]
         agreed = None if np.isnan(row[0]) else Agreement(int(row[0]), *map(float, row[1:]))
-        found.append(Fit(arrays[f"{prefix}/pose"][k], normal("geometry", k), texture.get(k, []), *scalars, agreed))
+        found.append(
+            Fit(arrays[f"{prefix}/pose"][k], normal("geometry", k), texture.get(k, []), **scalars, agreement=agreed)
+        )
         k += 1
     return found
