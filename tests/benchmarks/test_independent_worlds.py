@@ -196,6 +196,7 @@ def test_truth_explains_the_data_but_not_exactly(script, worlds, name, most):
     assert max(truth.values()) < min(most, 0.85 * max(nominal.values()))
 
 
+@pytest.mark.slow
 def test_the_model_as_given_is_off_by_more_than_noise_where_nothing_is_hidden(script, worlds):
     data_sets = script("benchmarks.independent.data_sets")
     ratios = [

@@ -18,7 +18,6 @@ from concent_warp.checks import check_device
 from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.errors import ConcentError
-from concent_warp.files import all_or_none
 from concent_warp.model import Model
 from concent_warp.perception.backends.named import (
     MaskerName,
@@ -51,13 +50,11 @@ class Arguments:
     model: Path | None = None
     """Model (.toml) or MJCF (.xml) whose scene is used; the recording's own by default."""
     pose: str = "initial"
-    """First poses: initial (the recording's initial state; a search where it has none), none (a search), or a TOML or
-    JSON file with position and quaternion of each body."""
+    """First poses: initial (of the recording, else a search), none (a search), or a TOML or JSON file of them."""
     click: tuple[str, ...] = ()
-    """Pixels on bodies in the first frame, at which they are searched: BODY=COLUMN,ROW, with @CAMERA where there are
-    several."""
+    """Pixels on bodies in the first frame: BODY=COLUMN,ROW, with @CAMERA where there are several."""
     box: tuple[str, ...] = ()
-    """Boxes around bodies in the first frame, BODY=LEFT,TOP,RIGHT,BOTTOM, with @CAMERA where there are several."""
+    """Boxes around bodies instead: BODY=LEFT,TOP,RIGHT,BOTTOM."""
     prompts: Path | None = None
     """TOML or JSON file of clicks and boxes, by body, or by demonstration and body."""
     body: tuple[str, ...] = ()
@@ -67,13 +64,12 @@ class Arguments:
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
     masker: MaskerName = "none"
-    """Masks of the bodies, outside of which nothing is looked at: depth (what stands out from robot and static scene)
-    or sam2 (SAM 2 with --masker-weights)."""
+    """Masks of the bodies: depth (what stands out from robot and static scene) or sam2 (with --masker-weights)."""
     masker_weights: Path | None = None
     """Folder with a checkpoint of SAM 2 in the format of transformers."""
     points: PointTrackerName = "none"
-    """Points that are tracked in the images and give the poses between keyframes: flow (optical flow), features (XFeat)
-    or tapir (TAPIR or BootsTAPIR with --points-checkout and --points-weights)."""
+    """Points that give the poses between keyframes: flow (optical flow), features (XFeat) or tapir (with
+    --points-checkout and --points-weights)."""
     points_checkout: Path | None = None
     """Folder with a checkout of github.com/google-deepmind/tapnet, whose code is run."""
     points_weights: Path | None = None
@@ -86,7 +82,7 @@ class Arguments:
     images: bool = False
     """Keep the video in the written recording."""
     report: Path | None = None
-    """Write a page (.html) with the video, the outlines of the tracked bodies in it and plots in step to this file."""
+    """Page (.html) to write: the video with outlines of the tracked bodies, and plots."""
     live: bool = False
     """While it is tracked, show the newest frame and the states so far in the browser."""
     json: bool = False
@@ -117,7 +113,6 @@ def run(arguments: Arguments) -> Tracked:
     accept = AcceptCfg(max_unexplained=1.0) if arguments.unknown_surroundings else AcceptCfg()
     make_folder(arguments.out.parent)
     with (
-        all_or_none(),
         _live_view(arguments) as watch,
         progress_bar("tracking") as progress,
         say_how_to_resume(state_path(arguments.out)),

