@@ -246,7 +246,7 @@ def page(rows: dict[str, Any]) -> str:
     parts = [
         "# Tracking of objects in RGB-D video\n",
         INTRODUCTION.format(count=len(seeds), first=seeds[0], last=seeds[-1]),
-        machine_line(measured[-1]["machine"]) + "\n",
+        machine_line(measured[-1]["machine"]) + _ended(len(seeds)) + "\n",
         _accuracy(measured),
         _first(measured),
         _shapes([row for row in rows.values() if "shape" in row]),
@@ -306,6 +306,13 @@ def _first(rows: list[dict[str, Any]]) -> str:
     return f"**First pose without prior** (bar: 95 % found, the rest refused):\n\n{table(head, searched)}\n" + (
         f"**Wrong first pose:**\n\n{table(second, wrong)}"
     )
+
+
+def _ended(count: int) -> str:
+    """Return what to say where videos of fewer seeds were measured than there are."""
+    if count >= len(SEEDS):
+        return ""
+    return f"\nThe run ended with its time in seed {count} of {len(SEEDS)}; nothing was left out for its result."
 
 
 def _shapes(rows: list[dict[str, Any]]) -> str:
