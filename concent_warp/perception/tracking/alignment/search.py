@@ -143,7 +143,7 @@ class _Search:
                 known += rivals
                 finals += self._settled(self._distinct(self._refined(rivals)))
             finals = self._distinct(sorted(finals, key=lambda c: -c.score))
-            if self._same(finals[0], best):
+            if not finals or self._same(finals[0], best):
                 break
         accepted = self._accepted(finals)
         if not accepted:
