@@ -1,6 +1,6 @@
 """A data set in BOP's format, rendered by Reality's camera: objects at rest on a table, seen by a moving camera.
 
-A stand-in where no data set of the benchmark is at hand. Three objects, none of them in the training of anything: a
+For use where no data set of the benchmark is at hand. Three objects, none of them in the training of anything: a
 carton, a can, which is round about its axis, and a stepped block. The table is not in the data set, as in BOP's.
 """
 

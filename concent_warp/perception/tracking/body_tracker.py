@@ -240,7 +240,10 @@ class BodyTracker:
         pose = self.symmetry.nearest(fit.pose, predicted)
         if rotation_angle(pose, fit.pose) < np.radians(self.cfg.search.same_rotation):
             return fit
-        return self.accepted(renderer, views, pose, self.chosen(views, pose), rough=False)
+        nearest = self.accepted(renderer, views, pose, self.chosen(views, pose), rough=False)
+        # Of a round shape hardly any texture may tell turns about its axis, and none of them is an exchange.
+        is_round = self.symmetry.axis is not None or self.symmetry.sphere
+        return fit if nearest is None and is_round else nearest
 
     def numbered_fits(self) -> tuple[list[Fit | None], int]:
         """Return the fits of all moments and the number of keyframes that their texture refers to."""
