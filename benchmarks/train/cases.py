@@ -23,6 +23,7 @@ from concent_warp.effects.registry import effect_class
 from concent_warp.fit.effects.fit import fit_effects
 from concent_warp.fit.fit_geometry import FitCfg, fit_geometry
 from concent_warp.model import Model
+from concent_warp.reality.expert.plan import Task
 from concent_warp.reality.hidden.in_task import TaskWorld, parse_effects
 from concent_warp.reality.record import RealityCfg, record
 from concent_warp.reality.variation import VariationCfg
@@ -30,14 +31,18 @@ from concent_warp.reality.world import WorldCfg
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
+from concent_warp.scene.round_peg import RoundPegCfg
 from concent_warp.scene.scene import Scene
+from concent_warp.scene.shape_sorter import ShapeSorterCfg
 from concent_warp.scene.spheres.build import ContactGeometryCfg
+from concent_warp.scene.stacking import StackingCfg
 
 HIDDEN = "actuator_delay=0.1"
 """What is hidden in Reality of some cases: commands that act a tenth of a second late. Demonstrations still
 succeed under it, policies that do not know of it fail more often."""
 WORLD_OF_TRIALS = WorldCfg(timestep=5e-4, integrator="Euler")
 """Reality as policies are tried in it: shorter steps and another integrator than the model's."""
+TASKS: dict[str, Task] = {"shape_sorter": ShapeSorterCfg(), "round_peg": RoundPegCfg(), "stacking": StackingCfg()}
 MODEL, DEMONSTRATION, WORLD = "model.toml", "demonstration.h5", "hidden.txt"
 
 
@@ -79,6 +84,8 @@ class Args:
     cases: tuple[str, ...] = tuple(CASES)
     seeds: tuple[int, ...] = (0, 1, 2)
     processes: int = 1
+    task: Literal["shape_sorter", "round_peg", "stacking"] = "shape_sorter"
+    """What is demonstrated."""
     hidden: str = HIDDEN
     """Effect that is hidden, with its magnitude."""
     spheres: int = 512
@@ -87,14 +94,15 @@ class Args:
     fit: FitCfg = field(default_factory=FitCfg)
 
 
-def demonstrate(seed: int, hidden: tuple[str, ...]) -> Recording:
+def demonstrate(seed: int, hidden: tuple[str, ...], task: Task) -> Recording:
     """Return a demonstration of Reality, with these effects hidden in it."""
     cfg = RealityCfg(world=WORLD_OF_TRIALS)
     effects = ()
     if hidden:
-        world = TaskWorld(cfg.task.build(), cfg.world, "block", cfg.task.robot.gripper_actuators, parse_effects(hidden))
+        fingers = task.robot.gripper_actuators
+        world = TaskWorld(task.build(), cfg.world, task.objects[0], fingers, parse_effects(hidden))
         effects = tuple(one.effect for one in world.hidden())
-    return record(cfg, [1000 * seed], effects=effects, variation=VariationCfg())[0]
+    return record(cfg, [1000 * seed], task=task, effects=effects, variation=VariationCfg())[0]
 
 
 def make(case: Case, seed: int, args: Args) -> None:
@@ -104,7 +112,7 @@ def make(case: Case, seed: int, args: Args) -> None:
     if folder.exists():
         return
     quiet_warp()
-    recording = demonstrate(seed, (hidden,) if hidden else ())
+    recording = demonstrate(seed, (hidden,) if hidden else (), TASKS[args.task])
     scene = Scene(recording.scene)
     placement = "surface" if case.geometry == "surface" else "inset"
     spheres = ContactGeometryCfg(count=args.spheres, edges=args.edges, placement=placement, seed=seed)

@@ -15,6 +15,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,15 +25,22 @@ from scipy.stats import rankdata
 
 from benchmarks.measurements import Measurements, Row
 from benchmarks.pages import machine_line, read_data, table, write_data, write_page
-from benchmarks.train.learning import POLICY, changed
+from benchmarks.train.learning import RESULT, changed
 from benchmarks.train.table1 import Args as Table1Args
-from benchmarks.train.table1 import trial
+from benchmarks.train.table1 import policy_folder, trial
 from concent_warp.deploy.cfg import RealityWorldCfg
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.trials.evaluate import wilson
 
 NAME = "train_trials"
-CASE, STAGE = "ours", "insert"
+CASE = "ours"
+TITLES = {
+    ("shape_sorter", "insert"): "Insertion",
+    ("shape_sorter", "all"): "The whole task",
+    ("round_peg", "insert"): "A round peg",
+    ("stacking", "insert"): "Stacking",
+}
+"""Titles of the sections by task and stage; *insert* is a task's last stage."""
 ABOUT = """\
 `python -m benchmarks.train.trials FOLDERS`: insertion by policies trained in simulation, in a Reality that neither
 the model nor the policy knows. In each episode the objects' friction is 0.2 to 0.5 (0.3 in the model), that of the
@@ -68,31 +76,44 @@ class Args:
     """Episodes of a trial."""
     stress_episodes: int = 100
     """Episodes of a stress test."""
+    stage: Literal["insert", "all"] = "insert"
+    """The last stage alone, or all stages chained."""
     processes: int = 1
 
 
-def measure(folder: Path, seed: int, episodes: int, stress_episodes: int) -> Row:
+def measure(folder: Path, seed: int, args: Args) -> Row:
     """Try a policy, and repeat its stress test."""
     torch.set_num_threads(1)
-    row = trial(Table1Args(out=folder, episodes=episodes), CASE, seed, RealityWorldCfg())
-    policy = Policy.load(training(folder, seed) / POLICY)
-    test = policy.run.stress_test(device="cpu", episodes=stress_episodes, seed=seed)
+    given = Table1Args(out=folder, episodes=args.episodes, stage=args.stage)
+    row = trial(given, CASE, seed, RealityWorldCfg())
+    policy = Policy.load(policy_folder(given, CASE, seed))
+    test = policy.run.stress_test(device="cpu", episodes=args.stress_episodes, seed=seed)
     found = test(policy.act_in(test.environment))
     geometry = policy.run.model.geometry
     assert geometry is not None
-    row["stress"] = {"successes": int(found.success.sum()), "episodes": stress_episodes}
+    row["stress"] = {"successes": int(found.success.sum()), "episodes": args.stress_episodes}
+    row["task"], row["stage"] = policy.run.model.scene.spec.modelname, args.stage
     row["spheres"] = len(geometry)
     row["settings"] = changed({**json.loads(json.dumps(asdict(policy.run.cfg))), "stress": {}})
     return row
 
 
-def training(folder: Path, seed: int) -> Path:
-    """Return the folder of a training."""
-    return folder / "runs" / f"{CASE}_{STAGE}_{seed}"
-
-
 def page(rows: Sequence[Row]) -> str:
     """Return the page."""
+    parts = ["# Trials of policies", "Written by `benchmarks/train/trials.py`; do not edit.", ABOUT]
+    for (task, stage), title in TITLES.items():
+        of = [row for row in rows if (row.get("task", "shape_sorter"), row.get("stage", "insert")) == (task, stage)]
+        if of:
+            parts += [f"## {title}", settings_table(of)]
+            if (task, stage) == ("shape_sorter", "insert"):
+                parts += ["### Does the stress test predict success?", prediction(of)]
+    for what, name in (("Trials", "machine"), ("Policies", "trained_on")):
+        parts += [f"{what}: {line}" for line in dict.fromkeys(machine_line(row[name]) for row in rows)]
+    return "\n\n".join(parts)
+
+
+def settings_table(rows: Sequence[Row]) -> str:
+    """Return a table of the success of policies, by settings, spheres and length of the training."""
     groups: dict[tuple[str, int, int], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["settings"], row["spheres"], round(row["trained"]["steps"], -5)), []).append(row)
@@ -115,11 +136,7 @@ def page(rows: Sequence[Row]) -> str:
             f"{simulated:.1%}", f"{stressed:.1%}",
         ])  # fmt: skip
     head = ["settings", "spheres", "steps", "succeed", "95 %", "seeds", "in simulation", "stress test"]
-    parts = ["# Trials of policies", "Written by `benchmarks/train/trials.py`; do not edit.", ABOUT, table(head, lines)]
-    parts += ["## Does the stress test predict success?", prediction(rows)]
-    for what, name in (("Trials", "machine"), ("Policies", "trained_on")):
-        parts += [f"{what}: {line}" for line in dict.fromkeys(machine_line(row[name]) for row in rows)]
-    return "\n\n".join(parts)
+    return table(head, lines)
 
 
 def prediction(rows: Sequence[Row]) -> str:
@@ -146,13 +163,14 @@ def main() -> None:
     data = read_data(NAME)
     for folder in args.folders:
         kept = Measurements(folder / f"{NAME}.jsonl")
-        seeds = sorted(int(path.name.rsplit("_", 1)[1]) for path in (folder / "runs").glob(f"{CASE}_{STAGE}_*"))
-        left = [seed for seed in seeds if kept.wanted(f"{folder.name} {seed}")]
-        jobs = (delayed(measure)(folder, seed, args.episodes, args.stress_episodes) for seed in left)
+        ended = (folder / "runs").glob(f"{CASE}_{args.stage}_*/{RESULT}")
+        names = {int(path.parent.name.rsplit("_", 1)[1]): f"{folder.name} {path.parent.name}" for path in ended}
+        left = [seed for seed in sorted(names) if kept.wanted(names[seed])]
+        jobs = (delayed(measure)(folder, seed, args) for seed in left)
         found = Parallel(n_jobs=args.processes, return_as="generator")(jobs)
         for seed, row in zip(left, found, strict=True):
             assert row is not None
-            kept.add(f"{folder.name} {seed}", row)
+            kept.add(names[seed], row)
         data |= kept.rows
     write_data(NAME, data)
     write_page(NAME, page(list(data.values())))

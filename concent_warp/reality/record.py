@@ -139,8 +139,8 @@ def _perform(
         # A generator of its own, so that all else is the same with and without variation.
         pads = pad_geoms(model, task.robot.gripper_actuators)
         fields = variation.sample(model, scene.objects(), pads, 1, rng.spawn(1)[0])
-        for name, values in fields.items():
-            getattr(model, name)[:] = values[0]
+        for field_name, values in fields.items():
+            getattr(model, field_name)[:] = values[0]
         mujoco.mj_setConst(model, data)
     data.qpos[:] = home(model)
     joint = model.jnt_qposadr[model.body(task.objects[0]).jntadr[0]]

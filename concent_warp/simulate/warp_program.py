@@ -21,6 +21,7 @@ from concent_warp.errors import EngineError
 from concent_warp.kernels import rollout as kernels
 from concent_warp.simulate.engine import Contacts
 from concent_warp.simulate.warp_model import WorldModel
+from concent_warp.simulate.warp_modules import load_modules
 
 if TYPE_CHECKING:
     from concent_warp.effects.force_model import ForceModel
@@ -135,8 +136,8 @@ class Program:
                 edited = sorted({name for force_model, _ in plan.force_models for name in force_model.edits})
                 self._unedited = [(getattr(self.model, name), wp.clone(getattr(self.model, name))) for name in edited]
                 self._integrate = INTEGRATORS[mujoco.mjtIntegrator(compiled.opt.integrator)]
-                for part in (self._begin, self._step, self._begin, self._end):
-                    part()
+                load_modules(self._all_parts)
+                self._all_parts()
             except EngineError:
                 raise
             except (NotImplementedError, ValueError) as error:
@@ -274,6 +275,11 @@ class Program:
         self._unstable.fill_(self.plan.steps + 1)
         if self.plan.contacts == "touched":
             self._touched.zero_()
+
+    def _all_parts(self) -> None:
+        """Launch all that is captured."""
+        for part in (self._begin, self._step, self._begin, self._end):
+            part()
 
     def _step(self) -> None:
         """Hold the commands, evaluate, record, integrate."""

@@ -6,10 +6,10 @@ def train_gpus(script):
     return script("benchmarks.train.gpus")
 
 
-def row(gpus, worlds, rate, curve):
+def row(gpus, worlds, rate, curve, settings="default"):
     facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
     measured = {"gpus": gpus, "worlds": worlds, "seed": 0, "steps_per_second": rate, "curve": curve}
-    return {**measured, "machine": facts, "options": ""}
+    return {**measured, "machine": facts, "options": "", "settings": settings, "memory": 2048 * gpus}
 
 
 def test_page_sets_each_number_of_gpus_against_one(train_gpus):
@@ -18,10 +18,21 @@ def test_page_sets_each_number_of_gpus_against_one(train_gpus):
     assert train_gpus.first(one, 0.9) == (4_000_000, 4.0)
     assert train_gpus.first(two, 0.9) is None
     text = train_gpus.page([two, one])
-    assert "| 1 x 8 | 1,000 | 1.00 | 1 | 2.00 M, 2 s | 2.00 M, 2 s | 4.00 M, 4 s | 90.0% |" in text
-    assert "| 2 x 8 | 1,900 | 1.90 | 1 | 2.00 M, 1 s | 2.00 M, 1 s | - | 60.0% |" in text
-    assert "2.00 M, 2 s (1 of 2)" in train_gpus.page([one, row(1, 8, 900.0, [(2_000_000, 2.0, 0.1)])])
-    assert "default settings" in text
-    text = train_gpus.page([{**one, "options": "--environment.stride 2"}])
-    assert "`--environment.stride 2`" in text
-    assert "default settings" not in text
+    assert "| default | 1 x 8 | 1,000 | 1.00 | 100% | 1 | 2.0 M, 2 s | 4.0 M, 4 s | - | 90.0% | 2.0 GiB |" in text
+    assert "| default | 2 x 8 | 1,900 | 1.90 | 95% | 1 | 2.0 M, 1 s | - | - | 60.0% | 4.0 GiB |" in text
+    assert text.index("1 x 8") < text.index("2 x 8")
+    assert "2.0 M, 2 s (1 of 2)" in train_gpus.page([one, row(1, 8, 900.0, [(2_000_000, 2.0, 0.1)])])
+
+
+def test_settings_are_compared_with_themselves(train_gpus):
+    curve = [(2_000_000, 2.0, 0.5)]
+    slow, fast = row(1, 8, 1000.0, curve), row(1, 8, 3000.0, curve, "fast")
+    text = train_gpus.page([slow, fast, row(2, 8, 4500.0, curve, "fast")])
+    assert "| fast | 2 x 8 | 4,500 | 1.50 | 75% |" in text
+
+
+def test_gpus_that_are_not_there_take_no_memory(train_gpus, monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    with train_gpus.watched_memory(1) as found:
+        pass
+    assert found == []

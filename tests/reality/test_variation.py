@@ -131,6 +131,7 @@ def test_recording_varies_and_all_else_stays():
     plain, same, varied, again = (
         record(quick, [0], variation=variation)[0][0] for variation in (None, off, VariationCfg(), VariationCfg())
     )
+    assert varied.name == plain.name
     for kind in ("action", "measured"):
         np.testing.assert_array_equal(channels(same, kind), channels(plain, kind))
         np.testing.assert_array_equal(channels(again, kind), channels(varied, kind))

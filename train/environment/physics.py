@@ -267,6 +267,7 @@ class WarpPhysics:
 
         from concent_warp.simulate.warp_engine import largest_by_magnitude
         from concent_warp.simulate.warp_model import WorldModel, check_drag
+        from concent_warp.simulate.warp_modules import load_modules
 
         self.model, self.worlds = model, worlds
         self.buffers: tuple[int, int] | None = (nconmax, njmax)
@@ -306,7 +307,8 @@ class WarpPhysics:
             self.dropping = int(bits.NEFC | bits.NJMAX_NNZ | bits.BROADPHASE | bits.NARROWPHASE | bits.CCD)
             made.place(d)
             start = wp.clone(d.qpos)
-            self._steps()  # loads the modules, which is impossible while a graph is captured
+            load_modules(self._steps)  # which is impossible while a graph is captured
+            self._steps()
             self._advance = Graph(self._steps, self._warp_device, capture)
             self._update_poses = Graph(lambda: mjw.kinematics(self._model, self._data), self._warp_device, capture)
             wp.copy(d.qpos, start)
