@@ -74,7 +74,7 @@ def test_a_tracking_killed_in_its_first_demonstration_is_continued_with_the_same
 
 def test_of_a_later_demonstration_only_the_rest_is_done_and_a_foreign_state_is_refused(made, tmp_path):
     folder, whole = made
-    out, shares = tmp_path / "tracked.h5", []
+    out, shares = tmp_path / "new" / "tracked.h5", []
     killed(folder, out, 0.7)
     recording = cw.load_recording(folder / "video.h5")
     with pytest.raises(cw.RecordingError, match="another recording, or had other settings"):

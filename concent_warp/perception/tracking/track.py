@@ -31,7 +31,7 @@ from concent_warp.perception.tracking.video import Video
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.recording import Recording
 from concent_warp.recording.validation.validate import validate
-from concent_warp.run_folder import versions
+from concent_warp.run_folder import make_folder, versions
 from concent_warp.scene.scene import Scene
 
 
@@ -109,6 +109,7 @@ def track(
     check_names(entries, [d.name for d in recording.demonstrations], names)
     kept = None
     if out is not None:
+        make_folder(Path(out).parent)
         given = read_first_poses(Path(pose)) if is_pose_file(pose) else pose
         key = tracking_key(
             recording,

@@ -1,0 +1,33 @@
+import pytest
+
+
+@pytest.fixture
+def trials(script):
+    return script("benchmarks.train.trials")
+
+
+def row(seed, successes, **given):
+    facts = dict.fromkeys(("processor", "cores", "python", "mujoco", "mujoco-warp", "warp-lang", "torch", "date"), "x")
+    return {
+        "seed": seed, "episodes": 100, "successes": successes, "settings": "", "spheres": 512, "machine": facts,
+        "trained_on": facts, "trained": {"steps": 9_830_400}, "simulation": {"rate": 1.0},
+        "stress": {"successes": successes // 2, "episodes": 50}, **given,
+    }  # fmt: skip
+
+
+def test_tasks_and_stages_have_tables_of_their_own(trials):
+    rows = [row(1, 90), row(2, 80), row(3, 40, task="round_peg", stage="insert"), row(1, 20, stage="all")]
+    text = trials.page(rows)
+    insertion, chain, peg = (text.index(f"\n## {title}") for title in ("Insertion", "The whole task", "A round peg"))
+    assert insertion < chain < peg
+    assert "| default | 512 | 9.8 M | 85.0% | 79.4% to 89.3% | 1: 90.0%, 2: 80.0% |" in text[insertion:chain]
+    assert "1: 20.0%" in text[chain:peg]
+    assert "3: 40.0%" in text[peg:]
+    assert "Stacking" not in text
+
+
+def test_prediction_is_of_insertion_alone(trials):
+    rows = [row(seed, 50 + 10 * seed) for seed in range(4)]
+    away = row(9, 0, task="stacking", stage="insert") | {"stress": {"successes": 50, "episodes": 50}}
+    assert "over 4 policies" in trials.page([*rows, away])
+    assert "correlation over 4 policies, settings and seeds mixed: 1.00" in trials.page([*rows, away])
