@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnose.hidden_effects_data import BEST, ELSEWHERE, DataSet, single
 from benchmarks.independent.scoring import exactly_right, groups, in_first_group
@@ -29,7 +30,6 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.errors import ConcentError, RecordingError
 from concent_warp.model import Model
-from concent_warp.perception.tracking.geometry.pose import twist_between
 from concent_warp.perception.tracking.track import track
 from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig
 from concent_warp.reality.hidden.registry import hidden
@@ -163,8 +163,8 @@ def tracked(
 ) -> tuple[Recording, dict[str, Any]]:
     """Return the recording with tracked poses, and their errors.
 
-    The errors are the mean and the largest of position [mm], the mean change of the orientation's error about its
-    median [deg], as a shape with symmetries is known up to these, and the frames in which the object is lost.
+    The errors are the mean and the largest of position [mm], the mean deviation of the orientation's error from its
+    mean [deg], as a shape with symmetries is known up to these, and the frames in which the object is lost.
     """
     sensing = SensingCfg(**IMPERFECT, image_samples=1)
     rate = RATES.get(case.rig, 60.0)
@@ -179,10 +179,10 @@ def tracked(
         seen = np.flatnonzero(~body.lost)
         lost += int(body.lost.sum())
         if len(seen):
-            twist = np.array([twist_between(truth[t], body.pose[t]) for t in seen])
-            position += (1e3 * np.linalg.norm(twist[:, :3], axis=1)).tolist()
-            change = twist[:, 3:] - np.median(twist[:, 3:], axis=0)
-            rotation += np.degrees(np.linalg.norm(change, axis=1)).tolist()
+            true, pose = truth[seen], body.pose[seen]
+            position += (1e3 * np.linalg.norm(pose[:, :3, 3] - true[:, :3, 3], axis=1)).tolist()
+            error = Rotation.from_matrix(np.swapaxes(true[:, :3, :3], 1, 2) @ pose[:, :3, :3])
+            rotation += np.degrees((error.mean().inv() * error).magnitude()).tolist()
     return read_hdf5(path), {
         "position": float(np.mean(position)), "largest_position": float(np.max(position)),
         "rotation": float(np.mean(rotation)), "lost": lost, "frames": sum(map(len, truths)),
