@@ -98,8 +98,8 @@ class ResetCfg:
     stuck: StuckCfg = field(default_factory=StuckCfg)
     """States in which progress stopped."""
     solver: Literal["auto", "newton", "posture"] = "auto"
-    """Inverse kinematics: "newton" solves all states at once, "posture" one by one; "auto" takes "newton" on a GPU (its
-    kernels take a minute to compile on a CPU)."""
+    """Inverse kinematics: "posture" solves states one by one, some hundred a second; "newton" solves all at once, once
+    its kernels are compiled, which takes 2 to 3 minutes on a GPU; "auto" takes "posture"."""
     posture_solver: PostureSolverCfg = field(default_factory=PostureSolverCfg)
     """Inverse kinematics of single poses."""
     newton_solver: NewtonSolverCfg = field(default_factory=NewtonSolverCfg)

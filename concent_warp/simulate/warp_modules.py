@@ -19,7 +19,7 @@ from concent_warp.simulate.parallel import simulations_at_a_time
 
 COMPILERS = 16
 """Largest number of modules compiled at a time; a compiler takes up to 0.5 GB."""
-Variant = tuple[Any, Any, int | None]
+Variant = tuple[Any, Any, int]
 """A module, the device and the threads of a block that it is compiled for."""
 
 _collecting = threading.Lock()
@@ -32,7 +32,10 @@ def load_modules(launches: Callable[[], None]) -> None:
     ``wp.capture_while`` and both branches of ``wp.capture_if`` are gone through once. What it launches must not depend
     on values that kernels compute. Kernels that are missed so are compiled at their first launch.
     """
-    variants = launched_modules(launches)
+    try:
+        variants = launched_modules(launches)
+    except Exception:
+        return  # what is wrong is said by the launches themselves, which follow
     workers = min(COMPILERS, simulations_at_a_time(), len(variants))
     if workers < 2:
         return
@@ -43,13 +46,27 @@ def load_modules(launches: Callable[[], None]) -> None:
 
 def launched_modules(launches: Callable[[], None]) -> list[Variant]:
     """Return the modules of the kernels that a function would launch, without launching them."""
-    found: dict[tuple[int, str, int | None], Variant] = {}
+    found: dict[tuple[int, str, int], Variant] = {}
 
     def note(module: Any, device: Any, block_dim: int | None = None, **_: object) -> None:
         # A launch whose module is None returns at once; overloads of generic kernels are made before.
-        found.setdefault((id(module), str(device), block_dim), (module, device, block_dim))
+        size = module.options["block_dim"] if block_dim is None else block_dim
+        found.setdefault((id(module), str(device), size), (module, device, size))
 
-    with _collecting, _branches_taken(), mock.patch.object(wp.Module, "load", note):
+    def suggested_block_size(kernel: Any, device: Any = None) -> tuple[int, int]:
+        # What depends on it is how many threads are launched, not which kernels.
+        if not wp.get_device(device).is_cuda:
+            return 1, 1
+        note(kernel.module, wp.get_device(device))
+        return 256, 1
+
+    patched = mock.patch.object(wp.Module, "load", note)
+    with (
+        _collecting,
+        _branches_taken(),
+        patched,
+        mock.patch.object(wp, "get_suggested_block_size", suggested_block_size),
+    ):
         launches()
     return list(found.values())
 

@@ -80,3 +80,13 @@ def test_a_kernel_that_does_not_compile_says_so():
 
     with limit_simulations(2), pytest.raises(Exception, match="undefined_name"):
         load_modules(launch)
+
+
+def test_what_fails_while_collecting_is_left_to_the_launches():
+    def launch():
+        raise NotImplementedError("no such thing")
+
+    load_modules(launch)
+    with pytest.raises(NotImplementedError):
+        launched_modules(launch)
+    assert wp.Module.load.__name__ == "load"

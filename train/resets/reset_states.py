@@ -80,7 +80,7 @@ class ResetSampler:
     def __init__(self, task: Task, cfg: ResetCfg, seed: int, device: str) -> None:
         """Prepare models and addresses; `device` is Warp's name of the device of Newton's solver."""
         self.task, self.cfg, self.device = task, cfg, device
-        self.newton = cfg.solver == "newton" or (cfg.solver == "auto" and device.startswith("cuda"))
+        self.newton = cfg.solver == "newton"
         self.rng = np.random.default_rng([seed, 1])
         self.discarded: dict[str, int] = {"unreachable": 0, "overlapping": 0, "chain broken": 0}
         self.m = task.compiled
