@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -41,6 +41,11 @@ def machine_line(facts: dict[str, Any]) -> str:
     first = f"{facts['device']}, " if "device" in facts else ""
     packages = ", ".join(f"{name} {facts[name]}" for name in ("python", *PACKAGES))
     return f"Measured {facts['date']} on {first}{facts['processor']}, {facts['cores']} cores ({packages})."
+
+
+def machines(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence for each machine that rows were measured on, as they are kept by their keys."""
+    return " ".join(dict.fromkeys(machine_line(row["machine"]) for row in rows.values()))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

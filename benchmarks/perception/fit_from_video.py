@@ -17,7 +17,7 @@ import tyro
 
 from benchmarks.fit.shape_sorter import interval, judge, starting_geometry
 from benchmarks.measurements import Measurements
-from benchmarks.pages import FOLDER, machine, machine_line, table, write_page
+from benchmarks.pages import FOLDER, machine, machines, table, write_page
 from benchmarks.perception.track import BODY, IMPERFECT
 from concent_warp.errors import RecordingError
 from concent_warp.fit.fit_geometry import fit_geometry
@@ -71,7 +71,7 @@ def main(args: Args) -> None:
     for seed in () if args.table else args.seeds:
         for source in SOURCES:
             if kept.wanted(f"{seed}/{source}"):
-                kept.add(f"{seed}/{source}", study(seed, source, args.out))
+                kept.add(f"{seed}/{source}", {"machine": machine(), **study(seed, source, args.out)})
     if not args.table:
         kept.close()
     write_page(NAME, page(kept.rows))
@@ -147,7 +147,7 @@ def page(rows: dict[str, dict[str, Any]]) -> str:
         "seed", "tracked position [mm]", "unseen error before", "after, video", "after, instruments",
         "contacts, video", "contacts, instruments",
     ]  # fmt: skip
-    text = f"# Fit from video\n\n{INTRODUCTION}\n{machine_line(machine())}\n\n{table(heads, lines)}"
+    text = f"# Fit from video\n\n{INTRODUCTION}\n{machines(rows)}\n\n{table(heads, lines)}"
     if not differences:
         return text
     low, high = interval(np.array(differences))

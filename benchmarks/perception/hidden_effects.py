@@ -24,7 +24,7 @@ from benchmarks.diagnose.hidden_effects_data import BEST, ELSEWHERE, DataSet, si
 from benchmarks.independent.scoring import exactly_right, groups, in_first_group
 from benchmarks.independent.study import TimeOut, limited, processor_seconds
 from benchmarks.measurements import Measurements
-from benchmarks.pages import FOLDER, machine, machine_line, table, write_page
+from benchmarks.pages import FOLDER, machine, machines, table, write_page
 from benchmarks.perception.track import IMPERFECT
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
@@ -105,7 +105,7 @@ def main(args: Args) -> None:
             continue
         for source in args.sources:
             if kept.wanted(f"{case.name}/{source}"):
-                kept.add(f"{case.name}/{source}", study(case, source, args))
+                kept.add(f"{case.name}/{source}", {"machine": machine(), **study(case, source, args)})
     if not args.table:
         kept.close()
     if args.shift == SHIFT:
@@ -213,7 +213,7 @@ def page(rows: dict[str, dict[str, Any]]) -> str:
         f" {first[source]} of {begun[source]}"
         for source in SOURCES
     ]
-    text = f"# Hidden effects from video\n\n{INTRODUCTION}\n{machine_line(machine())}\n\n" + "\n".join(counts)
+    text = f"# Hidden effects from video\n\n{INTRODUCTION}\n{machines(rows)}\n\n" + "\n".join(counts)
     text += "\n\nBar: named from tracked poses in 80 % of 20 sets. **Bold**: exactly right, named alone or in a group"
     return f"{text}\nof two and nothing else. A *+* separates effects, a *|* those of a group.\n\n{table(heads, lines)}"
 

@@ -189,10 +189,15 @@ def page(rows: Sequence[Row]) -> str:
     return f"""# Training on several GPUs
 
 Insertion stage of the shape sorter with the arm, `concent train` under torchrun with `--stress.every 0`. *fast* is
-`{SETTINGS["fast"]}`. Each GPU has the given number of worlds. Steps are those of all GPUs; rates are those of the
-second half of the training, with learning. Seconds leave out start and compilation. Success is that of the episodes of
-an iteration, while exploring with noise and perturbations; medians over the seeds. One seed each does not show how
-learning differs between numbers of GPUs. Memory is that in use on the fullest GPU, everything counted.
+`{SETTINGS["fast"]}`.
+Each GPU has the given number of worlds. Steps are those of all GPUs; rates are those of the second half of the
+training, with learning. Seconds leave out start and compilation. Success is that of the episodes of an iteration, while
+exploring with noise and perturbations; medians over the seeds. One seed each does not show how learning differs between
+numbers of GPUs. Memory is that in use on the fullest GPU, everything counted.
+
+The trainings on one and on two GPUs ran at the same time on one host, on GPUs of their own, those on four alone; other
+work was on the host's processors all the time. Two GPUs with default settings and eight GPUs were not tried, and no
+training was long enough for 99 %.
 
 ![Steps per second by number of GPUs, and success over time](train_gpus.png)
 
