@@ -22,6 +22,8 @@ from concent_warp.perception.tracking.geometry.view import View
 
 NEARBY = np.diag([1 / 0.015**2] * 3 + [1 / 0.25**2] * 3)
 """Information of a prediction from the frame before [1/m^2, 1/rad^2]: 15 mm and 0.25 rad."""
+CHOSEN_TURN = 0.002
+"""Standard deviation of turns that a shape does not show, in the first keyframe, which defines them [rad]."""
 MAX_TRIES = 3
 """Renewed attempts at the last pose, in a row, before only searches may find a lost body again."""
 
@@ -56,6 +58,8 @@ class BodyTracker:
         """Where a user says that it is, in each view of the moment; None in views that are not searched."""
         self.textures = TextureMap(cfg.texture)
         """Keyframes."""
+        self.first_keyframe = 0
+        """Number of the first keyframe that is compared: those before show a turn that is no longer known."""
 
     def begin(self, renderer: RayRenderer, time: float, views: Sequence[View], pose: np.ndarray) -> Agreement:
         """Take up a given first pose if the first moment agrees with it after a small correction; return the
@@ -88,7 +92,9 @@ class BodyTracker:
         self.reasons.append("" if fit is not None else (self.objections or [self.reason or "not searched yet"])[-1])
         if fit is None:
             self.reason = self.reasons[-1]
-            self.tracked, self.speed, self.misses = False, np.zeros(6), self.misses + 1
+            self.tracked, self.misses = False, self.misses + 1
+            if self.misses >= MAX_TRIES:
+                self.speed = np.zeros(6)
             renderer.place(self.shape.row, None)
         else:
             if self.tracked and self.pose is not None and time > self.time:
@@ -101,9 +107,11 @@ class BodyTracker:
     def followed(self, renderer: RayRenderer, time: float, views: Sequence[View]) -> Fit | None:
         """Return the fit near the predicted pose, or None where nothing agrees."""
         assert self.pose is not None
-        predicted = moved(self.pose, (time - self.time) * self.speed) if self.tracked else self.pose
-        keyframes = self.chosen(views, predicted)
-        fit = self.accepted(renderer, views, predicted, keyframes, rough=False)
+        predicted = moved(self.pose, (time - self.time) * self.speed)
+        fit = self.accepted(renderer, views, predicted, self.chosen(views, predicted), rough=False)
+        if fit is None and not self.tracked:
+            predicted = self.pose
+            fit = self.accepted(renderer, views, predicted, self.chosen(views, predicted), rough=False)
         if fit is None:
             starts = [
                 relocated(renderer, v, self.shape, predicted, self.cfg.search.reach, self.cfg.search) for v in views
@@ -112,7 +120,21 @@ class BodyTracker:
                 if fit is None and start is not None:
                     fit = self.accepted(renderer, views, start, self.chosen(views, start), rough=True)
                     fit = None if fit is None else self.same_representative(renderer, views, fit, predicted)
+        if fit is None and self.is_round():
+            fit = self.turned(renderer, views, predicted)
         return None if fit is None else self.settled(renderer, views, fit)
+
+    def turned(self, renderer: RayRenderer, views: Sequence[View], predicted: np.ndarray) -> Fit | None:
+        """Return the fit of a round body by depth and edges alone: it may have turned more than its texture tells."""
+        unknown: list[tuple[int, Keyframe] | None] = [None] * len(views)
+        fit = self.accepted(renderer, views, predicted, unknown, rough=False)
+        if fit is not None:
+            self.first_keyframe = len(self.textures.keyframes)
+        return fit
+
+    def is_round(self) -> bool:
+        """Return whether there are turns that depth and edges do not show at all."""
+        return self.symmetry.axis is not None or self.symmetry.sphere
 
     def accepted(
         self,
@@ -128,6 +150,7 @@ class BodyTracker:
         fit = refine(
             renderer, views, self.shape, start, cfg.align,
             prior=FREE if rough else NEARBY, keyframes=keyframes, texture=cfg.texture, rough=rough,
+            symmetry=self.symmetry,
         )  # fmt: skip
         if fit is None:
             self.objections.append("it is out of the image")
@@ -142,7 +165,7 @@ class BodyTracker:
             self.objections.append(f"its texture is not seen there (correlation {correlation:.2f}, at least {least:g})")
             return None
         agreed = agreement(renderer, views, self.shape, fit.pose, fit.depth_std, cfg.accept)
-        if against := agreed.objections(cfg.accept):
+        if against := agreed.objections(cfg.accept, followed=self.misses < MAX_TRIES and self.pose is not None):
             self.objections.append("; ".join(against))
             return None
         return replace(fit, agreement=agreed)
@@ -155,7 +178,9 @@ class BodyTracker:
         """Return number and keyframe for each view, None where none fits."""
         result: list[tuple[int, Keyframe] | None] = []
         for view in views:
-            keyframe = self.textures.choose(view, pose)
+            keyframe = self.textures.choose(view, pose, self.first_keyframe)
+            if keyframe is None and self.is_round():  # which texture alone shows to turn
+                keyframe = self.textures.choose(view, pose, self.first_keyframe, 1.6)
             index = next((i for i, k in enumerate(self.textures.keyframes) if k is keyframe), -1)
             result.append(None if keyframe is None else (index, keyframe))
         return result
@@ -163,7 +188,7 @@ class BodyTracker:
     def settled(self, renderer: RayRenderer, views: Sequence[View], fit: Fit) -> Fit:
         """Return a fit, after a keyframe was made of each view that has none near."""
         for view in views:
-            if self.textures.choose(view, fit.pose) is not None:
+            if self.textures.choose(view, fit.pose, self.first_keyframe) is not None:
                 continue
             renderer.place(self.shape.row, fit.pose)
             crop = rendered_crop(renderer, view, self.shape, fit.pose, 20_000)
@@ -177,6 +202,9 @@ class BodyTracker:
             np.linalg.inv(np.linalg.inv(n.information + 1e-3 * FREE) + self.textures.keyframes[k].covariance)
             for k, n in fit.texture
         )
+        if not self.textures.keyframes:
+            turn = fit.pose[:3, :3]
+            information[3:, 3:] += turn @ self.symmetry.chosen_turns() @ turn.T / CHOSEN_TURN**2
         inverse = np.linalg.inv(information + FREE)
         std = bias_stds(self.cfg.align)
         bias = inverse @ fit.geometry.bias * std
@@ -242,12 +270,27 @@ class BodyTracker:
             return fit
         nearest = self.accepted(renderer, views, pose, self.chosen(views, pose), rough=False)
         # Of a round shape hardly any texture may tell turns about its axis, and none of them is an exchange.
-        is_round = self.symmetry.axis is not None or self.symmetry.sphere
-        return fit if nearest is None and is_round else nearest
+        return fit if nearest is None and self.is_round() else nearest
 
     def numbered_fits(self) -> tuple[list[Fit | None], int]:
         """Return the fits of all moments and the number of keyframes that their texture refers to."""
         return self.fits, len(self.textures.keyframes)
+
+    def keyframe_turns(self) -> list[np.ndarray]:
+        """Return what is known of each keyframe's turn about axes about which the shape is round.
+
+        For the first it was chosen, for the others texture has told it.
+
+        Returns:
+            Information in the body's frame, shape (3, 3) each [1/rad^2].
+        """
+        open_turns = self.symmetry.chosen_turns()
+        found = []
+        for keyframe in self.textures.keyframes:
+            turn = keyframe.pose[:3, :3]
+            within = open_turns @ turn.T @ keyframe.covariance[3:, 3:] @ turn @ open_turns
+            found.append(np.linalg.pinv(within, rcond=1e-6, hermitian=True) if open_turns.any() else open_turns)
+        return found
 
     def correction(self, given: np.ndarray) -> tuple[float, float]:
         """Return how far the pose is from a given one: distance of the middle [m] and angle [rad]."""

@@ -8,6 +8,7 @@ the covariance as an error that all these frames share, like the errors of depth
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,16 +32,19 @@ class Bundle:
     """Covariance of the errors that do not change from frame to frame, shape (T, 6, 6)."""
 
 
-def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg) -> Bundle:
+def bundled(fits: list[Fit | None], keyframes: int, cfg: AlignCfg, turns: Sequence[np.ndarray] = ()) -> Bundle:
     """Return the moments' measurements with the errors of keyframes taken out.
 
     Args:
         fits: Of each moment; None where the object was not seen.
         keyframes: How many keyframes there are.
         cfg: Settings.
+        turns: What is known of the turns of the first keyframes, body frame, shape (3, 3) each [1/rad^2].
     """
     size = 6 * keyframes
     matrix, right = np.kron(np.eye(keyframes), LOOSE), np.zeros(size)
+    for k, information in enumerate(turns):
+        matrix[6 * k + 3 : 6 * k + 6, 6 * k + 3 : 6 * k + 6] += information
     sensitivity = np.zeros((size, BIASES))
     for fit in fits:
         if fit is None or not fit.texture:

@@ -74,7 +74,11 @@ class AcceptCfg:
     min_texture: Share = 0.5
     """Least mean correlation of a keyframe's patches with the image [-]."""
     max_penetration: Positive = 0.005
-    """Depth in other bodies above which a pose is impossible [m]: joint readings and shapes are not exact."""
+    """Depth in other bodies above which a pose that was searched for is impossible [m]: joint readings and shapes are
+    not exact."""
+    max_followed_penetration: Positive = 0.03
+    """The same for a body that is followed from frame to frame [m]: what it meets may give way, and more so in an
+    impact."""
     min_pixels: Count = 30
     """Least number of agreeing pixels."""
     min_visible: Share = 0.12
@@ -95,6 +99,8 @@ class TextureCfg:
     """Half edge of the patch around a point [px]."""
     spacing: Positive = 5.0
     """Least distance between points [px]."""
+    min_spacing: Positive = 2.5
+    """The same on a body that is too small for so many points at that distance [px]."""
     min_contrast: Positive = 4.0
     """Least standard deviation of a patch over the image's noise [-]."""
     min_correlation: PositiveShare = 0.75
@@ -197,6 +203,11 @@ class SmoothCfg:
     acceleration: Annotated[tuple[float, ...], Bounds(above_low=True)] = (0.02, 0.2, 2.0, 20.0)
     """Standard deviations of the acceleration within one frame that are compared [m/s^2]; for rotations over the
     object's radius. Each stretch of the motion takes the most likely."""
+    impact: Positive = 500.0
+    """The same in single steps in which the velocity jumps, as where a ball bounces [m/s^2]."""
+    surprising: PositiveShare = 0.9999
+    """Probability, were the motion smooth, of a smaller distance of a measurement from its prediction than there is in
+    such a step [-]."""
     window: Positive = 0.3
     """Time over which their likelihoods are averaged [s]."""
     max_gap: float = 0.15

@@ -169,7 +169,7 @@ def _smoothed(tracker: BodyTracker, video: Video, cfg: TrackCfg, name: str) -> B
     pose = np.full((len(time), 4, 4), np.nan)
     covariance = np.full((len(time), 6, 6), np.nan)
     seen = np.array([fit is not None for fit in tracker.fits])
-    bundle = bundled(*tracker.numbered_fits(), cfg.align)
+    bundle = bundled(*tracker.numbered_fits(), cfg.align, tracker.keyframe_turns())
     # Stretches between long gaps are independent: nothing is known of the motion in between.
     rows = np.flatnonzero(seen)
     for part in np.split(rows, np.flatnonzero(np.diff(time[rows]) > cfg.smooth.max_gap) + 1) if len(rows) else []:

@@ -12,6 +12,7 @@ import numpy as np
 from concent_warp.perception.tracking.geometry.pose import quaternion_of
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import SPHERE
 from concent_warp.perception.tracking.result import BodyTrack
 from concent_warp.perception.tracking.video import Video
 from concent_warp.recording.recording import Channel, Demonstration, PointTrack
@@ -21,6 +22,8 @@ KINDS = {"framepos": mujoco.mjtSensor.mjSENS_FRAMEPOS, "framequat": mujoco.mjtSe
 """Elements of the sensors that read a body's pose."""
 NAMES = {"framepos": "{}_position", "framequat": "{}_orientation"}
 """Their names where the scene has none to follow."""
+MAX_BALL_ORIENTATION_STD = 0.15
+"""Usual standard deviation of a ball's rotation from which on its orientation counts as unknown [rad]."""
 POINT_SLACK = 0.04
 """Distance of a surface in front of a point, over the body's reach, below which the point is seen [-]."""
 
@@ -64,8 +67,8 @@ def _pattern(model: mujoco.MjModel, element: str) -> str:
 
 
 def pose_channels(track: BodyTrack) -> dict[str, Channel]:
-    """Return position and orientation of a track as channels, by the kind of sensor."""
-    kept = ~track.lost
+    """Return position and orientation, where it is known, of a track as channels, by the kind of sensor."""
+    kept, oriented = ~track.lost, has_orientation(track)
     position = np.where(kept[:, None], track.pose[:, :3, 3], np.nan)
     quaternion = np.full((len(kept), 4), np.nan)
     quaternion[kept] = [quaternion_of(pose) for pose in track.pose[kept]]
@@ -73,12 +76,23 @@ def pose_channels(track: BodyTrack) -> dict[str, Channel]:
     for t in range(1, len(kept)):
         turned = np.nansum(quaternion[t] * quaternion[t - 1]) < 0
         signs[t] = -signs[t - 1] if turned else signs[t - 1]
+    quaternion[~oriented] = np.nan
     turn = track.pose[:, :3, :3]
     in_body = np.swapaxes(turn, 1, 2) @ track.covariance[:, 3:, 3:] @ turn
-    return {
-        "framepos": _channel(track.time, position, track.covariance[:, :3, :3]),
-        "framequat": _channel(track.time, signs[:, None] * quaternion, in_body),
-    }
+    channels = {"framepos": _channel(track.time, position, track.covariance[:, :3, :3])}
+    if oriented.any():
+        in_body = np.where(oriented[:, None, None], in_body, np.nan)
+        channels["framequat"] = _channel(track.time, signs[:, None] * quaternion, in_body)
+    return channels
+
+
+def has_orientation(track: BodyTrack) -> np.ndarray:
+    """Return in which moments a body's orientation is known, shape (T,) bool: never of a ball that hardly shows it."""
+    known = ~track.lost
+    if track.symmetry.startswith(SPHERE):
+        variance = np.einsum("tii->t", track.covariance[known][:, 3:, 3:]) / 3
+        known &= bool(np.median(variance) < MAX_BALL_ORIENTATION_STD**2)
+    return known
 
 
 def _channel(time: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> Channel:
@@ -112,7 +126,7 @@ def point_track(
     value = np.full((len(track.time), count, 3), np.nan)
     visible = np.zeros((len(track.time), count), dtype=bool)
     renderer = RayRenderer(model)
-    for t in np.flatnonzero(~track.lost):
+    for t in np.flatnonzero(has_orientation(track)):
         renderer.set_state(video.qpos[t])
         for other in tracks:
             renderer.place(by_name[other.body].row, None if other.lost[t] else other.pose[t])

@@ -3,7 +3,8 @@ pass.
 
 Each moment gives the normal equations of a pose rather than a pose, so directions that a frame does not show (the
 turn of a cylinder about its axis) stay open. The acceleration's standard deviation is the most likely of a few, for
-each stretch of the motion: objects rest for most of the time and are jerked in between.
+each stretch of the motion: objects rest for most of the time and are jerked in between. In single steps, in which a
+measurement contradicts the prediction, the velocity may change at once: an impact.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from concent_warp.perception.tracking.cfg import SmoothCfg
 from concent_warp.perception.tracking.geometry.pose import moved, twist_between
 
+MAX_IMPACTS = 20
+"""Most impacts looked for in one stretch of a track."""
 START_SPEED = 0.5
 """Standard deviation of the speed before the first measurement [m/s], of rotations over the radius."""
 
@@ -49,7 +53,16 @@ def smooth(
     best = (likelihood @ window).argmax(axis=0)
     # A change of motion is felt on both sides of it.
     widest = np.array([best[row].max() for row in window])
-    run = _filtered(time, measurements, radius, np.array(cfg.acceleration)[widest])
+    acceleration = np.array(cfg.acceleration)[widest]
+    run = _filtered(time, measurements, radius, acceleration)
+    for _ in range(MAX_IMPACTS):
+        surprise = np.where(acceleration < cfg.impact, run.surprise, 0.0)
+        worst = int(surprise.argmax())
+        if surprise[worst] <= chi2.ppf(cfg.surprising, 6):
+            break
+        # Between two frames the impact may be near either.
+        acceleration[worst : worst + 2] = cfg.impact
+        run = _filtered(time, measurements, radius, acceleration)
     return _backward(run)
 
 
@@ -65,6 +78,8 @@ class _Run:
     predicted_covariance: list[np.ndarray]
     transition: list[np.ndarray]
     likelihood: np.ndarray
+    surprise: np.ndarray
+    """Squared Mahalanobis distance of each measurement from its prediction, along what it shows, shape (T,)."""
 
 
 def _filtered(
@@ -72,7 +87,7 @@ def _filtered(
 ) -> _Run:
     """Return the forward pass with a standard deviation of the acceleration for each moment [m/s^2], shape (T,)."""
     first = next(m for m in measurements if m is not None)
-    run = _Run([], [], [], [], [], [], [], np.zeros(len(time)))
+    run = _Run([], [], [], [], [], [], [], np.zeros(len(time)), np.zeros(len(time)))
     scale = np.array([1.0] * 3 + [1 / radius] * 3)
     pose, speed = first.pose, np.zeros(6)
     covariance = np.diag(np.concatenate([(scale * 0.3) ** 2, (scale * START_SPEED) ** 2]))
@@ -95,6 +110,7 @@ def _filtered(
             after = covariance - covariance[:, :6] @ measurement.information @ np.linalg.solve(gain, covariance[:6])
             after = (after + after.T) / 2
             change = after[:, :6] @ rest
+            run.surprise[t] = _surprise(measurement.information, rest, covariance[:6, :6])
             run.likelihood[t] = (
                 measurement.gradient @ offset
                 - 0.5 * offset @ measurement.information @ offset
@@ -106,6 +122,21 @@ def _filtered(
         run.speed.append(speed)
         run.covariance.append(covariance)
     return run
+
+
+def _surprise(information: np.ndarray, gradient: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the squared Mahalanobis distance of a measurement from a prediction, along the directions it shows.
+
+    Args:
+        information: Of the measurement, shape (6, 6).
+        gradient: Information times offset of measurement and prediction, shape (6,).
+        covariance: Of the prediction, shape (6, 6).
+    """
+    values, directions = np.linalg.eigh(information)
+    shown = values > 1e-6 * values[-1]
+    offset = directions[:, shown].T @ gradient / values[shown]
+    spread = np.diag(1 / values[shown]) + directions[:, shown].T @ covariance @ directions[:, shown]
+    return float(offset @ np.linalg.solve(spread, offset))
 
 
 def _backward(run: _Run) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from concent_warp.perception.tracking.alignment.rows import MAD, Crop, Normal, depth_rows, edge_rows, rendered_crop
 from concent_warp.perception.tracking.alignment.texture import Keyframe, common_shift, texture_rows
@@ -13,6 +14,7 @@ from concent_warp.perception.tracking.cfg import AcceptCfg, AlignCfg, TextureCfg
 from concent_warp.perception.tracking.geometry.pose import moved, twist_between
 from concent_warp.perception.tracking.geometry.ray_renderer import RayRenderer
 from concent_warp.perception.tracking.geometry.shape import TrackedShape
+from concent_warp.perception.tracking.geometry.symmetry import Symmetry
 from concent_warp.perception.tracking.geometry.view import View
 
 FREE = np.diag([1 / 0.1**2] * 3 + [1 / 1.0**2] * 3)
@@ -77,8 +79,14 @@ class Agreement:
         """Return whether this is agreement enough."""
         return not self.objections(cfg)
 
-    def objections(self, cfg: AcceptCfg) -> list[str]:
-        """Return what speaks against the pose, in words; nothing where this is agreement enough."""
+    def objections(self, cfg: AcceptCfg, *, followed: bool = False) -> list[str]:
+        """Return what speaks against the pose, in words; nothing where this is agreement enough.
+
+        Args:
+            cfg: Thresholds.
+            followed: Whether the body was seen nearby just before.
+        """
+        deepest = cfg.max_followed_penetration if followed else cfg.max_penetration
         misfit = max(cfg.max_misfit, cfg.max_misfit_share * self.depth_std)
         checks = (
             (
@@ -99,8 +107,8 @@ class Agreement:
                 f"its surface is off by {1e3 * self.misfit:.1f} mm (at most {1e3 * misfit:.1f})",
             ),
             (
-                self.penetration <= cfg.max_penetration,
-                f"it is {1e3 * self.penetration:.1f} mm inside others (at most {1e3 * cfg.max_penetration:g})",
+                self.penetration <= deepest,
+                f"it is {1e3 * self.penetration:.1f} mm inside others (at most {1e3 * deepest:g})",
             ),
         )
         found = [words for passed, words in checks if not passed]
@@ -129,6 +137,7 @@ def refine(
     texture: TextureCfg | None = None,
     rough: bool = False,
     iterations: int | None = None,
+    symmetry: Symmetry | None = None,
 ) -> Fit | None:
     """Return the pose that agrees best with the frames of one moment, or None where the body is out of all of them.
 
@@ -143,6 +152,7 @@ def refine(
         texture: Settings of the texture.
         rough: Whether the start may be off by centimetres.
         iterations: Iterations; by default those of `cfg`.
+        symmetry: Of the body; a round one may have turned where its texture has moved.
     """
     start, prior = pose, FREE if prior is None else prior
     count = iterations or (cfg.first_iterations if rough else cfg.iterations)
@@ -150,9 +160,8 @@ def refine(
         renderer.place(shape.row, pose)
         for view, chosen in zip(views, keyframes, strict=False):
             if chosen is not None:
-                pose = pose.copy()
-                pose[:3, 3] += common_shift(renderer, view, shape, pose, chosen[1], texture)
-                start = pose
+                shift = common_shift(renderer, view, shape, pose, chosen[1], texture)
+                start = pose = _shifted(pose, shift, view, shape, symmetry)
                 break
     fit = None
     for k in range(count):
@@ -189,6 +198,26 @@ def refine(
         limit = max(np.linalg.norm(step[:3]) / cfg.max_step, np.linalg.norm(step[3:]) * shape.reach / cfg.max_step, 1.0)
         pose = moved(pose, step / limit)
     return fit
+
+
+def _shifted(
+    pose: np.ndarray, shift: np.ndarray, view: View, shape: TrackedShape, symmetry: Symmetry | None
+) -> np.ndarray:
+    """Return a pose after a displacement of the surface that faces the camera [m], shape (3,).
+
+    A sphere turns, any other body moves: depth and outline would say where else a sphere is.
+    """
+    result = pose.copy()
+    if symmetry is None or not symmetry.sphere or not shift.any():
+        result[:3, 3] += shift
+        return result
+    middle = pose[:3, :3] @ symmetry.centre + pose[:3, 3]
+    front = view.camera.position - middle
+    front *= shape.radius / np.linalg.norm(front)
+    turn = Rotation.from_rotvec(np.cross(front, shift) / shape.radius**2).as_matrix()
+    result[:3, :3] = turn @ pose[:3, :3]
+    result[:3, 3] = middle - result[:3, :3] @ symmetry.centre
+    return result
 
 
 def _tempered(information: np.ndarray, covariance: np.ndarray) -> np.ndarray:

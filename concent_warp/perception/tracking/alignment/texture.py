@@ -1,9 +1,9 @@
 """Texture points on keyframes: patches of a former frame, on the shape's surface, matched to the current one.
 
 A keyframe keeps the positions of its points on the body, where the lines of sight met the shape at the keyframe's
-pose. Each patch is warped to the current prediction through its tangent plane and shifted by Lucas and Kanade's
-method. All frames are compared with keyframes, never with the frame before, so that errors do not add up from frame to
-frame.
+pose, and those of all pixels of their patches. Each patch is projected to the current prediction and shifted by Lucas
+and Kanade's method. All frames are compared with keyframes, never with the frame before, so that errors do not add up
+from frame to frame.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from concent_warp.perception.tracking.alignment.rows import Crop, Normal, point_jacobian, weighted
 from concent_warp.perception.tracking.cfg import AlignCfg, TextureCfg
@@ -27,6 +28,10 @@ SHIFT_GAIN = 0.2
 """Advantage in median correlation of a shift over none at which it is taken [-]."""
 LOOKED_AT = 0.35
 """Least cosine between normal and line of sight of a texture point [-]."""
+MAX_BEND = 0.9
+"""Largest change of the normal from the middle of a patch to its corners [-]."""
+CREASE = 0.2
+"""Change of the normal from one grid pixel to the next from which on there is an edge [-]."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Keyframe:
     normals: np.ndarray
     """Normals there, body frame, shape (n, 3)."""
     grid: np.ndarray
-    """Positions of the patches' pixels on the tangent planes [m], body frame, shape (n, p, 3)."""
+    """Positions of the patches' pixels on the surface [m], body frame, shape (n, p, 3)."""
     patches: np.ndarray
     """Brightness of the patches, of mean 0 and norm 1, shape (n, p)."""
     sight: np.ndarray
@@ -58,15 +63,24 @@ class TextureMap:
     cfg: TextureCfg
     keyframes: list[Keyframe] = field(default_factory=list)
 
-    def choose(self, view: View, pose: np.ndarray) -> Keyframe | None:
-        """Return the oldest keyframe that sees the body from about the same side, or None."""
+    def choose(self, view: View, pose: np.ndarray, first: int = 0, factor: float = 1.0) -> Keyframe | None:
+        """Return the oldest keyframe, from that number on, that sees the body from about the same side, or None.
+
+        The turn in between is at most the largest of the settings times a factor; with one above 1 the nearest is
+        taken.
+        """
         sight = view.camera.pose[:3, :3].T @ pose[:3, :3]
         distance = float(np.linalg.norm(pose[:3, 3] - view.camera.position))
-        for keyframe in self.keyframes:
-            near = rotation_angle(keyframe.sight, sight) < np.radians(self.cfg.max_angle)
-            if near and 0.75 < distance / keyframe.distance < 1.33:
-                return keyframe
-        return None
+        angles = [rotation_angle(k.sight, sight) for k in self.keyframes]
+        near = [
+            k
+            for k in range(first, len(self.keyframes))
+            if angles[k] < factor * np.radians(self.cfg.max_angle)
+            and 0.75 < distance / self.keyframes[k].distance < 1.33
+        ]
+        if not near:
+            return None
+        return self.keyframes[min(near, key=angles.__getitem__) if factor > 1 else near[0]]
 
     def add(self, view: View, crop: Crop, pose: np.ndarray, covariance: np.ndarray) -> bool:
         """Add a keyframe of what is seen now; return whether there was texture enough."""
@@ -92,7 +106,9 @@ def new_keyframe(view: View, crop: Crop, pose: np.ndarray, covariance: np.ndarra
     full = cv2.resize(mask, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
     if not full.any():
         return None
-    found = cv2.goodFeaturesToTrack(image, 2 * cfg.points, 0.01, cfg.spacing, mask=full, blockSize=5)
+    # A small body has room for enough points only if they are nearer to each other.
+    spacing = float(np.clip(np.sqrt(full.sum() / cfg.points), min(cfg.min_spacing, cfg.spacing), cfg.spacing))
+    found = cv2.goodFeaturesToTrack(image, 2 * cfg.points, 0.01, spacing, mask=full, blockSize=5)
     if found is None:
         return None
     pixels = found.reshape(-1, 2).astype(float) + np.array([columns[0], rows[0]])
@@ -103,22 +119,19 @@ def new_keyframe(view: View, crop: Crop, pose: np.ndarray, covariance: np.ndarra
     i = np.clip(np.round((pixels[:, 1] - rows[0]) / stride).astype(int), 0, len(rows) - 1)
     j = np.clip(np.round((pixels[:, 0] - columns[0]) / stride).astype(int), 0, len(columns) - 1)
     normal = crop.normal[i, j]
-    # The plane of the nearest grid pixel, met by the patch's own lines of sight.
-    anchor = view.camera.position + crop.depth[i, j][:, None] * crop.rays[i, j]
+    # The rendered surface, met by the patch's own lines of sight.
+    places = (around[..., ::-1] - np.array([rows[0], columns[0]])) / stride
+    depth, whole = (_bilinear(values, places) for values in (crop.depth, crop.own.astype(float)))
     rays = view.camera.rays(around) @ view.camera.pose[:3, :3].T
-    lean = np.einsum("npk,nk->np", rays, normal)
-    level = np.einsum("nk,nk->n", anchor - view.camera.position, normal)
     good = crop.own[i, j] & crop.mask[i, j] & (brightness.std(axis=1) > cfg.min_contrast * view.noise)
+    good &= (whole > 0.999).all(axis=1)
     good &= -np.einsum("nk,nk->n", normal, crop.rays[i, j]) > LOOKED_AT * np.linalg.norm(crop.rays[i, j], axis=1)
-    good &= (
-        np.linalg.norm(crop.normal[i, j] - _corner_normals(crop, i, j, max(1, half // stride)), axis=2).max(axis=0)
-        < 0.35
-    )
-    good &= (np.abs(lean) > 1e-3).all(axis=1)
+    bend = np.linalg.norm(crop.normal[i, j] - _corner_normals(crop, i, j, max(1, half // stride)), axis=2).max(axis=0)
+    good &= (bend < MAX_BEND) & ~_near_crease(crop, max(1, half // stride))[i, j]
     if good.sum() < cfg.min_points:
         return None
     keep = np.flatnonzero(good)[: cfg.points]
-    world = view.camera.position + (level[keep, None] / lean[keep])[..., None] * rays[keep]
+    world = view.camera.position + depth[keep, :, None] * rays[keep]
     rotation = pose[:3, :3]
     grid = (world - pose[:3, 3]) @ rotation
     middle = len(patch) // 2
@@ -143,6 +156,27 @@ def _corner_normals(crop: Crop, i: np.ndarray, j: np.ndarray, reach: int) -> np.
             for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1))
         ]
     )
+
+
+def _near_crease(crop: Crop, reach: int) -> np.ndarray:
+    """Return whether an edge of the body is within some grid pixels of each, shape (h, w) bool."""
+    import cv2
+
+    crease = np.zeros(crop.own.shape, dtype=np.uint8)
+    for axis in (0, 1):
+        jump = np.linalg.norm(np.diff(crop.normal, axis=axis), axis=2) > CREASE
+        both = np.take(crop.own, range(1, crop.own.shape[axis]), axis) & np.take(
+            crop.own, range(jump.shape[axis]), axis
+        )
+        found = np.argwhere(jump & both)
+        for side in (0, 1):
+            crease[tuple((found + side * np.eye(2, dtype=int)[axis]).T)] = 1
+    return cv2.dilate(crease, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+
+
+def _bilinear(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return values (h, w) between grid pixels, at rows and columns of shape (..., 2)."""
+    return map_coordinates(values, np.moveaxis(places, -1, 0), order=1, mode="nearest")
 
 
 def _standardised(patches: np.ndarray) -> np.ndarray:
@@ -229,7 +263,8 @@ def common_shift(
     """Return the translation [m], parallel to the image, shape (3,), at which a keyframe's patches match together.
 
     All shifts up to `cfg.search_range` are tried on some of the visible patches; zero where none is better than none by
-    much, so that a good prediction stays.
+    much, so that a good prediction stays. On a round body it is a displacement of the surface that faces the camera,
+    which a turn may cause.
     """
     points = keyframe.points @ pose[:3, :3].T + pose[:3, 3]
     pixels, depth, _ = view.pixel_rows(points)

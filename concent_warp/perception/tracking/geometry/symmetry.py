@@ -18,6 +18,8 @@ ROUND_STEPS = 24
 """Turns that stand for all about a round axis."""
 SPREAD_SAMPLES = 20_000
 """Surface points whose principal axes are tried."""
+SPHERE = "sphere"
+"""First word of the class of a shape that is round about every axis."""
 MAX_TURNS = 120
 """Most turns listed: the icosahedron's are 60."""
 
@@ -44,6 +46,12 @@ class Symmetry:
         offset = self.centre - self.turns @ self.centre
         result[:, :3, 3] = pose[:3, 3] + offset @ pose[:3, :3].T
         return result
+
+    def chosen_turns(self) -> np.ndarray:
+        """Return the projection on the axes about which every turn looks alike, body frame, shape (3, 3)."""
+        if self.sphere:
+            return np.eye(3)
+        return np.zeros((3, 3)) if self.axis is None else np.outer(self.axis, self.axis)
 
     def nearest(self, pose: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return that pose of those which look like `pose` whose orientation is nearest to the target's."""
@@ -94,7 +102,7 @@ def _round(shape: TrackedShape, centre: np.ndarray, about: list[np.ndarray], sla
     if len(about) > 1:
         every = Rotation.random(MAX_TURNS, rng=np.random.default_rng(0)).as_matrix()
         turns = np.concatenate([np.eye(3)[None], every])
-        return Symmetry(turns, centre, "sphere: no rotation can be observed", None, True)
+        return Symmetry(turns, centre, f"{SPHERE}: no rotation can be observed", None, True)
     axis = about[0]
     across = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     over = _turn(np.pi * across / np.linalg.norm(across))
