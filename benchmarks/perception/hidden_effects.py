@@ -64,6 +64,13 @@ the pose instruments; other seeds. The ball of the drops is thrown forward {SLOW
 stays in view. *Instruments*: the same motions with poses of a motion-capture system, 0.3 mm and 0.17 degrees at 100 Hz.
 A diagnosis of more than {LIMIT:g} s counts as wrong. Objects have a printed texture; on plain balls no turning could
 be seen.
+
+In a first run on these sets 8 of 20 were exactly right: balls were not seen to turn, tracks ended where something was
+hit. After that the tracker was changed, on sets of other seeds, and the drops, spins and tumbles were tracked again;
+slides, pushes and grasps are as they were in the first run.
+"""
+FURTHER = """\
+Drops, spins and tumbles with seeds that were not seen before the changes; video alone.
 """
 
 
@@ -192,30 +199,44 @@ def tracked(
 
 def page(rows: dict[str, dict[str, Any]]) -> str:
     """Return the page."""
-    lines, right, first = [], dict.fromkeys(SOURCES, 0), dict.fromkeys(SOURCES, 0)
-    cases = sets(SHIFT)
-    begun = dict.fromkeys(SOURCES, 0)
-    for case in cases:
-        line = [f"{case.rig}, {' + '.join(case.magnitudes)}"]
-        video = rows.get(f"{case.name}/video", {})
-        line.append(f"{video['position']:.2f}, {video['rotation']:.2f}" if "position" in video else "-")
-        line.append(f"{video['lost']} of {video['frames']}" if "lost" in video else "-")
-        for source in SOURCES:
-            row = rows.get(f"{case.name}/{source}")
-            begun[source] += row is not None
-            right[source] += row is not None and exactly_right(scored(row))
-            first[source] += row is not None and in_first_group(scored(row))
-            line.append("not begun" if row is None else answer(row))
-        lines.append(line)
     heads = ["experiment, hidden effect", "position [mm], rotation [deg]", "lost", "from video", "from instruments"]
-    counts = [
-        f"- from {source}: exactly right {right[source]} of {begun[source]}, the right one in the first group"
-        f" {first[source]} of {begun[source]}"
-        for source in SOURCES
-    ]
-    text = f"# Hidden effects from video\n\n{INTRODUCTION}\n{machines(rows)}\n\n" + "\n".join(counts)
+    names = [case.name for case in sets(SHIFT)]
+    further = [row["name"] for row in rows.values() if row["name"] not in names]
+    text = f"# Hidden effects from video\n\n{INTRODUCTION}\n{machines(rows)}\n\n{counts(names, rows)}"
     text += "\n\nBar: named from tracked poses in 80 % of 20 sets. **Bold**: exactly right, named alone or in a group"
-    return f"{text}\nof two and nothing else. A *+* separates effects, a *|* those of a group.\n\n{table(heads, lines)}"
+    text += "\nof two and nothing else. A *+* separates effects, a *|* those of a group.\n\n"
+    text += table(heads, [line(name, rows) for name in names])
+    if further:
+        again = list(dict.fromkeys(further))
+        text += f"\n## Further seeds\n\n{FURTHER}\n\n{counts(again, rows)}\n\n"
+        text += table(heads, [line(name, rows) for name in again])
+    return text
+
+
+def counts(names: Sequence[str], rows: dict[str, dict[str, Any]]) -> str:
+    """Return how many of some sets are right, by where their poses come from."""
+    lines = []
+    for source in SOURCES:
+        of = [scored(rows[key]) for name in names if (key := f"{name}/{source}") in rows]
+        right, first = sum(map(exactly_right, of)), sum(map(in_first_group, of))
+        if of:
+            lines.append(
+                f"- from {source}: exactly right {right} of {len(of)}, the right one in the first group"
+                f" {first} of {len(of)}"
+            )
+    return "\n".join(lines)
+
+
+def line(name: str, rows: dict[str, dict[str, Any]]) -> list[str]:
+    """Return a line of the table."""
+    of = {source: rows.get(f"{name}/{source}") for source in SOURCES}
+    any_row, video = next(row for row in of.values() if row is not None), of["video"] or {}
+    return [
+        f"{any_row['rig']}, {' + '.join(any_row['hidden'])}",
+        f"{video['position']:.2f}, {video['rotation']:.2f}" if "position" in video else "-",
+        f"{video['lost']} of {video['frames']}" if "lost" in video else "-",
+        *("not begun" if row is None else answer(row) for row in of.values()),
+    ]
 
 
 def scored(row: dict[str, Any]) -> dict[str, Any]:
