@@ -163,14 +163,11 @@ def _near_crease(crop: Crop, reach: int) -> np.ndarray:
     import cv2
 
     crease = np.zeros(crop.own.shape, dtype=np.uint8)
-    for axis in (0, 1):
-        jump = np.linalg.norm(np.diff(crop.normal, axis=axis), axis=2) > CREASE
-        both = np.take(crop.own, range(1, crop.own.shape[axis]), axis) & np.take(
-            crop.own, range(jump.shape[axis]), axis
-        )
-        found = np.argwhere(jump & both)
-        for side in (0, 1):
-            crease[tuple((found + side * np.eye(2, dtype=int)[axis]).T)] = 1
+    own, normal = crop.own, crop.normal
+    below = own[1:] & own[:-1] & (np.linalg.norm(normal[1:] - normal[:-1], axis=2) > CREASE)
+    right = own[:, 1:] & own[:, :-1] & (np.linalg.norm(normal[:, 1:] - normal[:, :-1], axis=2) > CREASE)
+    for part, edge in ((crease[1:], below), (crease[:-1], below), (crease[:, 1:], right), (crease[:, :-1], right)):
+        part[edge] = 1
     return cv2.dilate(crease, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
 
 
