@@ -44,8 +44,6 @@ class BodyTracker:
         """Time of the last pose [s]."""
         self.searched = -np.inf
         """Time of the last search [s]."""
-        self.searches = 0
-        """Searches since it was seen."""
         self.reason = ""
         """Why it was not found last."""
         self.misses = 0
@@ -89,7 +87,7 @@ class BodyTracker:
         fit, self.objections = None, []
         if self.pose is not None and (self.tracked or self.misses < MAX_TRIES):
             fit = self.followed(renderer, time, views)
-        if fit is None and not self.tracked and time - self.searched >= self.pause():
+        if fit is None and not self.tracked and time - self.searched >= self.cfg.search.interval:
             fit = self.recovered(renderer, time, views, rng)
         self.reasons.append("" if fit is not None else (self.objections or [self.reason or "not searched yet"])[-1])
         if fit is None:
@@ -102,14 +100,9 @@ class BodyTracker:
             if self.tracked and self.pose is not None and time > self.time:
                 speed = twist_between(self.pose, fit.pose) / (time - self.time)
                 self.speed = 0.3 * self.speed + 0.7 * speed
-            self.pose, self.tracked, self.time, self.misses, self.searches = fit.pose, True, time, 0, 0
+            self.pose, self.tracked, self.time, self.misses = fit.pose, True, time, 0
             renderer.place(self.shape.row, fit.pose)
         self.fits.append(fit)
-
-    def pause(self) -> float:
-        """Return the time from the last search to the next [s]."""
-        cfg = self.cfg.search
-        return float(min(cfg.first_interval * 2.0 ** (self.searches - 1), cfg.interval))
 
     def followed(self, renderer: RayRenderer, time: float, views: Sequence[View]) -> Fit | None:
         """Return the fit near the predicted pose, or None where nothing agrees."""
@@ -228,7 +221,7 @@ class BodyTracker:
         regions = self.regions or (None,) * len(views)
         if self.regions and not any(regions):
             return None
-        self.searched, self.searches = time, self.searches + 1
+        self.searched = time
         best = None
         for view, region in zip(views, regions, strict=True):
             if self.regions and region is None:

@@ -161,10 +161,8 @@ class SearchCfg:
     """Distance below which two poses are the same [m]."""
     same_rotation: Angle = 8.0
     """Turn below which two poses are the same [deg]."""
-    first_interval: Positive = 0.05
-    """Time to the next search after the first one of a lost object [s]; doubled after each search."""
     interval: Positive = 0.3
-    """Longest time between searches while an object is lost [s]."""
+    """Time between searches while an object is lost [s]."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ MAX_SHARE = 0.05
 """Share of the time that writing may take [-]; a long video's state is written less often."""
 NORMAL = {"information": (6, 6), "gradient": (6,), "bias": (6, BIASES)}
 """Shapes of a set of normal equations."""
-TRACKER = ("pose", "tracked", "speed", "time", "searched", "reason", "reasons", "misses", "searches", "first_keyframe")
+TRACKER = ("pose", "tracked", "speed", "time", "searched", "reason", "reasons", "misses", "first_keyframe")
 """Members of a tracker that are its state, besides fits and keyframes."""
 SCALARS = ("depth_std", "edge_share", "texture_correlation", "edge_std", "texture_std")
 """Members of a fit that are numbers, in order."""
