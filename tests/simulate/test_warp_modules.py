@@ -16,7 +16,7 @@ def scaling(factor: float):
     """Return a kernel in a module of its own."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def scale(values: wp.array(dtype=float)):
+    def scale(values: Any):
         i = wp.tid()
         values[i] = factor * values[i]
 
@@ -24,7 +24,7 @@ def scaling(factor: float):
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def cast(values: wp.array(dtype=Any), out: wp.array(dtype=float)):
+def cast(values: Any, out: Any):
     i = wp.tid()
     out[i] = float(values[i])
 
@@ -69,8 +69,8 @@ def test_modules_are_loaded_once_with_all_types(launches, monkeypatch):
 
 def test_a_kernel_that_does_not_compile_says_so():
     @wp.kernel(module="unique", enable_backward=False)
-    def broken(values: wp.array(dtype=float)):
-        values[wp.tid()] = undefined_name  # noqa: F821
+    def broken(values: Any):
+        values[wp.tid()] = undefined_name  # noqa: F821 # pyright: ignore[reportUndefinedVariable]
 
     values = wp.ones(1, dtype=float, device="cpu")
 
