@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from test_checkpoint_files import copied, trained, training
 
 assert trained
@@ -70,7 +69,6 @@ def test_training_that_fills_the_disk_keeps_its_last_checkpoint(trained, tmp_pat
     assert code == 0
 
 
-@pytest.mark.slow
 def test_export_to_a_full_disk_leaves_the_earlier_file(trained, tmp_path):
     run = copied(trained, tmp_path)
     commands = []
