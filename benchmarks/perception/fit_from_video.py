@@ -45,7 +45,8 @@ INTRODUCTION = f"""\
 none`, and fitted from the disturbed start of [the fit's page](fit_shape_sorter.md), whose errors these are: mean block
 position error over align and insert [mm] of two unseen demonstrations. *Instruments*: the same with the poses and
 points that Reality's pose tracker measures (0.3 mm, 0.17 degrees). Contacts: overlap (IoU) of the frames in which block
-and box touch / of all body pairs with the block, unseen. The block is textured.
+and box touch / of all body pairs with the block, unseen. The block is textured. Tracked before the tracker was made to
+follow balls and impacts, by which the track of a block hardly changes; not repeated since.
 """
 
 

@@ -95,15 +95,15 @@ def trained(args: Args, given: list[str], folder: Path, options: str, gpus: int,
 
 
 @contextlib.contextmanager
-def watched_memory(gpus: int) -> Iterator[list[int]]:
-    """Yield a list of the memory in use on the fullest of the first GPUs visible [MiB], read every 2 s."""
+def watched_memory(gpus: int, every: float = 2.0) -> Iterator[list[int]]:
+    """Yield a list of the memory in use on the fullest of the first GPUs visible [MiB], read ever so often [s]."""
     found: list[int] = []
     ended = threading.Event()
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(gpus)))).split(",")[:gpus]
     query = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "-i", ",".join(visible)]
 
     def watch() -> None:
-        while not ended.wait(2.0):
+        while not ended.wait(every):
             with contextlib.suppress(OSError, ValueError, subprocess.SubprocessError):
                 found.append(max(map(int, subprocess.check_output(query, text=True).split())))
 
@@ -206,6 +206,16 @@ training was long enough for 99 %.
 """
 
 
+def check(rows: Sequence[Row], paths: Sequence[Path]) -> None:
+    """End with a sentence where there is no training on one GPU to compare others with."""
+    alone = {row["settings"] for row in rows if row["gpus"] == 1}
+    if not rows or (missing := {row["settings"] for row in rows} - alone):
+        what = f"on one GPU with {', '.join(sorted(missing))} settings" if rows else "at all"
+        raise SystemExit(
+            f"{', '.join(map(str, paths))}: no training {what}; measure it with --gpus 1, then report again"
+        )
+
+
 def plot(rows: Sequence[Row]) -> None:
     """Draw rates by number of GPUs, and success over time."""
     groups = grouped(rows)
@@ -239,6 +249,7 @@ def main() -> None:
         measure(args, args.out)
     if args.report:
         rows = {key: row for path in args.report for key, row in Measurements(path).rows.items()}
+        check(list(rows.values()), args.report)
         write_data(NAME, {"rows": list(rows.values())})
     if args.out is None:
         rows = read_data(NAME)["rows"]

@@ -64,7 +64,8 @@ Seeds 12 and 13 were used to choose. The trainings kept their last policy, not t
 Eight trainings ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead
 0.015` with seeds 12 and 13, and without edges seeds 20 to 25. So did ten with geometry fitted with edge spheres, seeds
 30 to 39, after 160 of 300 iterations, and two of a round peg after 90; of these two policies were kept, seed 33, which
-succeeds in 191 of 200 trials, and a peg's, seed 30, in 187 of 200.
+succeeds in 191 of 200 trials, and a peg's, seed 30, in 187 of 200 (`concent evaluate --checkpoint POLICY --world
+reality --episodes 200`; they are not in the repository).
 """
 
 

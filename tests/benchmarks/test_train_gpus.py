@@ -1,3 +1,5 @@
+import time
+
 import pytest
 
 
@@ -31,8 +33,27 @@ def test_settings_are_compared_with_themselves(train_gpus):
     assert "| fast | 2 x 8 | 4,500 | 1.50 | 75% |" in text
 
 
-def test_gpus_that_are_not_there_take_no_memory(train_gpus, monkeypatch):
-    monkeypatch.setenv("PATH", "/nowhere")
-    with train_gpus.watched_memory(1) as found:
-        pass
-    assert found == []
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [([], "no training at all"), ([row(4, 8, 1.0, [])], "no training on one GPU with default settings")],
+)
+def test_a_page_without_a_training_on_one_gpu_is_refused(train_gpus, tmp_path, rows, said):
+    with pytest.raises(SystemExit, match=said):
+        train_gpus.check(rows, [tmp_path / "nothing.jsonl"])
+
+
+@pytest.mark.parametrize(("installed", "expected"), [(True, 300), (False, None)])
+def test_memory_is_that_of_the_fullest_gpu_where_it_can_be_read(train_gpus, monkeypatch, tmp_path, installed, expected):
+    asked = tmp_path / "asked"
+    if installed:
+        program = tmp_path / "nvidia-smi"
+        program.write_text(f"#!/bin/sh\necho x >> {asked}\necho 100\necho 300\n")
+        program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    ends = time.monotonic() + 10
+    with train_gpus.watched_memory(2, 0.01) as found:
+        while installed and not found and time.monotonic() < ends:
+            time.sleep(0.01)
+        time.sleep(0.1)
+    assert max(found, default=None) == expected
+    assert asked.exists() == installed
