@@ -208,12 +208,13 @@ training was long enough for 99 %.
 
 def check(rows: Sequence[Row], paths: Sequence[Path]) -> None:
     """End with a sentence where there is no training on one GPU to compare others with."""
-    alone = {row["settings"] for row in rows if row["gpus"] == 1}
-    if not rows or (missing := {row["settings"] for row in rows} - alone):
-        what = f"on one GPU with {', '.join(sorted(missing))} settings" if rows else "at all"
-        raise SystemExit(
-            f"{', '.join(map(str, paths))}: no training {what}; measure it with --gpus 1, then report again"
-        )
+    where = ", ".join(map(str, paths))
+    if not rows:
+        raise SystemExit(f"{where}: no training at all; measure with --out, then report again")
+    missing = {row["settings"] for row in rows} - {row["settings"] for row in rows if row["gpus"] == 1}
+    if missing:
+        what = f"no training on one GPU with {', '.join(sorted(missing))} settings"
+        raise SystemExit(f"{where}: {what}; measure it with --gpus 1, then report again")
 
 
 def plot(rows: Sequence[Row]) -> None:
