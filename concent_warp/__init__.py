@@ -78,6 +78,12 @@ _HOMES = {
     "simulate.engine": ("Rollout",),
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.flow.cfg": (
+        *("FlowAugmentCfg", "FlowDataCfg", "FlowPolicyCfg"),
+        *("SmallBackboneCfg", "TrainFlowCfg"),
+    ),
+    "train.flow.policy": ("FlowPolicy", "load_flow_policy"),
+    "train.flow.train_flow": ("FlowProgress", "train_flow"),
     "train.observation_cfg": ("SensorErrorsCfg",),
     "train.trials.evaluate": ("Evaluation",),
     "train.policy.load": ("Policy", "load_policy"),
@@ -165,6 +171,15 @@ if TYPE_CHECKING:
     from concent_warp.simulate.engine import Rollout
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.flow.cfg import (
+        FlowAugmentCfg,
+        FlowDataCfg,
+        FlowPolicyCfg,
+        SmallBackboneCfg,
+        TrainFlowCfg,
+    )
+    from concent_warp.train.flow.policy import FlowPolicy, load_flow_policy
+    from concent_warp.train.flow.train_flow import FlowProgress, train_flow
     from concent_warp.train.observation_cfg import SensorErrorsCfg
     from concent_warp.train.policy.load import Policy, load_policy
     from concent_warp.train.train import train

@@ -48,6 +48,7 @@ GROUPS = {
         "splat-fit": "fit Gaussian splats to posed images of an object",
         "render-train": "train the networks that paint robot and background",
         "render": "render episodes or a recording as a data set of images",
+        "train-flow": "train a policy that sees, from a data set of images",
     },
 }
 """Commands by the step of the pipeline, each a module of this package, "-" as "_", with what it does."""
@@ -73,6 +74,7 @@ EXAMPLES = {
     "splat-fit": "concent splat-fit photographs -o runs/splats",
     "render-train": "concent render-train robot.h5 -o runs/render",
     "render": "concent render --checkpoint runs/insert -o dataset",
+    "train-flow": "concent train-flow dataset -o runs/flow",
 }
 """One example of each command, shown by its help."""
 LOADING_AFTER = 1.5
