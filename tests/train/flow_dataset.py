@@ -13,11 +13,11 @@ from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
 from concent_warp.train.flow.cfg import FlowAugmentCfg, FlowDataCfg, FlowPolicyCfg, SmallBackboneCfg, TrainFlowCfg
 
-SIZE, LENGTH, RATE = 32, 6, 10
+SIZE, LENGTH, RATE = 16, 6, 10
 UP, DOWN = "push it up", "push it down"
 SIZES = FlowPolicyCfg(
-    size=32, chunk=4, execute=2, width=32, layers=2, heads=2,
-    small=SmallBackboneCfg(channels=(8, 16, 16, 32), text_layers=1, fusion_layers=1, text_bytes=40),
+    size=16, chunk=4, execute=2, width=32, causal=False, layers=2, heads=2,
+    small=SmallBackboneCfg(channels=(8, 16, 32), text_layers=1, fusion_layers=1, text_bytes=40),
 )  # fmt: skip
 TINY = TrainFlowCfg(
     steps=300, batch=32, learning_rate=3e-3, warm_up=20, ema=0.98, validate=100, validation_samples=64, policy=SIZES,
@@ -28,8 +28,8 @@ TINY = TrainFlowCfg(
 def image(goal: float) -> np.ndarray:
     """Return an image with a bright bar at a goal in -1..1."""
     found = np.full((SIZE, SIZE, 3), 20, dtype=np.uint8)
-    column = round((goal + 1) / 2 * (SIZE - 4))
-    found[:, column : column + 4] = 230
+    column = round((goal + 1) / 2 * (SIZE - 2))
+    found[:, column : column + 2] = 230
     return found
 
 

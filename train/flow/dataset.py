@@ -1,12 +1,12 @@
 """Numbers, texts and images of a LeRobot v3 data set, as a flow policy learns from them.
 
-Features are found by the data set's own description, ``meta/info.json``. Numbers of all frames are in memory; images
-are decoded once, resized, and kept in files (`frames`).
+Features are found by the data set's own description, ``meta/info.json``. Numbers of all frames are in memory; `frames`
+decodes the images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from concent_warp.errors import RecordingError, TrainError
 from concent_warp.recording.logs.readers.lerobot import BOOKKEEPING, NUMBERS, SUCCESS, LeRobotLog
 from concent_warp.recording.logs.readers.log import Episode
 from concent_warp.train.flow.cfg import FlowDataCfg
-from concent_warp.train.flow.frames import FrameFiles, decode_episodes
 
 IMAGES = "observation.images."
 """Begins the names of features of images."""
@@ -64,8 +63,13 @@ class FlowDataset:
     """Instruction of each frame, a row of `features.tasks`, shape (T,) int64."""
     start: np.ndarray
     """First frame of each episode, shape (E + 1,) int64, the last entry being T."""
-    frames: FrameFiles
-    """Images."""
+    images: tuple[str, ...]
+    """Features of the images, in the order of the cameras."""
+
+    @property
+    def lengths(self) -> list[int]:
+        """Frames of each episode."""
+        return np.diff(self.start).tolist()
 
     def last(self) -> np.ndarray:
         """Return the last frame of the episode of each frame, shape (T,) int64."""
@@ -87,29 +91,18 @@ class FlowDataset:
         return np.concatenate(training), np.concatenate(validation or [np.zeros(0, dtype=np.int64)])
 
 
-def read_dataset(
-    source: Path,
-    cfg: FlowDataCfg,
-    edge: int,
-    folder: Path,
-    *,
-    progress: Callable[[float], None] | None = None,
-) -> FlowDataset:
-    """Read a data set, with its images in files of a folder, where those of an interrupted call are gone on with.
+def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
+    """Return numbers and texts of a data set.
 
     Args:
-        source: Folder of the data set.
+        log: The data set.
         cfg: Which features.
-        edge: Height and width to which images are resized [px].
-        folder: Run folder; the images go to a folder in it.
-        progress: Called with the share of the frames that is decoded, 0..1.
 
     Raises:
-        TrainError: It lacks features, or numbers that are not finite are in them.
-        RecordingError: It is no LeRobot v3 data set, or something of it is missing or cannot be decoded.
+        TrainError: It lacks features or has no episodes, or a number is not finite.
+        RecordingError: A table is missing or cannot be read.
     """
-    log = open_dataset(source)
-    chosen = _chosen_features(log, cfg)
+    source, chosen = log.source, _chosen_features(log, cfg)
     numbers = log.numbers
     if not numbers:
         raise TrainError("the data set has no episodes", where=source)
@@ -130,14 +123,13 @@ def read_dataset(
     assert names is not None
     texts = tuple(dict.fromkeys(tasks))
     cameras = tuple(name.removeprefix(IMAGES) for name in chosen.cameras)
-    frames = decode_episodes(log, chosen.cameras, edge, lengths, folder, progress=progress)
     return FlowDataset(
         FlowFeatures(cameras, *names, log.rate, texts),
         np.concatenate([state for state, _ in tables]),
         np.concatenate([action for _, action in tables]),
         np.repeat([texts.index(task) for task in tasks], lengths),
         np.concatenate([[0], np.cumsum(lengths)]),
-        frames,
+        chosen.cameras,
     )
 
 

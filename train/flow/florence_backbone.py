@@ -97,7 +97,9 @@ class FlorenceBackbone(nn.Module):
         backbone.vision.load_state_dict(model.vision_tower.state_dict())
         backbone.projection.load_state_dict(model.multi_modal_projector.state_dict())
         backbone.embedding.load_state_dict(model.language_model.shared.state_dict())
-        kept = {n: v for n, v in model.language_model.encoder.state_dict().items() if n in backbone.encoder.state_dict()}
+        kept = {
+            n: v for n, v in model.language_model.encoder.state_dict().items() if n in backbone.encoder.state_dict()
+        }
         backbone.encoder.load_state_dict(kept)
         return backbone
 
@@ -115,9 +117,7 @@ class FlorenceBackbone(nn.Module):
         mask = torch.tensor([[k < len(row) for k in range(length)] for row in encoded])
         return ids, mask
 
-    def forward(
-        self, images: torch.Tensor, ids: torch.Tensor, mask: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, images: torch.Tensor, ids: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (N, L', W), and which of them there are, shape (N, L') bool.
 
         Args:
@@ -149,7 +149,9 @@ def _described(folder: Path) -> tuple[dict[str, Any], str]:
     settings = read_json(folder / "config.json", TrainError)
     kind = settings.get("model_type") if isinstance(settings, dict) else type(settings).__name__
     if kind != KIND:
-        fix = "microsoft's own files are of another format: take florence-community's" if kind == "florence2_vl" else None
+        fix = (
+            "microsoft's own files are of another format: take florence-community's" if kind == "florence2_vl" else None
+        )
         raise TrainError("the weights are of another model", where=folder, expected=KIND, found=kind, fix=fix)
     return json.loads(json.dumps(settings)), (folder / "tokenizer.json").read_text()
 

@@ -26,6 +26,7 @@ from concent_warp.limits import limits, raising
 from concent_warp.run_folder import TRAIN_CHECKPOINT, plain
 from concent_warp.train.flow.cfg import FlowAugmentCfg, TrainFlowCfg
 from concent_warp.train.flow.dataset import FlowDataset
+from concent_warp.train.flow.frames import FrameFiles
 from concent_warp.train.flow.network import FlowPolicyNetwork
 from concent_warp.train.learning.metrics import Point, curve
 
@@ -91,11 +92,9 @@ class FlowTraining:
         )
         if folder is not None:
             self._check_size()
-        self._state, self._action = (
-            torch.from_numpy(values).to(self.device) for values in (data.state, data.action)
-        )
+        self._state, self._action = (torch.from_numpy(values).to(self.device) for values in (data.state, data.action))
         self._task, self._last = (torch.from_numpy(v).to(self.device) for v in (data.task, data.last()))
-        self._images = self._stored_images()
+        self._images: torch.Tensor | list[np.ndarray] = []
 
     def learn(self, report: Callable[[FlowStep], None] | None = None) -> None:
         """Train until all steps are done; a checkpoint is left when interrupted.
@@ -220,19 +219,19 @@ class FlowTraining:
         order, back = np.unique(rows.numpy(), return_inverse=True)  # the disk is read in order
         return torch.from_numpy(np.stack([array[order][back] for array in self._images], axis=1))
 
-    def _stored_images(self) -> torch.Tensor | list[np.ndarray]:
-        """Return the images of the cameras on the GPU where there is room, shape (K, T, S, S, 3), else on the disk."""
-        arrays = self.data.frames.arrays()
+    def open_images(self, frames: FrameFiles) -> None:
+        """Take the images to learn from: to the GPU where there is room, else from the disk as they are needed."""
+        self._images = arrays = frames.arrays()
         if self.device.type != "cuda":
-            return arrays
+            return
         free, _ = torch.cuda.mem_get_info(self.device)
-        if self.data.frames.bytes > self.cfg.device_share * free:
-            return arrays
+        if frames.bytes > self.cfg.device_share * free:
+            return
         found = torch.empty((len(arrays), *arrays[0].shape), dtype=torch.uint8, device=self.device)
         for camera, array in enumerate(arrays):
             for first in range(0, len(array), BLOCK):
                 found[camera, first : first + BLOCK] = torch.from_numpy(array[first : first + BLOCK].copy())
-        return found
+        self._images = found
 
     def _half(self) -> torch.autocast:
         """Return the context of bfloat16, without effect on a CPU."""
@@ -240,7 +239,12 @@ class FlowTraining:
 
     def _point(self, loss: float) -> Point:
         """Return the metrics of this step."""
-        point = {"steps": self.done, "seconds": self.seconds, "loss": loss, "learning rate": self.cfg.peak * self.rate()}
+        point = {
+            "steps": self.done,
+            "seconds": self.seconds,
+            "loss": loss,
+            "learning rate": self.cfg.peak * self.rate(),
+        }
         return point if self.validation is None else {**point, "validation loss": self.validation}
 
     @contextmanager
@@ -289,7 +293,9 @@ class FlowTraining:
             fix = "give the same data set, or start anew with --overwrite"
             raise TrainError("this training was begun with another data set", where=self.folder, fix=fix)
         for name, module in (("network", self.network), ("mean", self.mean)):
-            check_state(state[name], module.state_dict(), "the checkpoint's network", where=self.folder, error=TrainError)
+            check_state(
+                state[name], module.state_dict(), "the checkpoint's network", where=self.folder, error=TrainError
+            )
             module.load_state_dict(state[name])
         try:
             self.optimiser.load_state_dict(state["optimiser"])

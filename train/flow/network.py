@@ -56,9 +56,7 @@ class FlowPolicyNetwork(nn.Module):
         self.project = nn.Sequential(nn.Linear(self.backbone.width, cfg.width), nn.RMSNorm(cfg.width))
         self.state = nn.Sequential(nn.Linear(states, cfg.width), nn.SiLU(), nn.Linear(cfg.width, cfg.width))
         self.no_state = nn.Parameter(torch.zeros(cfg.width))
-        self.transformer = FlowTransformer(
-            actions, cfg.chunk, cfg.width, cfg.layers, cfg.heads, causal=cfg.causal
-        )
+        self.transformer = FlowTransformer(actions, cfg.chunk, cfg.width, cfg.layers, cfg.heads, causal=cfg.causal)
         for name, size in (("state", states), ("action", actions)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))

@@ -138,7 +138,9 @@ class FlowPolicy:
             TrainError: An input is missing or has another shape or type.
         """
         if missing := [name for name in self.features.cameras if name not in images]:
-            raise TrainError(f"there are no images of {missing[0]!r}", expected=list(self.features.cameras), found=list(images))
+            raise TrainError(
+                f"there are no images of {missing[0]!r}", expected=list(self.features.cameras), found=list(images)
+            )
         shape, width = tuple(np.shape(proprioception)), len(self.features.state)
         if len(shape) != 2 or shape[1] != width:
             raise TrainError("the proprioception has another shape", expected=f"(N, {width})", found=shape)

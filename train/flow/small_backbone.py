@@ -115,9 +115,7 @@ class SmallBackbone(nn.Module):
             mask[row, : 1 + len(data)] = True
         return ids, mask
 
-    def forward(
-        self, images: torch.Tensor, ids: torch.Tensor, mask: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, images: torch.Tensor, ids: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return tokens (N, L', W), and which of them there are, shape (N, L') bool.
 
         Args:

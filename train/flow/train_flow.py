@@ -11,11 +11,10 @@ from tempfile import TemporaryDirectory
 import torch
 
 from concent_warp.checks import check_device
-from concent_warp.errors import TrainError
 from concent_warp.run_folder import SETTINGS, TRAIN_CHECKPOINT, check_unchanged, plain, run_folder, write_settings
 from concent_warp.train.flow.cfg import TrainFlowCfg, check_train_cfg
-from concent_warp.train.flow.dataset import check_features, read_dataset
-from concent_warp.train.flow.frames import remove_frames
+from concent_warp.train.flow.dataset import check_features, open_dataset, read_dataset
+from concent_warp.train.flow.frames import decode_episodes, remove_frames
 from concent_warp.train.flow.learning import FlowStep, FlowTraining
 from concent_warp.train.flow.policy import POLICY, FlowPolicy, policy_of, write_policy
 
@@ -100,7 +99,13 @@ def train_flow(
 
 
 def _trained(
-    source: Path, cfg: TrainFlowCfg, place: Path, device: str, report: Callable[[FlowProgress], None], *, folder: Path | None
+    source: Path,
+    cfg: TrainFlowCfg,
+    place: Path,
+    device: str,
+    report: Callable[[FlowProgress], None],
+    *,
+    folder: Path | None,
 ) -> FlowPolicy:
     """Train, and return the policy.
 
@@ -112,12 +117,17 @@ def _trained(
         report: Told about the progress.
         folder: Run folder, where a checkpoint is gone on with if there is one; None for none.
     """
-    data = read_dataset(
-        source, cfg.data, cfg.policy.edge, place, progress=lambda share: report(FlowProgress("reading images", share))
-    )
+    log = open_dataset(source)
+    data = read_dataset(log, cfg.data)
     training = FlowTraining(data, cfg, folder, device=device)
     if folder is not None and (folder / TRAIN_CHECKPOINT).exists():
         training.resume()
+
+    def reading(share: float) -> None:
+        report(FlowProgress("reading images", share))
+
+    frames = decode_episodes(log, data.images, cfg.policy.edge, data.lengths, place, progress=reading)
+    training.open_images(frames)
     training.learn(lambda step: report(FlowProgress("training", step.done / step.steps, step)))
     network = training.mean.module
     if folder is not None:

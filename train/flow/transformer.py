@@ -117,11 +117,11 @@ class FlowBlock(nn.Module):
         """Return tokens (N, T, W) of tokens (N, T, W); `modulation` has shape (N, 9, W)."""
         scale, shift, gate = (modulation[:, k::3, None] for k in range(3))
         normed = self.norm(x) * (1 + scale[:, 0]) + shift[:, 0]
-        x = x + (1 + gate[:, 0]) * self.attention(normed, normed, causal=causal, rotation=rotation)
+        x = x + gate[:, 0] * self.attention(normed, normed, causal=causal, rotation=rotation)
         normed = self.norm(x) * (1 + scale[:, 1]) + shift[:, 1]
-        x = x + (1 + gate[:, 1]) * self.cross(normed, context, mask=mask)
+        x = x + gate[:, 1] * self.cross(normed, context, mask=mask)
         normed = self.norm(x) * (1 + scale[:, 2]) + shift[:, 2]
-        return x + (1 + gate[:, 2]) * self.feed(normed)
+        return x + gate[:, 2] * self.feed(normed)
 
 
 class FlowTransformer(nn.Module):
@@ -169,7 +169,7 @@ def time_waves(time: torch.Tensor) -> torch.Tensor:
 
 
 def rotations(count: int, channels: int) -> torch.Tensor:
-    """Return cosines and sines by which pairs of channels are rotated at positions 0, 1, ..., shape (2, count, pairs)."""
+    """Return cosines and sines of the rotations of pairs of channels at positions from 0, shape (2, count, pairs)."""
     frequency = ROTARY_BASE ** (-torch.arange(0, channels, 2) / channels)
     angle = torch.arange(count)[:, None] * frequency
     return torch.stack([angle.cos(), angle.sin()])
