@@ -18,7 +18,7 @@ from concent_warp.version import __version__
 _HOMES = {
     "comparison.compare": ("CompareCfg", "compare"),
     "comparison.result": ("Comparison",),
-    "deploy.cfg": ("EvaluateCfg", "PlayCfg", "RenderCfg"),
+    "deploy.cfg": ("EvaluateCfg", "HandoverCfg", "PlayCfg", "RenderCfg"),
     "deploy.evaluate": ("evaluate",),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
@@ -97,7 +97,7 @@ __all__ = ["__version__", *sorted(_MODULE_OF)]  # pyright: ignore[reportUnsuppor
 if TYPE_CHECKING:
     from concent_warp.comparison.compare import CompareCfg, compare
     from concent_warp.comparison.result import Comparison
-    from concent_warp.deploy.cfg import EvaluateCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.cfg import EvaluateCfg, HandoverCfg, PlayCfg, RenderCfg
     from concent_warp.deploy.evaluate import evaluate
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render

@@ -9,9 +9,10 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.errors import TrainError
-from concent_warp.run_folder import check_training
+from concent_warp.run_folder import TRAIN_SETTINGS, check_training
 
 if TYPE_CHECKING:
+    from concent_warp.train.flow.policy import FlowPolicy
     from concent_warp.train.policy.load import Policy
 
 DEFAULT = "shape_sorter"
@@ -74,3 +75,42 @@ def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:
     from concent_warp.train.policy.pretrained import pretrained_checkpoint
 
     return Policy.load(pretrained_checkpoint(pretrained) if pretrained is not None else checkpoint or Path())
+
+
+def check_driver(folder: Path) -> None:
+    """Check that a folder holds a policy that can drive, before torch is imported.
+
+    Raises:
+        TrainError: It holds neither the run of concent train nor that of concent train-flow.
+    """
+    if not folder.exists():
+        expected = "a run folder of concent train or concent train-flow"
+        raise TrainError("no such policy", where=folder, expected=expected)
+    if _is_of_train(folder):
+        check_training(folder)
+
+
+def given_driver(folder: Path, device: str | None) -> Policy | FlowPolicy:
+    """Return the policy of a folder: one that observes the state, or a flow policy, which sees.
+
+    Args:
+        folder: Run folder, or a file in one.
+        device: Torch's name of the device of a flow policy; the first CUDA device by default where there is one.
+
+    Raises:
+        TrainError: There is no policy.
+    """
+    check_driver(folder)
+    quiet_warp()
+    if _is_of_train(folder):
+        return given_policy(folder, None)
+    import torch
+
+    from concent_warp.train.flow.policy import FlowPolicy
+
+    return FlowPolicy.load(folder, device=device or ("cuda:0" if torch.cuda.is_available() else "cpu"))
+
+
+def _is_of_train(folder: Path) -> bool:
+    """Return whether a run folder, or that of a file, is one of concent train."""
+    return ((folder if folder.is_dir() else folder.parent) / TRAIN_SETTINGS).is_file()

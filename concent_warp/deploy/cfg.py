@@ -95,6 +95,23 @@ class PlayCfg(RealityWorldCfg):
 
 
 @dataclass(frozen=True)
+class HandoverCfg:
+    """When a policy hands over to the one whose episodes are rendered, and what of it goes into the data set.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.RenderCfg(handover=cw.HandoverCfg(time=(0.5, 2.0))).handover.frames
+        'teacher'
+    """
+
+    time: Annotated[tuple[float, float], Bounds(0, 3600, ascending=True)] = (0.0, 1.5)
+    """Least and largest time for which the first policy drives [s], uniform; episodes last as much longer."""
+    frames: Literal["teacher", "all"] = "teacher"
+    """Frames that go into the data set: those from the hand-over on, or all. What the first policy did is no example
+    to follow."""
+
+
+@dataclass(frozen=True)
 class RenderCfg:
     """Settings of rendering.
 
@@ -140,6 +157,8 @@ class RenderCfg:
     """Seed of initial states, lights and noise."""
     lights: ShadowCfg = field(default_factory=ShadowCfg)
     """Settings of the lights."""
+    handover: HandoverCfg = field(default_factory=HandoverCfg)
+    """Settings of the hand-over from another policy, where one is given."""
 
 
 def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0) -> None:
