@@ -69,7 +69,7 @@ def paint_patterns_kernel(
         turn = wp.quat(q[1], q[2], q[3], q[0])
         local = wp.quat_rotate_inv(turn, point - body_position[world, body])
         pattern = geom % contrast.shape[1]
-        level = float(0.0)
+        level = float(0.0)  # noqa: UP018  (a constant cannot change in a loop)
         for k in range(wp.static(WAVES)):
             wave = waves[world, pattern, k]
             level += wp.sin(wave[0] * local[0] + wave[1] * local[1] + wave[2] * local[2] + wave[3])

@@ -122,7 +122,7 @@ class StudentNetworkCfg:
 
 @dataclass(frozen=True)
 class DaggerCfg:
-    """DAgger (Ross et al., AISTATS 2011) with a share of teacher-driven episodes that falls from `beta` to `beta_end`."""
+    """DAgger (Ross et al., AISTATS 2011); the share of episodes that the teacher drives falls to `beta_end`."""
 
     iterations: Count = 1000
     """Iterations of collecting samples and updating the student."""

@@ -1,4 +1,4 @@
-"""The samples that a student learns from: the latest ones, in a ring on the device, and in a file between checkpoints."""
+"""The samples that a student learns from: the latest ones, in a ring on the device; in a file between checkpoints."""
 
 from __future__ import annotations
 
