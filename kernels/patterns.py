@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-WAVES = 3
+WAVES = 4
 """Sine waves of a pattern."""
 
 wp.set_module_options({"enable_backward": False})

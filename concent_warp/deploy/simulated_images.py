@@ -34,7 +34,7 @@ PATTERNS = 8
 """Patterns of a world, among which its geoms are divided."""
 VARIED = ("geom_rgba", "cam_pos", "cam_quat", "light_pos", "light_dir", "light_diffuse", "light_ambient")
 """Fields of the model that differ between worlds."""
-HEADLIGHT = {"ambient": [0.15] * 3, "diffuse": [0.2] * 3, "specular": [0.1] * 3}
+HEADLIGHT = {"ambient": [0.1] * 3, "diffuse": [0.15] * 3, "specular": [0.1] * 3}
 """Light from the camera itself, the same in all worlds."""
 
 
@@ -155,9 +155,9 @@ class RandomisedImages:
         low, high = self._looks.pattern_length
         direction = torch.randn(*shape, 3, device=self._device)
         direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True).clamp(min=1e-6)
-        # The waves of a pattern have lengths of one size.
+        # The waves of a pattern have lengths of about one size.
         length = low * (high / low) ** self._uniform((0.0, 1.0), *shape[:2], 1, 1)
-        length = length * self._uniform((0.7, 1.4), *shape, 1)
+        length = length * self._uniform((0.5, 2.0), *shape, 1)
         return torch.cat([2 * np.pi / length * direction, 2 * np.pi * self._uniform((0.0, 1.0), *shape, 1)], dim=-1)
 
     def _uniform(self, bounds: tuple[float, float], *shape: int) -> torch.Tensor:

@@ -61,7 +61,7 @@ class LooksCfg:
     """Largest change of a geom's red, green and blue [-], uniform."""
     hue_share: Share = 0.15
     """Share of geoms whose colour is replaced by a random one."""
-    pattern: Share = 0.3
+    pattern: Share = 0.8
     """Largest contrast of random patterns on surfaces [-]."""
     pattern_length: PositiveInterval = (0.004, 0.3)
     """Range of the wavelengths of the patterns, log-uniform [m]."""
@@ -75,7 +75,7 @@ class LooksCfg:
     """Range of the light of a lamp [-]."""
     light_tint: Share = 0.2
     """Largest relative change of red, green and blue of a lamp [-]."""
-    ambient: Interval = (0.0, 0.15)
+    ambient: Interval = (0.0, 0.1)
     """Range of the light of a lamp that comes from all sides [-]."""
     camera_position: Duration = 0.005
     """Largest displacement of a camera per axis [m]."""
@@ -89,7 +89,7 @@ class AugmentCfg:
 
     shift: Annotated[int, Bounds(0, 64)] = 2
     """Largest shift of an image along each axis [px]."""
-    brightness: Share = 0.25
+    brightness: Share = 0.35
     """Largest relative change of the brightness [-]."""
     contrast: Share = 0.25
     """Largest relative change of the contrast [-]."""

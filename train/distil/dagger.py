@@ -74,9 +74,11 @@ class Dagger:
         self.network = make_network(cfg, self._proprioception, environment.num_actions).to(self.device)
         if self.device.startswith("cuda"):
             self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+            self.network.use_half(cfg.dagger.half)
         self._optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=cfg.dagger.learning_rate, weight_decay=cfg.dagger.decay
-        )
+            self.network.parameters(), lr=cfg.dagger.learning_rate, weight_decay=cfg.dagger.decay,
+            fused=self.device.startswith("cuda"),
+        )  # fmt: skip
         n, d = environment.num_envs, cfg.dagger
         size, channels = cfg.images.size, 3 * cfg.images.frames
         self.samples = Samples(
@@ -184,8 +186,7 @@ class Dagger:
         self._taught = torch.where(started, taught, self._taught)
         action = label
         if beta < 1 or not bool(self._taught.all()):
-            with self._autocast():
-                action = self.network(seen.float() / 255, own).float()
+            action = self.network(seen.float() / 255, own)
             action = torch.where(self._taught[:, None], label, action)
         environment.step(action)
         done = environment.done
@@ -232,15 +233,9 @@ class Dagger:
             label: The teacher's actions, shape (N, A).
             poses: Scaled poses of the objects, shape (N, 9 objects).
         """
-        with self._autocast():
-            action, predicted = self.network.both(images, own)
-        first = functional.smooth_l1_loss(action.float(), label, beta=HUBER)
-        return torch.stack([first, functional.smooth_l1_loss(predicted.float(), poses)])
-
-    def _autocast(self) -> torch.autocast:
-        """Return the context in which the network computes."""
-        cuda = self.device.startswith("cuda")
-        return torch.autocast("cuda" if cuda else "cpu", torch.bfloat16, enabled=cuda and self.cfg.dagger.half)
+        action, predicted = self.network.both(images, own)
+        first = functional.smooth_l1_loss(action, label, beta=HUBER)
+        return torch.stack([first, functional.smooth_l1_loss(predicted, poses)])
 
     def _rate(self) -> float:
         """Return the learning rate of the next gradient step."""

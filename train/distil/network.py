@@ -34,16 +34,22 @@ class CameraEncoder(nn.Module):
         self.layers = nn.Sequential(*layers)
         line = torch.linspace(-1, 1, (size + 1) // 2)
         v, u = torch.meshgrid(line, line, indexing="ij")
-        self.register_buffer("grid", torch.stack([u.reshape(-1), v.reshape(-1)], dim=1), persistent=False)
-        self.sharpness = nn.Parameter(torch.ones(()))
+        self.register_buffer("across", u.reshape(-1), persistent=False)
+        self.register_buffer("down", v.reshape(-1), persistent=False)
+        self.half = False
+        """Whether convolutions compute in bfloat16; places in the image need more digits."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return the features of images in -1..1."""
-        scores = self.layers(images).flatten(2).float()
-        share = torch.softmax(scores * self.sharpness, dim=2)
-        places = torch.matmul(share, self.get_buffer("grid"))
-        strength = (share * scores).sum(dim=2)
-        return torch.cat([places.flatten(1), torch.tanh(strength / 10)], dim=1)
+        if self.half:
+            with torch.autocast("cuda", torch.bfloat16):
+                scores = self.layers(images)
+        else:
+            scores = self.layers(images)
+        scores = scores.flatten(2).float()
+        share = torch.softmax(scores, dim=2)
+        u, v = ((share * self.get_buffer(name)).sum(dim=2) for name in ("across", "down"))
+        return torch.cat([u, v, torch.tanh((share * scores).sum(dim=2) / 10)], dim=1)
 
 
 class StudentNetwork(nn.Module):
@@ -78,6 +84,11 @@ class StudentNetwork(nn.Module):
         self.action = nn.Linear(before, actions)
         self.poses = nn.Linear(before, 9 * objects)
 
+    def use_half(self, half: bool) -> None:
+        """Compute the convolutions in bfloat16, or not."""
+        for encoder in self.encoders:
+            encoder.half = half  # pyright: ignore[reportAttributeAccessIssue]
+
     def forward(self, images: torch.Tensor, proprioception: torch.Tensor) -> torch.Tensor:
         """Return actions, shape (N, A); see `both`."""
         return self.both(images, proprioception)[0]
@@ -92,7 +103,7 @@ class StudentNetwork(nn.Module):
         seen = torch.zeros_like(images) if self.blind else 2 * images - 1
         features = [encoder(seen[:, c]) for c, encoder in enumerate(self.encoders)]
         own = ((proprioception - self.get_buffer("mean")) / self.get_buffer("std")).clamp(-10, 10)
-        trunk = self.trunk(torch.cat([*features, own], dim=1)).float()
+        trunk = self.trunk(torch.cat([*features, own], dim=1))
         return torch.tanh(self.action(trunk)), self.poses(trunk)
 
 
