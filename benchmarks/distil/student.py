@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -111,7 +112,7 @@ class Benchmark:
                     continue
             for world in WORLDS:
                 if self.kept.wanted(f"{key} {world}"):
-                    self._attempt(f"{key} {world}", lambda p=policy, w=world: self._trial(p, w), teacher, variant, seed)
+                    self._attempt(f"{key} {world}", partial(self._trial, policy, world), teacher, variant, seed)
         self.kept.close()
 
     def _distilled(self, teacher: Policy, variant: str, seed: int, key: str) -> cw.Student | None:

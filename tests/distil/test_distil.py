@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.distil.conftest import TINY
 
 import concent_warp as cw
 from concent_warp.cli import main
@@ -15,6 +15,7 @@ from concent_warp.errors import ConcentError, TrainError
 from concent_warp.train.distil.dagger import Dagger
 from concent_warp.train.distil.run import Distillation
 from concent_warp.train.learning.metrics import read_curve
+from tests.distil.conftest import TINY
 
 
 def trainer(teacher: cw.Policy, cfg: cw.DistilCfg) -> Dagger:
@@ -96,7 +97,7 @@ def test_images_of_the_worlds_reach_the_action(student):
     environment.start_from([0, 1])
     source = simulated_images(environment, student.cfg.images, student.cfg.looks)
     observation = environment.get_observations()
-    actions = []
+    actions: list[torch.Tensor] = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)  # of the looks
         actions.append(student.act_in(environment, source)(observation))
@@ -120,7 +121,7 @@ def test_the_controller_acts_as_the_exported_student(student, tmp_path):
     images = rng.integers(0, 255, (3, *controller.images), dtype=np.uint8)
     own = rng.normal(size=(3, controller.proprioception.size)).astype(np.float32)
     expected = controller.act(images, own)
-    found = ReferenceEvaluator(str(tmp_path / "student.onnx")).run(None, {"images": images, "proprioception": own})
+    found: Any = ReferenceEvaluator(str(tmp_path / "student.onnx")).run(None, {"images": images, "proprioception": own})
     assert np.allclose(found[0], expected, atol=1e-5)
     assert described["images"]["shape"] == list(controller.images)
     assert sum(part["size"] for part in described["observation"]["parts"]) == controller.proprioception.size
@@ -166,7 +167,7 @@ def test_the_commands_train_and_try_a_blind_student(tmp_path, capsys):
 )
 def test_wrong_inputs_give_a_sentence(words, said, folder, tmp_path, capsys):
     out = tmp_path / "out"
-    given = [{"OUT": str(out), "STUDENT": str(folder)}.get(word, word) for word in words.split()]
+    given = words.replace("OUT", str(out)).replace("STUDENT", str(folder)).split()
     assert main(given) == 2
     error = capsys.readouterr().err
     assert said in error

@@ -74,7 +74,7 @@ class Dagger:
         self.network = make_network(cfg, self._proprioception, environment.num_actions).to(self.device)
         if self.device.startswith("cuda"):
             self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-            self.network.use_half(cfg.dagger.half)
+            self.network.reduce_precision(cfg.dagger.half)
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=cfg.dagger.learning_rate, weight_decay=cfg.dagger.decay,
             fused=self.device.startswith("cuda"),

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
 
+from concent_warp.train.distil.cfg import DistilCfg
 from concent_warp.train.distil.network import StudentNetwork
 from concent_warp.train.distil.proprioception import OWN, Proprioception
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.policy.export import check_suffix, describe, write_module
-
-if TYPE_CHECKING:
-    from concent_warp.train.distil.student import Student
+from concent_warp.train.run import TrainingRun
 
 FORMAT = "concent-student"
 IMAGES, PROPRIOCEPTION = "images", "proprioception"
@@ -32,19 +32,23 @@ class _FromBytes(nn.Module):
         return self.network(images.float() / 255, proprioception)
 
 
-def export_student(student: Student, out: Path) -> dict[str, Any]:
+def export_student(
+    run: TrainingRun, cfg: DistilCfg, network: StudentNetwork, weights: Mapping[str, Any], out: Path
+) -> dict[str, Any]:
     """Write a student, and return its metadata.
 
     Args:
-        student: The student.
+        run: Inputs of the teacher's training.
+        cfg: Settings of the distillation.
+        network: The student's network.
+        weights: Checkpoint of the student, of which iterations and steps are read.
         out: File to write: ``.onnx`` for ONNX, ``.pt`` for TorchScript.
 
     Raises:
         TrainError: The file has another suffix.
     """
     check_suffix(out)
-    run, images = student.run, student.cfg.images
-    task = run.task()
+    task, images = run.task(), cfg.images
     proprioception = Proprioception(ObservationLayout.of(task, run.cfg.environment.observation))
     described = describe(run.cfg, task)
     seen = described["observation"]
@@ -53,7 +57,7 @@ def export_student(student: Student, out: Path) -> dict[str, Any]:
     for name in ("slots", "history"):
         del seen[name]
     shape = [len(images.cameras), 3 * images.frames, images.size, images.size]
-    described |= {"format": FORMAT, "iterations": student.weights["iteration"], "steps": student.weights["steps"]}
+    described |= {"format": FORMAT, "iterations": weights["iteration"], "steps": weights["steps"]}
     described["moving on"] = None
     described[IMAGES] = {
         "input": IMAGES,
@@ -67,5 +71,5 @@ def export_student(student: Student, out: Path) -> dict[str, Any]:
         IMAGES: torch.zeros(2, *shape, dtype=torch.uint8),
         PROPRIOCEPTION: torch.zeros(2, proprioception.size),
     }
-    write_module(_FromBytes(student.network(proprioception, task.robot.actions)).eval(), example, described, out)
+    write_module(_FromBytes(network).eval(), example, described, out)
     return described

@@ -36,12 +36,12 @@ class CameraEncoder(nn.Module):
         v, u = torch.meshgrid(line, line, indexing="ij")
         self.register_buffer("across", u.reshape(-1), persistent=False)
         self.register_buffer("down", v.reshape(-1), persistent=False)
-        self.half = False
+        self.reduced_precision = False
         """Whether convolutions compute in bfloat16; places in the image need more digits."""
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Return the features of images in -1..1."""
-        if self.half:
+        if self.reduced_precision:
             with torch.autocast("cuda", torch.bfloat16):
                 scores = self.layers(images)
         else:
@@ -84,10 +84,11 @@ class StudentNetwork(nn.Module):
         self.action = nn.Linear(before, actions)
         self.poses = nn.Linear(before, 9 * objects)
 
-    def use_half(self, half: bool) -> None:
+    def reduce_precision(self, reduced: bool) -> None:
         """Compute the convolutions in bfloat16, or not."""
         for encoder in self.encoders:
-            encoder.half = half  # pyright: ignore[reportAttributeAccessIssue]
+            assert isinstance(encoder, CameraEncoder)
+            encoder.reduced_precision = reduced
 
     def forward(self, images: torch.Tensor, proprioception: torch.Tensor) -> torch.Tensor:
         """Return actions, shape (N, A); see `both`."""

@@ -77,24 +77,23 @@ class Student:
         """Whether the policy comes with the package."""
         return False
 
-    def network(self, proprioception: Proprioception, actions: int) -> StudentNetwork:
-        """Return the network with its weights, on the CPU.
+    def network(self) -> tuple[StudentNetwork, Proprioception]:
+        """Return the network with its weights, on the CPU, and what the robot knows of itself.
 
         Raises:
             TrainError: The weights are of another network.
         """
-        network = make_network(self.cfg, proprioception, actions)
+        task = self.run.task()
+        proprioception = Proprioception(ObservationLayout.of(task, self.run.cfg.environment.observation))
+        network = make_network(self.cfg, proprioception, task.robot.actions)
         found = self.weights["student"]
         check_state(found, network.state_dict(), "the student's network", where=self.folder, error=TrainError)
         network.load_state_dict(found)
-        return network.eval()
+        return network.eval(), proprioception
 
     def controller(self, device: str = "cpu") -> StudentController:
         """Return what acts by arrays, without an environment, on a device by torch's name."""
-        task = self.run.task()
-        layout = ObservationLayout.of(task, self.run.cfg.environment.observation)
-        proprioception = Proprioception(layout)
-        network = self.network(proprioception, task.robot.actions)
+        network, proprioception = self.network()
         return StudentController(network.to(device), self.cfg, proprioception, device)
 
     def act_in(
@@ -107,8 +106,7 @@ class Student:
             images: Their cameras.
             delay: Least and largest delay of the images [control steps]; that of the settings by default.
         """
-        proprioception = Proprioception(environment.layout)
-        network = self.network(proprioception, environment.num_actions)
+        network, proprioception = self.network()
         line = DelayedImages(images, self.cfg.images.frames, self.cfg.images.delay if delay is None else delay)
 
         def act(observation: TensorDict) -> torch.Tensor:
@@ -134,7 +132,7 @@ class Student:
         """
         from concent_warp.train.distil.export import export_student
 
-        return export_student(self, Path(out))
+        return export_student(self.run, self.cfg, self.network()[0], self.weights, Path(out))
 
 
 class StudentController:
