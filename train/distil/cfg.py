@@ -30,7 +30,13 @@ DISTIL_SETTINGS = "distil.toml"
 
 @dataclass(frozen=True)
 class ImagesCfg:
-    """What the student sees."""
+    """What the student sees.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.ImagesCfg(cameras=("wrist",), size=96).delay
+        (0, 2)
+    """
 
     cameras: tuple[str, ...] = ("base", "wrist")
     """Cameras of the scene; "base" beside the objects and "wrist" on the hand are added where the scene has none."""
@@ -55,7 +61,13 @@ class ImagesCfg:
 
 @dataclass(frozen=True)
 class LooksCfg:
-    """Random appearance of the ray-traced scene; values are sampled for each world when an episode begins."""
+    """Random appearance of the ray-traced scene; values are sampled for each world when an episode begins.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.LooksCfg(camera_position=0.01).camera_angle
+        1.0
+    """
 
     colour: Share = 0.25
     """Largest change of a geom's red, green and blue [-], uniform."""
@@ -85,7 +97,13 @@ class LooksCfg:
 
 @dataclass(frozen=True)
 class AugmentCfg:
-    """Random changes of the images in training, of each camera and sample anew."""
+    """Random changes of the images in training, of each camera and sample anew.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.AugmentCfg(shift=4).shift
+        4
+    """
 
     shift: Annotated[int, Bounds(0, 64)] = 2
     """Largest shift of an image along each axis [px]."""
@@ -107,7 +125,13 @@ class AugmentCfg:
 
 @dataclass(frozen=True)
 class StudentNetworkCfg:
-    """The student's network: a convolutional network for each camera, and a multi-layer perceptron."""
+    """The student's network: a convolutional network for each camera, and a multi-layer perceptron.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.StudentNetworkCfg(blind=True).blind
+        True
+    """
 
     channels: tuple[Annotated[int, Bounds(8, 4096)], ...] = (32, 48, 48, 64)
     """Channels of the convolutions, multiples of 8; the first halves the resolution, those after the second look twice
@@ -122,7 +146,13 @@ class StudentNetworkCfg:
 
 @dataclass(frozen=True)
 class DaggerCfg:
-    """DAgger (Ross et al., AISTATS 2011); the share of episodes that the teacher drives falls to `beta_end`."""
+    """DAgger (Ross et al., AISTATS 2011); the share of episodes that the teacher drives falls to `beta_end`.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.DaggerCfg(beta=1.0, beta_end=1.0).beta_end  # cloning without DAgger
+        1.0
+    """
 
     iterations: Count = 1000
     """Iterations of collecting samples and updating the student."""
