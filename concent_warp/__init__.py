@@ -19,6 +19,7 @@ _HOMES = {
     "comparison.compare": ("CompareCfg", "compare"),
     "comparison.result": ("Comparison",),
     "deploy.cfg": ("EvaluateCfg", "HandoverCfg", "PlayCfg", "RenderCfg"),
+    "deploy.distil": ("distil",),
     "deploy.evaluate": ("evaluate",),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
@@ -78,6 +79,11 @@ _HOMES = {
     "simulate.engine": ("Rollout",),
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.distil.cfg": (
+        *("AugmentCfg", "DaggerCfg", "DistilCfg", "ImagesCfg"),
+        *("LooksCfg", "StudentNetworkCfg"),
+    ),
+    "train.distil.student": ("Student", "load_student"),
     "train.flow.cfg": (
         *("FlowAugmentCfg", "FlowDataCfg", "FlowPolicyCfg"),
         *("SmallBackboneCfg", "TrainFlowCfg"),
@@ -98,6 +104,7 @@ if TYPE_CHECKING:
     from concent_warp.comparison.compare import CompareCfg, compare
     from concent_warp.comparison.result import Comparison
     from concent_warp.deploy.cfg import EvaluateCfg, HandoverCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.distil import distil
     from concent_warp.deploy.evaluate import evaluate
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
@@ -171,6 +178,15 @@ if TYPE_CHECKING:
     from concent_warp.simulate.engine import Rollout
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.distil.cfg import (
+        AugmentCfg,
+        DaggerCfg,
+        DistilCfg,
+        ImagesCfg,
+        LooksCfg,
+        StudentNetworkCfg,
+    )
+    from concent_warp.train.distil.student import Student, load_student
     from concent_warp.train.flow.cfg import (
         FlowAugmentCfg,
         FlowDataCfg,

@@ -20,6 +20,7 @@ NEEDED = {
     "locate": "recording.h5",
     "add": "joint_friction --model model.toml --fit recording.h5 -o out.toml",
     "train": "recording.h5 --model model.toml --device cpu -o out",
+    "distil": "shape_sorter --device cpu -o out",
     "evaluate": "--pretrained --device cpu",
     "play": "--pretrained",
     "export": "--pretrained -o out.onnx",
@@ -72,6 +73,11 @@ WRONG = {
         "--worlds 1000000000", "--demonstration demo_9", "--events gone.json", "--begin-with gone", "--ppo.hidden 0",
         "--environment.action.gripper-actuators hand", "--environment.action.tool-site gone", "--iterations 0",
         "--environment.randomisation.mass 2 1", "--ppo.activation wish",
+    ),
+    "distil": (
+        "--device cuda:7", "--images.cameras ceiling", "--images.cameras base base", "--images.networks gone",
+        "--images.splats block", "--images.delay 2 1", "--network.channels 12", "--network.hidden", "--iterations 0",
+        "--worlds 1000000000", "--dagger.label guess", "--size 4",
     ),
     "evaluate": (
         "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",

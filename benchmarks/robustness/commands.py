@@ -28,6 +28,10 @@ NETWORKS = (
     "--network.size 16 --network.width 16 --network.factors 1 2 --flow.batch 8 --enlarge.batch 8 "
     "--super-resolution.width 16 --super-resolution.blocks 2 --crop 10 --device cpu"
 )
+DISTIL = (
+    "distil shape_sorter --states 4 --size 16 --images.samples 1 --worlds 2 --dagger.steps 2 --dagger.updates 2 "
+    "--dagger.batch 4 --network.channels 8 8 --network.hidden 16 --device cpu"
+)
 LIMIT = 600.0
 """Time after which a command counts as stuck [s]."""
 
@@ -90,6 +94,7 @@ WRITING = [
     Writing("locate", f"locate {SERVO} --png {{out}}/forces.png --html {{out}}/report.html"),
     Writing("add", f"add joint_friction --model {{inputs}}/{SERVO_MODEL} --fit {SERVO} --out {{out}}/m.toml"),
     Writing("train", f"{TRAIN} --iterations 4 --out {{out}}/run"),
+    Writing("distil", f"{DISTIL} --iterations 4 --out {{out}}/run"),
     Writing(
         "evaluate",
         f"evaluate --checkpoint {{inputs}}/{TRAINED} --world reality --episodes 2 --videos 2 --device cpu "

@@ -40,6 +40,7 @@ GROUPS = {
     },
     "from a model to a policy": {
         "train": "train a policy under the contact events of a demonstration",
+        "distil": "train a student that sees to act as a policy does",
         "evaluate": "count how often a policy succeeds, in simulation and Reality",
         "play": "show a policy live in the browser",
         "export": "write a policy as ONNX, or a recording as a LeRobot data set",
@@ -68,6 +69,7 @@ EXAMPLES = {
     "locate": "concent locate demo.h5 --model scene.xml --png forces.png",
     "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
     "train": "concent train demo.h5 --model model.toml -o runs/insert",
+    "distil": "concent distil runs/insert -o runs/student",
     "evaluate": "concent evaluate --checkpoint runs/insert --episodes 200",
     "play": "concent play --checkpoint runs/insert",
     "export": "concent export --checkpoint runs/insert -o policy.onnx",

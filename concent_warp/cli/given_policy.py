@@ -10,8 +10,10 @@ from tyro.constructors import PrimitiveConstructorSpec
 from concent_warp.cli.terminal import quiet_warp
 from concent_warp.errors import TrainError
 from concent_warp.run_folder import TRAIN_SETTINGS, check_training
+from concent_warp.train.distil.cfg import holds_student
 
 if TYPE_CHECKING:
+    from concent_warp.train.distil.student import Student
     from concent_warp.train.flow.policy import FlowPolicy
     from concent_warp.train.policy.load import Policy
 
@@ -52,11 +54,28 @@ def check_policy(checkpoint: Path | None, pretrained: str | None) -> None:
             found="neither" if checkpoint is None else "both",
         )
     if checkpoint is not None:
+        if holds_student(checkpoint):
+            fix = "name the run folder of a policy; students are for concent evaluate and concent export"
+            raise TrainError("this is a student, which acts by images", where=checkpoint, fix=fix)
         check_training(checkpoint)
     if pretrained is not None:
         from concent_warp.train.policy.pretrained import pretrained_checkpoint
 
         pretrained_checkpoint(pretrained)
+
+
+def given_policy_or_student(checkpoint: Path | None, pretrained: str | None) -> Policy | Student:
+    """Return the policy that was asked for, or the student where the run folder is one of `concent distil`.
+
+    Raises:
+        TrainError: Neither or both are given, or there is no such policy, student, folder or file.
+    """
+    if checkpoint is None or pretrained is not None or not holds_student(checkpoint):
+        return given_policy(checkpoint, pretrained)
+    quiet_warp()
+    from concent_warp.train.distil.student import Student
+
+    return Student.load(checkpoint)
 
 
 def given_policy(checkpoint: Path | None, pretrained: str | None) -> Policy:

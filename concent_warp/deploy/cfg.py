@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from concent_warp.checks import Bounds, Count, PositiveShare, Signed, Worlds, check_seed, check_settings
 from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
+from concent_warp.reality.sensors.live_cameras import LiveCamerasCfg
 from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.render.shadow_cfg import ShadowCfg
@@ -60,6 +61,8 @@ class EvaluateCfg(RealityWorldCfg):
     of the drives it bounds the force that the robot exerts."""
     videos: int = 0
     """Number of first episodes in Reality to record as MP4."""
+    cameras: LiveCamerasCfg = field(default_factory=LiveCamerasCfg)
+    """Reality's cameras, by which a student acts."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from concent_warp.checks import Bounds
-from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.given_policy import Pretrained, given_policy_or_student
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
@@ -29,7 +29,7 @@ class Arguments:
     """
 
     checkpoint: Path | None = None
-    """Run folder of a training, or its checkpoint file."""
+    """Run folder of a training or of a student that sees, or its checkpoint file."""
     pretrained: Pretrained = None
     """Run a policy that comes with the package, shape_sorter where no name is given."""
     world: Literal["simulation", "stress", "reality", "both", "all"] = "both"
@@ -60,7 +60,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     check_evaluation(cfg, worlds[-1], arguments.episodes)
     if arguments.out is not None:
         check_folder(arguments.out)
-    policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    policy = given_policy_or_student(arguments.checkpoint, arguments.pretrained)
     if arguments.out is not None and cfg.videos:
         make_folder(arguments.out)
     from concent_warp.deploy.evaluate import evaluate, without_reality
