@@ -85,10 +85,11 @@ _HOMES = {
     ),
     "train.distil.student": ("Student", "load_student"),
     "train.flow.cfg": (
-        *("FlowAugmentCfg", "FlowDataCfg", "FlowPolicyCfg"),
+        *("FlowDataCfg", "FlowPolicyCfg"),
         *("SmallBackboneCfg", "TrainFlowCfg"),
     ),
     "train.flow.policy": ("FlowPolicy", "load_flow_policy"),
+    "train.flow.task_policy": ("TaskFlowPolicy",),
     "train.flow.train_flow": ("FlowProgress", "train_flow"),
     "train.observation_cfg": ("SensorErrorsCfg",),
     "train.trials.evaluate": ("Evaluation",),
@@ -188,13 +189,13 @@ if TYPE_CHECKING:
     )
     from concent_warp.train.distil.student import Student, load_student
     from concent_warp.train.flow.cfg import (
-        FlowAugmentCfg,
         FlowDataCfg,
         FlowPolicyCfg,
         SmallBackboneCfg,
         TrainFlowCfg,
     )
     from concent_warp.train.flow.policy import FlowPolicy, load_flow_policy
+    from concent_warp.train.flow.task_policy import TaskFlowPolicy
     from concent_warp.train.flow.train_flow import FlowProgress, train_flow
     from concent_warp.train.observation_cfg import SensorErrorsCfg
     from concent_warp.train.policy.load import Policy, load_policy

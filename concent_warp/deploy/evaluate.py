@@ -18,9 +18,12 @@ from concent_warp.reality.hidden.in_task import TaskWorld
 from concent_warp.reality.sensors.live_cameras import LiveCamerasCfg
 from concent_warp.reality.sensors.video import render_video, write_video
 from concent_warp.run_folder import claim_file, make_folder
+from concent_warp.scene.cameras import BASE_FOVY
+from concent_warp.train.distil.cfg import ImagesCfg
 from concent_warp.train.distil.student import Student
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.flow.task_policy import TaskFlowPolicy
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.task.task import Task
@@ -29,7 +32,7 @@ from concent_warp.train.trials.evaluate import Evaluation, run_episodes
 
 
 def evaluate(
-    policy: Policy | Student,
+    policy: Policy | Student | TaskFlowPolicy,
     cfg: EvaluateCfg | None = None,
     *,
     world: TrialName = "reality",
@@ -43,10 +46,10 @@ def evaluate(
     """Return the outcomes of a policy's episodes from many initial states.
 
     A student acts by images: in simulation by those of the task's scene under random looks, in Reality by those of
-    Reality's own cameras.
+    Reality's own cameras. So does a flow policy, in simulation by images like those that `render` writes.
 
     Args:
-        policy: The policy, which observes the state, or a student, which sees.
+        policy: The policy, which observes the state, a student, which sees, or a flow policy in a task.
         cfg: Settings: Reality with its hidden effects, the scales of the robot's commands, videos.
         world: "simulation", the model that the policy was trained in; "stress", the same model under the worse
             conditions of `StressCfg`; or "reality": exact convex shapes, friction, masses and gains that nobody knows,
@@ -108,7 +111,7 @@ def evaluate(
 
 
 def _act_in(
-    policy: Policy | Student,
+    policy: Policy | Student | TaskFlowPolicy,
     environment: Environment,
     real: TaskWorld | None = None,
     cameras: LiveCamerasCfg | None = None,
@@ -120,14 +123,25 @@ def _act_in(
     if isinstance(policy, Policy):
         return policy.act_in(environment)
     from concent_warp.deploy.reality_images import RealityImages
-    from concent_warp.deploy.simulated_images import simulated_images
+    from concent_warp.deploy.simulated_images import HybridImages, simulated_images
     from concent_warp.simulate.warp_engine import preferred_device
 
+    where = preferred_device() if device is None else device
+    if isinstance(policy, TaskFlowPolicy):
+        features = policy.policy.features
+        images = ImagesCfg(features.cameras, base_fovy=BASE_FOVY, size=max(features.size))
+        if real is None:
+            source = HybridImages(environment, images)
+        else:
+            live = cameras or LiveCamerasCfg()
+            source = RealityImages(environment, real.spec(), images, live, seed=seed, device=where)
+        act = policy.act_in(environment, source)
+        torch.manual_seed(seed)
+        return act
     images = policy.cfg.images
     if real is None:
         act = policy.act_in(environment, simulated_images(environment, images, policy.cfg.looks))
     else:
-        where = preferred_device() if device is None else device
         source = RealityImages(environment, real.spec(), images, cameras or LiveCamerasCfg(), seed=seed, device=where)
         act = policy.act_in(environment, source, delay=(0, 0))
     torch.manual_seed(seed)

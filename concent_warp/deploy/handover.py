@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from concent_warp.deploy.cfg import HandoverCfg
+from concent_warp.render.filming import DatasetFilming
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.trials.episodes import PolicyFunction
 
@@ -62,3 +63,29 @@ class Handover:
     def has_taken_over(self, world: int) -> bool:
         """Return whether the teacher drives in a world."""
         return not self._driving[world]
+
+
+class FilmedImages:
+    """Images of a data set that is being filmed, for a policy in its worlds: an `ImageSource` of `train.distil`."""
+
+    def __init__(self, filming: DatasetFilming) -> None:
+        """Keep what films."""
+        self.cameras, self.size = filming.camera.cameras, filming.camera.size[0]
+        self._filming = filming
+
+    def begin(self, which: torch.Tensor) -> None:
+        """Do nothing: episodes begin with those of the data set."""
+        del which
+
+    def render(self, qpos: torch.Tensor, mocap: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        """Return the frame that was filmed last, uint8, shape (N, C, 3, size, size)."""
+        del qpos, mocap
+        return torch.from_numpy(self._filming.images).permute(0, 1, 4, 2, 3)
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return nothing: an episode that was interrupted is filmed anew."""
+        return {}
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
+        """Do nothing."""
+        del state

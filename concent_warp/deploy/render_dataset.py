@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
     from concent_warp.render.filming import DatasetFilming
+    from concent_warp.train.distil.student import Student
     from concent_warp.train.environment.environment import Environment
     from concent_warp.train.flow.policy import FlowPolicy
     from concent_warp.train.policy.load import Policy
@@ -68,7 +69,7 @@ def render(
     out: str | Path,
     cfg: RenderCfg | None = None,
     *,
-    driver: Policy | FlowPolicy | None = None,
+    driver: Policy | Student | FlowPolicy | None = None,
     format: Format = "lerobot",
     device: str | None = None,
     resume: bool = False,
@@ -85,7 +86,7 @@ def render(
         out: Folder of the data set.
         cfg: Settings.
         driver: Policy that acts at the beginning of each episode, for a random time, before it hands over to `source`;
-            its images are those of the data set. None for none.
+            a flow policy sees the images of the data set, a student its own. None for none.
         format: LeRobotDataset v3.0, or one HDF5 file in robomimic's layout.
         device: Warp's name of the device; the first CUDA device by default where there is one.
         resume: Continue an interrupted data set, or one with fewer episodes.
@@ -130,7 +131,7 @@ class Destination:
     format: Format
     device: str | None
     resume: bool
-    driver: Policy | FlowPolicy | None = None
+    driver: Policy | Student | FlowPolicy | None = None
 
 
 def _ignore(share: float) -> None:
@@ -174,7 +175,7 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     joints, layout = _addressed(model, camera, rate)
     writer = _dataset_writer(to, layout, model)
     filming = _new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
-    handover = None if to.driver is None else _handover(to.driver, environment, act, filming, to)
+    handover = None if to.driver is None else _handover(environment, policy, act, filming, to)
     act = act if handover is None else handover.act
     left = [row for row in range(cfg.episodes) if not writer.has(row)]
     physics, length = environment.physics, int(environment.max_episode_length)
@@ -236,23 +237,24 @@ def _film_recording(recording: Recording, to: Destination, progress: Callable[[f
 
 
 def _handover(
-    driver: Policy | FlowPolicy,
-    environment: Environment,
-    teacher: PolicyFunction,
-    filming: DatasetFilming,
-    to: Destination,
+    environment: Environment, teacher: Policy, act: PolicyFunction, filming: DatasetFilming, to: Destination
 ) -> Handover:
-    """Return who drives in an environment whose worlds are filmed."""
-    from concent_warp.deploy.flow_cameras import FilmedCameras
-    from concent_warp.deploy.handover import Handover
+    """Return who drives in an environment whose worlds are filmed; `act` is the teacher's function there."""
+    from concent_warp.deploy.handover import FilmedImages, Handover
+    from concent_warp.deploy.simulated_images import simulated_images
+    from concent_warp.train.distil.student import Student
     from concent_warp.train.flow.policy import FlowPolicy
-    from concent_warp.train.flow.receding_horizon import act_in
+    from concent_warp.train.flow.task_policy import TaskFlowPolicy
 
+    driver = to.driver
     if isinstance(driver, FlowPolicy):
-        drive = act_in(driver, environment, FilmedCameras(filming), filming.task)
+        drive = TaskFlowPolicy(driver, teacher, filming.task).act_in(environment, FilmedImages(filming))
+    elif isinstance(driver, Student):
+        drive = driver.act_in(environment, simulated_images(environment, driver.cfg.images, driver.cfg.looks))
     else:
+        assert driver is not None
         drive = driver.act_in(environment)
-    return Handover(environment, drive, teacher, to.cfg.handover, to.cfg.seed)
+    return Handover(environment, drive, act, to.cfg.handover, to.cfg.seed)
 
 
 @contextmanager

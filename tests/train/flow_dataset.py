@@ -11,7 +11,8 @@ import numpy as np
 
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
-from concent_warp.train.flow.cfg import FlowAugmentCfg, FlowDataCfg, FlowPolicyCfg, SmallBackboneCfg, TrainFlowCfg
+from concent_warp.train.distil.cfg import AugmentCfg
+from concent_warp.train.flow.cfg import FlowDataCfg, FlowPolicyCfg, SmallBackboneCfg, TrainFlowCfg
 
 SIZE, LENGTH, RATE = 16, 6, 10
 UP, DOWN = "push it up", "push it down"
@@ -21,7 +22,10 @@ SIZES = FlowPolicyCfg(
 )  # fmt: skip
 TINY = TrainFlowCfg(
     steps=300, batch=32, learning_rate=3e-3, warm_up=20, ema=0.98, validate=100, validation_samples=64, policy=SIZES,
-    augment=FlowAugmentCfg(shift=0, brightness=0.02, contrast=0.02, blank_state=0.0), data=FlowDataCfg(validation=0.2),
+    blank_state=0.0, data=FlowDataCfg(validation=0.2),
+    augment=AugmentCfg(
+        shift=0, brightness=0.02, contrast=0.02, balance=0.02, gamma=(1, 1), vignette=0, noise=0, blur=0,
+    ),
 )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def settings(weights: Path, steps: int = 4) -> cw.TrainFlowCfg:
 def test_tokens_are_those_of_the_whole_network(weights):
     from transformers import Florence2ForConditionalGeneration  # pyright: ignore
 
-    whole = Florence2ForConditionalGeneration.from_pretrained(weights).eval()
+    whole: Any = Florence2ForConditionalGeneration.from_pretrained(weights).eval()
     backbone = FlorenceBackbone.load(weights, 1, EDGE).eval()
     images = torch.rand(2, 1, 3, EDGE, EDGE)
     ids, mask = backbone.tokens_of([UP, "push"])

@@ -8,12 +8,15 @@ from typing import Annotated, Literal
 
 from concent_warp.checks import Bounds, Count, Pixels, Positive, Share, SmallShare, check_settings
 from concent_warp.errors import TrainError
+from concent_warp.train.distil.cfg import AugmentCfg
 
 Backbone = Literal["small", "florence2"]
 SIZES: dict[str, int] = {"small": 96, "florence2": 224}
 """Edge of the images by backbone [px]."""
 LEARNING_RATES: dict[str, float] = {"small": 3e-4, "florence2": 2e-5}
 """Largest learning rate by backbone; that of Florence-2 is FLOWER's."""
+FLOW_SETTINGS = "flow.toml"
+"""File of the settings of a training; a folder that holds one is the run folder of a flow policy."""
 CELL = 32
 """Edge of the square that Florence-2's image encoder makes one token of [px]."""
 
@@ -90,20 +93,6 @@ class FlowDataCfg:
 
 
 @dataclass(frozen=True)
-class FlowAugmentCfg:
-    """Augmentation of the training's samples."""
-
-    shift: Annotated[int, Bounds(0, 1000)] = 4
-    """Largest shift of an image along each axis [px], its edge repeated (Yarats et al. 2021)."""
-    brightness: Share = 0.1
-    """Largest change of brightness, of colours in 0..1."""
-    contrast: SmallShare = 0.1
-    """Largest relative change of contrast."""
-    blank_state: SmallShare = 0.1
-    """Share of the samples whose proprioception is hidden, so that the policy does not rely on it alone."""
-
-
-@dataclass(frozen=True)
 class TrainFlowCfg:
     """Settings of the training of a flow policy.
 
@@ -130,6 +119,8 @@ class TrainFlowCfg:
     """Largest norm of the gradient [-]."""
     ema: SmallShare = 0.999
     """Share of the running mean of the weights that a step keeps; fewer in the first steps."""
+    blank_state: SmallShare = 0.1
+    """Share of the samples whose proprioception is hidden, so that the policy does not rely on it alone."""
     validate: Count = 500
     """Steps between validations; one is also made at the end."""
     validation_samples: Annotated[int, Bounds(1, 1_000_000)] = 1024
@@ -142,8 +133,8 @@ class TrainFlowCfg:
     """Share of a GPU's free memory that images may take; those of larger data sets stay on the disk."""
     data: FlowDataCfg = field(default_factory=FlowDataCfg)
     """Features of the data set."""
-    augment: FlowAugmentCfg = field(default_factory=FlowAugmentCfg)
-    """Augmentation."""
+    augment: AugmentCfg = field(default_factory=AugmentCfg)
+    """Random changes of the images, as in a distillation."""
     policy: FlowPolicyCfg = field(default_factory=FlowPolicyCfg)
     """Inputs and sizes of the policy."""
 
@@ -198,3 +189,8 @@ def check_train_cfg(cfg: TrainFlowCfg) -> None:
     if cfg.policy.backbone == "florence2" and cfg.policy.weights is None:
         fix = "give the folder of a copy of florence-community/Florence-2-large"
         raise TrainError("Florence-2 needs weights", expected="policy.weights", found="none", fix=fix)
+
+
+def holds_flow_policy(path: Path) -> bool:
+    """Return whether a folder, or the folder of a checkpoint file, is the run folder of a flow policy."""
+    return ((path if path.is_dir() else path.parent) / FLOW_SETTINGS).is_file()

@@ -38,6 +38,8 @@ class FlowFeatures:
     """Actions in a second [Hz]."""
     tasks: tuple[str, ...]
     """Instructions of the data set."""
+    size: tuple[int, int]
+    """Height and width of the images of the first camera in the data set [px]."""
 
     def plain(self) -> dict[str, Any]:
         """Return the features as plain data."""
@@ -47,7 +49,8 @@ class FlowFeatures:
     def of(plain: Mapping[str, Any]) -> FlowFeatures:
         """Return the features that `plain` returned."""
         names = {name: tuple(map(str, plain[name])) for name in ("cameras", "state", "action", "tasks")}
-        return FlowFeatures(rate=float(plain["rate"]), **names)
+        height, width = map(int, plain["size"])
+        return FlowFeatures(rate=float(plain["rate"]), size=(height, width), **names)
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
         raise TrainError("the data set has no episodes", where=source)
     tables, tasks, lengths = [], [], []
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    size = (0, 0)
     for number in numbers:
         episode = log.episode(number)
         found = tuple(_columns(episode, features, source) for features in (chosen.state, chosen.action))
@@ -116,7 +120,7 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
             raise TrainError(
                 "an episode has other columns", where=f"{source}, episode {number}", expected=names, found=now
             )
-        names = now
+        names, size = now, episode.images[chosen.cameras[0]].size
         tables.append([_table(columns, f"{source}, episode {number}") for columns in found])
         tasks.append(episode.task)
         lengths.append(len(tables[-1][1]))
@@ -124,7 +128,7 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
     texts = tuple(dict.fromkeys(tasks))
     cameras = tuple(name.removeprefix(IMAGES) for name in chosen.cameras)
     return FlowDataset(
-        FlowFeatures(cameras, *names, log.rate, texts),
+        FlowFeatures(cameras, *names, log.rate, texts, size),
         np.concatenate([state for state, _ in tables]),
         np.concatenate([action for _, action in tables]),
         np.repeat([texts.index(task) for task in tasks], lengths),

@@ -22,8 +22,9 @@ from torch import nn
 
 from concent_warp.errors import TrainError
 from concent_warp.files import write_bytes
+from concent_warp.train.flow.cfg import FlowPolicyCfg
+from concent_warp.train.flow.dataset import FlowFeatures
 from concent_warp.train.flow.network import FlowPolicyNetwork
-from concent_warp.train.flow.policy import FlowPolicy
 
 FORMAT, VERSION = "concent-flow-policy", 1
 METADATA = "concent"
@@ -64,7 +65,9 @@ class _EulerStep(nn.Module):
         return chunk + self.transformer(chunk, time, context, there) / self.steps
 
 
-def export_flow_policy(policy: FlowPolicy, out: Path) -> dict[str, Any]:
+def export_flow_policy(
+    cfg: FlowPolicyCfg, features: FlowFeatures, network: FlowPolicyNetwork, out: Path
+) -> dict[str, Any]:
     """Write the sampler as ONNX, for any number of observations and tokens, and return its metadata.
 
     Raises:
@@ -72,15 +75,14 @@ def export_flow_policy(policy: FlowPolicy, out: Path) -> dict[str, Any]:
     """
     if out.suffix != SUFFIX:
         raise TrainError("the export format is unknown", where=out, expected=f"a name in {SUFFIX}")
-    described = _described(policy)
-    write_bytes(out, _onnx(policy, described))
+    described = _described(cfg, features, network)
+    write_bytes(out, _onnx(features, network, described))
     return described
 
 
-def _described(policy: FlowPolicy) -> dict[str, Any]:
+def _described(cfg: FlowPolicyCfg, features: FlowFeatures, network: FlowPolicyNetwork) -> dict[str, Any]:
     """Return the metadata as plain data."""
-    cfg, features = policy.cfg, policy.features
-    backbone = policy.network.described_backbone()
+    backbone = network.described_backbone()
     text = {"tokenizer": json.loads(backbone["tokenizer"])} if backbone else {"bytes": "UTF-8", "first": 256}
     return {
         "format": FORMAT,
@@ -100,12 +102,12 @@ def _described(policy: FlowPolicy) -> dict[str, Any]:
     }
 
 
-def _onnx(policy: FlowPolicy, described: dict[str, Any]) -> bytes:
+def _onnx(features: FlowFeatures, network: FlowPolicyNetwork, described: dict[str, Any]) -> bytes:
     """Return the sampler as ONNX, with the weights inside: the encoder, and a loop over Euler steps."""
     import onnx
 
-    cfg, features = policy.cfg, policy.features
-    network = copy.deepcopy(policy.network).cpu().float().eval()
+    cfg = network.cfg
+    network = copy.deepcopy(network).cpu().float().eval()
     count, edge = EXAMPLES, cfg.edge
     images = [torch.zeros(count, edge, edge, 3, dtype=torch.uint8) for _ in features.cameras]
     ids = torch.zeros(count, EXAMPLE_TOKENS, dtype=torch.int64)

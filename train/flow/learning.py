@@ -24,7 +24,8 @@ from concent_warp.checkpoint_file import check_state, read_checkpoint, write_che
 from concent_warp.errors import TrainError
 from concent_warp.limits import limits, raising
 from concent_warp.run_folder import TRAIN_CHECKPOINT, plain
-from concent_warp.train.flow.cfg import FlowAugmentCfg, TrainFlowCfg
+from concent_warp.train.distil.augmentation import augmented
+from concent_warp.train.flow.cfg import TrainFlowCfg
 from concent_warp.train.flow.dataset import FlowDataset
 from concent_warp.train.flow.frames import FrameFiles
 from concent_warp.train.flow.network import FlowPolicyNetwork
@@ -148,7 +149,7 @@ class FlowTraining:
             group["lr"] = self.cfg.peak * self.rate()
         with self._half():
             shown = augmented(images.permute(0, 1, 4, 2, 3).float() / 255, self.cfg.augment)
-            blank = torch.rand(len(rows), device=self.device) < self.cfg.augment.blank_state
+            blank = torch.rand(len(rows), device=self.device) < self.cfg.blank_state
             loss = self._loss(self.network, rows, shown, blank=blank).mean()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -330,23 +331,6 @@ def read_training(folder: Path) -> dict[str, Any]:
     return read_checkpoint(folder / TRAIN_CHECKPOINT, keys=keys, finite=WEIGHTS, error=TrainError)
 
 
-def augmented(images: torch.Tensor, cfg: FlowAugmentCfg) -> torch.Tensor:
-    """Return images (N, K, 3, S, S) in 0..1, shifted, brightened and with more or less contrast, each at random."""
-    count, cameras, _, edge, _ = images.shape
-    images = images.flatten(0, 1)
-    given: dict[str, Any] = {"device": images.device}
-    if cfg.shift:
-        places = torch.arange(edge, **given)
-        shift = torch.randint(-cfg.shift, cfg.shift + 1, (2, len(images), 1), **given)
-        rows, columns = (places + shift).clamp(0, edge - 1)
-        which = torch.arange(len(images), **given)[:, None, None]
-        images = images.permute(0, 2, 3, 1)[which, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
-    contrast, brightness = 2 * torch.rand((2, len(images), 1, 1, 1), **given) - 1
-    middle = images.mean(dim=(1, 2, 3), keepdim=True)
-    images = (1 + cfg.contrast * contrast) * (images - middle) + middle + cfg.brightness * brightness
-    return images.clamp(0, 1).unflatten(0, (count, cameras))
-
-
 def step_seed(seed: int, step: int) -> int:
     """Return the seed of a step's random numbers."""
     return int.from_bytes(hashlib.sha256(f"{seed} {step}".encode()).digest()[:8]) >> 1
@@ -386,6 +370,6 @@ def _running_mean(
     @torch.no_grad()
     def update(means: Any, weights: Any, count: torch.Tensor | int) -> None:
         kept = min(most, (1 + int(count)) / (10 + int(count)))
-        torch._foreach_lerp_(means, weights, 1 - kept)
+        torch._foreach_lerp_(means, weights, 1 - kept)  # pyright: ignore[reportPrivateImportUsage]
 
     return update

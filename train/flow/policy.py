@@ -124,7 +124,7 @@ class FlowPolicy:
         """
         from concent_warp.train.flow.export import export_flow_policy
 
-        return export_flow_policy(self, Path(out))
+        return export_flow_policy(self.cfg, self.features, self.network, Path(out))
 
     def _shown(self, images: Array) -> torch.Tensor:
         """Return images (N, H, W, 3) uint8 as the network takes them, shape (N, 3, S, S) in 0..1."""

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import tomli_w
 import torch
 
 from concent_warp.checks import check_device
+from concent_warp.files import write_text
 from concent_warp.run_folder import SETTINGS, TRAIN_CHECKPOINT, check_unchanged, plain, run_folder, write_settings
-from concent_warp.train.flow.cfg import TrainFlowCfg, check_train_cfg
+from concent_warp.train.flow.cfg import FLOW_SETTINGS, TrainFlowCfg, check_train_cfg
 from concent_warp.train.flow.dataset import check_features, open_dataset, read_dataset
 from concent_warp.train.flow.frames import decode_episodes, remove_frames
 from concent_warp.train.flow.learning import FlowStep, FlowTraining
@@ -93,6 +95,7 @@ def train_flow(
             if (claimed.path / POLICY).is_file():
                 return FlowPolicy.load(claimed.path, device=where)
         write_settings(claimed.path, settings)
+        write_text(claimed.path / FLOW_SETTINGS, tomli_w.dumps(plain(cfg)))
         _trained(source, cfg, claimed.path, where, report, folder=claimed.path)
         path = claimed.commit()
         return FlowPolicy.load(path, device=where)

@@ -1,8 +1,9 @@
-"""Data of how to recover: another policy drives for a random time, the teacher ends the episode."""
+"""A flow policy in its task: evaluated there, and as the policy that hands over to its teacher."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,10 @@ import torch
 import concent_warp as cw
 from concent_warp.cli.entry import main
 from concent_warp.deploy.handover import Handover
+from concent_warp.deploy.simulated_images import HybridImages
 from concent_warp.recording.logs.readers.lerobot import LeRobotLog
+from concent_warp.train.environment.worlds import make_environment
+from concent_warp.train.trials.evaluate import run_episodes
 
 COMMON = ["render", "--pretrained", "--size", "32", "--cameras", "base", "--device", "cpu", "--worlds", "4"]
 FLOW = cw.TrainFlowCfg(
@@ -82,12 +86,59 @@ def test_wrong_drivers_are_refused(folder, capsys):
         return capsys.readouterr().err.strip().splitlines()[-1]
 
     assert "no such policy" in said("--handover", str(folder / "nowhere"))
-    assert "no such flow policy" in said("--handover", str(folder / "plain"))
+    assert "the folder holds no training" in said("--handover", str(folder / "plain"))
     assert "no camera of the policy; expected base" in said("--handover", str(folder / "flow"), "--cameras", "wrist")
     assert "--handover.time is out of bounds" in said("--handover", str(folder / "flow"), "--handover.time", "2", "1")
     shipped = cw.load_policy("shape_sorter")
     with pytest.raises(cw.RenderError, match="not driven"):
         cw.render(shipped.run.recording, folder / "bad", driver=shipped)
+
+
+def test_flow_policy_is_evaluated_in_simulation_and_reality(folder, capsys):
+    command = ["evaluate", "--checkpoint", str(folder / "flow"), "--episodes", "2", "--device", "cpu"]
+    assert main([*command, "--task-of", "shape_sorter"]) == 0
+    said = capsys.readouterr().out
+    assert "simulation: 0 of 2 succeed" in said  # it has hardly learned anything
+    assert "reality: " in said
+    shipped = cw.load_policy("shape_sorter")
+    policy = cw.TaskFlowPolicy(cw.load_flow_policy(folder / "flow"), shipped, "stand still")
+    assert cw.TaskFlowPolicy(policy.policy, shipped).instruction == shipped.run.recording[0].task
+    assert cw.evaluate(policy, world="simulation", episodes=1, device="cpu").success.shape == (1,)
+    for options, what in (
+        ((), "a flow policy needs a task"),
+        (("--task-of", "dishwasher"), "no such policy"),
+        (("--instruction", "go"), "an instruction is for flow policies"),
+    ):
+        assert main([*command, *options]) == 2
+        assert what in capsys.readouterr().err
+    assert main(["evaluate", "--pretrained", "--task-of", "shape_sorter"]) == 2
+    assert "--task-of is for flow policies" in capsys.readouterr().err
+
+
+def test_a_policy_that_knows_the_teachers_commands_succeeds(folder, monkeypatch):
+    """What turns commands to actions loses nothing: a flow policy that predicts the teacher's commands inserts."""
+    shipped = cw.load_policy("shape_sorter")
+    flow = cw.load_flow_policy(folder / "flow")
+    task = shipped.run.task()
+    states = shipped.run.evaluation_states(task, 4, 3)
+    environment = make_environment(task, replace(shipped.run.cfg.environment, worlds=4), states, device="cpu")
+    teach = shipped.act_in(environment)
+    robot, model = task.robot, task.compiled
+
+    def predict(self, *_, **__):
+        action = teach(environment.get_observations()).clamp(-1, 1)
+        ctrl = environment.physics.ctrl.clone()
+        step = torch.as_tensor(robot.step, dtype=ctrl.dtype)
+        ctrl[:, robot.actuator.tolist()] += (action * step)[:, : len(robot.actuator)]
+        ctrl[:, robot.gripper.tolist()] += (action * step)[:, len(robot.actuator) :]
+        order = [model.actuator(name).id for name in self.features.action]
+        return ctrl[:, order].numpy().astype(np.float32)[:, None].repeat(self.cfg.chunk, axis=1)
+
+    monkeypatch.setattr(cw.FlowPolicy, "act", predict)
+    once = cw.FlowPolicy(replace(flow.cfg, execute=1), flow.features, flow.network, flow.folder)
+    images = HybridImages(environment, cw.ImagesCfg(cameras=("base",), size=32))
+    act = cw.TaskFlowPolicy(once, shipped).act_in(environment, images)
+    assert run_episodes(environment, act, states).success.all()
 
 
 class _Worlds:
