@@ -164,7 +164,7 @@ class DaggerCfg:
     """Gradient steps per iteration."""
     batch: Annotated[int, Bounds(1, 1_000_000)] = 1024
     """Samples of a gradient step, on each rank."""
-    buffer: Count = 300_000
+    buffer: Count = 600_000
     """Latest samples that are kept to learn from, on each rank."""
     beta: Share = 1.0
     """Share of episodes that the teacher drives, at first."""
@@ -203,7 +203,7 @@ class DistilCfg:
 
     seed: int = 0
     """Seed of all random numbers."""
-    checkpoint: Positive = 300.0
+    checkpoint: Positive = 600.0
     """Time between checkpoints [s]; one is also written at the end and on interruption."""
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""
