@@ -201,6 +201,9 @@ class DistilCfg:
         ('base', 'wrist')
     """
 
+    method: Literal["dagger", "rsl_rl"] = "dagger"
+    """DAgger, or rsl-rl's own distillation as a baseline: the student drives from the start, and what was seen is
+    learned from once."""
     seed: int = 0
     """Seed of all random numbers."""
     checkpoint: Positive = 600.0
