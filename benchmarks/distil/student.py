@@ -36,7 +36,11 @@ from concent_warp.train.trials.evaluate import wilson
 NAME = "distil"
 DATA = FOLDER / "data" / f"{NAME}.jsonl"
 TEACHER, STUDENT = "teacher", "student"
-CONTROLS = {"blind": "blind: black images", "cloned": "cloned: the teacher drives all episodes"}
+CONTROLS = {
+    "blind": "blind: black images",
+    "cloned": "cloned: the teacher drives all episodes",
+    "rsl_rl": "rsl-rl's distillation",
+}
 """Controls and what they are."""
 TITLES = {TEACHER: "the teacher, which observes the state", STUDENT: "the student, by DAgger", **CONTROLS}
 WORLDS: tuple[TrialName, ...] = ("simulation", "reality")
@@ -84,7 +88,7 @@ def variant_cfg(cfg: DistilCfg, variant: str, seed: int) -> DistilCfg:
         return replace(cfg, network=replace(cfg.network, blind=True))
     if variant == "cloned":
         return replace(cfg, dagger=replace(cfg.dagger, beta=1.0, beta_end=1.0))
-    return cfg
+    return replace(cfg, method="rsl_rl") if variant == "rsl_rl" else cfg
 
 
 class Benchmark:

@@ -67,6 +67,15 @@ def test_a_distillation_that_stopped_continues_exactly(teacher, student, tmp_pat
     assert [point["iteration"] for point in read_curve(out)] == [1, 2, 3]
 
 
+def test_the_distillation_of_rsl_rl_is_a_baseline_that_resumes(teacher, tmp_path):
+    cfg = replace(TINY, method="rsl_rl", dagger=replace(TINY.dagger, iterations=2))
+    whole = cw.distil(teacher, cfg, device="cpu")
+    stopped = cw.distil(teacher, cfg, device="cpu", out=tmp_path / "run", seconds=0)
+    assert stopped.weights["iteration"] == 1
+    assert not same(stopped, whole)
+    assert same(cw.distil(teacher, cfg, device="cpu", out=tmp_path / "run", resume=True), whole)
+
+
 def test_the_run_folder_holds_metrics_and_the_teacher(folder, teacher):
     points = read_curve(folder)
     assert [point["beta"] for point in points] == [1.0, 0.5, 0.0]

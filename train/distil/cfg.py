@@ -164,7 +164,7 @@ class DaggerCfg:
     """Gradient steps per iteration."""
     batch: Annotated[int, Bounds(1, 1_000_000)] = 1024
     """Samples of a gradient step, on each rank."""
-    buffer: Count = 300_000
+    buffer: Count = 600_000
     """Latest samples that are kept to learn from, on each rank."""
     beta: Share = 1.0
     """Share of episodes that the teacher drives, at first."""
@@ -201,9 +201,12 @@ class DistilCfg:
         ('base', 'wrist')
     """
 
+    method: Literal["dagger", "rsl_rl"] = "dagger"
+    """DAgger, or rsl-rl's own distillation as a baseline: the student drives from the start, and what was seen is
+    learned from once."""
     seed: int = 0
     """Seed of all random numbers."""
-    checkpoint: Positive = 300.0
+    checkpoint: Positive = 600.0
     """Time between checkpoints [s]; one is also written at the end and on interruption."""
     states: Count | None = None
     """Initial states of the episodes; as many as in the teacher's training by default."""

@@ -81,8 +81,9 @@ class Dagger:
         )  # fmt: skip
         n, d = environment.num_envs, cfg.dagger
         size, channels = cfg.images.size, 3 * cfg.images.frames
+        kept = min(d.buffer, d.iterations * d.steps * n) if cfg.method == "dagger" else 1
         self.samples = Samples(
-            min(d.buffer, d.iterations * d.steps * n),
+            kept,
             (len(images.cameras), channels, size, size),
             (self._proprioception.size, environment.num_actions, 9 * self._proprioception.objects),
             self.device,
@@ -155,7 +156,7 @@ class Dagger:
         log = self._log()
         collected = time.monotonic()
         self.network.train()
-        losses = torch.stack([self._update() for _ in range(d.updates)]).mean(dim=0)
+        losses = self._learn()
         losses = self.process.sum_over_ranks(losses) / self.process.world_size
         action, poses = losses.tolist()
         if not math.isfinite(action + poses):
@@ -179,8 +180,8 @@ class Dagger:
         environment, started = self.environment, self._started
         seen = self._images.look(environment, started).to(self.device)
         own, truth = self._proprioception.read(environment.observation).clone(), environment.truth
-        given = truth if self._labels_from_truth else environment.history.flatten(1)
-        label = self._teacher(TensorDict({"policy": given.clone()}, batch_size=[len(given)])).clamp(-1, 1)
+        given = self._teacher_observation()
+        label = self._teacher(TensorDict({"policy": given}, batch_size=[len(given)])).clamp(-1, 1)
         self.samples.add(seen, own, label, scaled_poses(self._proprioception.poses(truth)))
         taught = torch.rand(len(label), device=self.device) < beta
         self._taught = torch.where(started, taught, self._taught)
@@ -189,6 +190,16 @@ class Dagger:
             action = self.network(seen.float() / 255, own)
             action = torch.where(self._taught[:, None], label, action)
         environment.step(action)
+        self._count()
+
+    def _teacher_observation(self) -> torch.Tensor:
+        """Return what the teacher observes, shape (N, O)."""
+        environment = self.environment
+        return (environment.truth if self._labels_from_truth else environment.history.flatten(1)).clone()
+
+    def _count(self) -> None:
+        """Count the episodes that the last step ended."""
+        environment = self.environment
         done = environment.done
         succeeded = done & environment.success & ~environment.failure.any(dim=1)
         counts = [done & ~self._taught, succeeded & ~self._taught, done & self._taught, succeeded & self._taught]
@@ -199,15 +210,23 @@ class Dagger:
         """Estimate mean and standard deviation of the proprioception by the latest samples of all ranks."""
         if self.iteration >= self.cfg.dagger.normalise_iterations:
             return
-        count = min(self.cfg.dagger.steps * self.environment.num_envs, len(self.samples))
-        rows = (self.samples.next - 1 - torch.arange(count, device=self.device)) % self.samples.capacity
-        values = self.samples.proprioception[rows].double()
-        added = torch.cat([values.sum(dim=0), values.square().sum(dim=0), values.new_tensor([float(count)])])
+        values = self._latest_proprioception().double()
+        added = torch.cat([values.sum(dim=0), values.square().sum(dim=0), values.new_tensor([float(len(values))])])
         self._moments += self.process.sum_over_ranks(added)
         total = self._moments[-1]
         mean, square = (self._moments[:-1] / total).chunk(2)
         self.network.get_buffer("mean").copy_(mean)
         self.network.get_buffer("std").copy_((square - mean.square()).clamp(min=1e-8).sqrt().clamp(min=1e-3))
+
+    def _latest_proprioception(self) -> torch.Tensor:
+        """Return the proprioception of this iteration's samples, shape (M, P)."""
+        count = min(self.cfg.dagger.steps * self.environment.num_envs, len(self.samples))
+        rows = (self.samples.next - 1 - torch.arange(count, device=self.device)) % self.samples.capacity
+        return self.samples.proprioception[rows]
+
+    def _learn(self) -> torch.Tensor:
+        """Take the gradient steps of an iteration; return the mean losses of actions and of poses, shape (2,)."""
+        return torch.stack([self._update() for _ in range(self.cfg.dagger.updates)]).mean(dim=0)
 
     def _update(self) -> torch.Tensor:
         """Take a gradient step on random samples; return the losses of actions and of poses, shape (2,)."""

@@ -15,6 +15,7 @@ from concent_warp.run_folder import plain
 from concent_warp.train.distil.cfg import DISTIL_SETTINGS, DistilCfg
 from concent_warp.train.distil.dagger import Dagger
 from concent_warp.train.distil.images import MakeImages
+from concent_warp.train.distil.rsl_rl import RslRlDagger
 from concent_warp.train.environment.environment import Environment
 from concent_warp.train.environment.worlds import check_worlds, make_environment
 from concent_warp.train.learning.distributed import DistributedProcess
@@ -119,7 +120,8 @@ def run_distillation(
         environment = inputs.environment(device, seed)
         images = inputs.make_images(environment)
         teacher = inputs.teacher.act_in(environment)
-        trainer = Dagger(environment, teacher, images, cfg, folder, process)
+        kind = RslRlDagger if cfg.method == "rsl_rl" else Dagger
+        trainer = kind(environment, teacher, images, cfg, folder, process)
         environment.reset()
         if resume and folder is not None:
             trainer.resume(folder / CHECKPOINT)
