@@ -98,7 +98,7 @@ def test_data_set_of_concent_render_is_learned_by_the_command(tmp_path, capsys):
     assert main(["train-flow", str(tmp_path / "data"), "-o", str(run), *QUICK]) == 0
     said = capsys.readouterr().out
     assert "cameras base, wrist" in said
-    assert "policy.pt" in said
+    assert "flow_policy.pt" in said
     policy = cw.load_flow_policy(run)
     info = json.loads((tmp_path / "data" / "meta" / "info.json").read_text())
     assert list(policy.features.state) == info["features"]["observation.state"]["names"]

@@ -19,7 +19,7 @@ from concent_warp.train.flow.cfg import FlowPolicyCfg, check_policy_cfg
 from concent_warp.train.flow.dataset import FlowFeatures
 from concent_warp.train.flow.network import FlowPolicyNetwork, prepared
 
-POLICY = "policy.pt"
+POLICY = "flow_policy.pt"
 """File of the policy in the run folder of a finished training."""
 PARTS = ("policy", "features", "backbone", "weights")
 MODULE = "module."
@@ -203,6 +203,6 @@ def load_flow_policy(source: str | Path, *, device: str | None = None) -> FlowPo
         ...     cw.load_flow_policy("nowhere")
         ... except cw.TrainError as error:
         ...     print(error)
-        nowhere: no such flow policy; expected the run folder of concent train-flow, or its policy.pt.
+        nowhere: no such flow policy; expected the run folder of concent train-flow, or its flow_policy.pt.
     """
     return FlowPolicy.load(source, device=device)
