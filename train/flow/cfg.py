@@ -23,7 +23,13 @@ CELL = 32
 
 @dataclass(frozen=True)
 class SmallBackboneCfg:
-    """Encoder of images and text that is trained from random weights."""
+    """Encoder of images and text that is trained from random weights.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.FlowPolicyCfg(small=cw.SmallBackboneCfg(channels=(32, 64, 128))).small.text_layers
+        2
+    """
 
     channels: tuple[Annotated[int, Bounds(1, 16_384)], ...] = (32, 64, 128, 256)
     """Channels of the convolutions; each level halves the image, and the pixels of the last are its tokens."""
@@ -80,7 +86,13 @@ class FlowPolicyCfg:
 
 @dataclass(frozen=True)
 class FlowDataCfg:
-    """Which features of a LeRobot data set a flow policy learns from."""
+    """Which features of a LeRobot data set a flow policy learns from.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.TrainFlowCfg(data=cw.FlowDataCfg(cameras=("wrist",), validation=0.1)).data.cameras
+        ('wrist',)
+    """
 
     cameras: tuple[str, ...] = ()
     """Features of images, with or without "observation.images."; all colour images by default."""

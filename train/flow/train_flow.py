@@ -26,7 +26,15 @@ FREE = ("dataset", "checkpoint", "device_share")
 
 @dataclass(frozen=True)
 class FlowProgress:
-    """How far a training is."""
+    """How far a training is.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> def report(now: cw.FlowProgress) -> str:
+        ...     return now.work if now.step is None else f"{now.step.loss:.3f}, {now.step.left:.0f} s left"
+        >>> report(cw.FlowProgress("reading images", 0.5))
+        'reading images'
+    """
 
     work: str
     """What is being done: "reading images" or "training"."""
