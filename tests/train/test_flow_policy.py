@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -117,7 +118,8 @@ def test_onnx_samples_as_the_policy_and_tells_how_to_run_it(policy, tmp_path):
         "image_front": SHOWN["front"][:3], "proprioception": STATES[:3].astype(np.float32), "tokens": tokens,
         "mask": np.ones(tokens.shape, dtype=bool), "noise": noise.numpy(),
     }  # fmt: skip
-    found = np.asarray(ReferenceEvaluator(str(tmp_path / "policy.onnx")).run(None, given)[0])
+    outputs: Any = ReferenceEvaluator(str(tmp_path / "policy.onnx")).run(None, given)
+    found = outputs[0]
     expected = policy.act({"front": SHOWN["front"][:3]}, STATES[:3], UP, noise=noise)
     np.testing.assert_allclose(found, expected, atol=2e-4)
     written = {p.key: p.value for p in onnx.load(tmp_path / "policy.onnx").metadata_props}

@@ -18,7 +18,7 @@ from torch.nn import functional
 from concent_warp.train.flow.cfg import FlowPolicyCfg
 from concent_warp.train.flow.florence_backbone import FlorenceBackbone
 from concent_warp.train.flow.small_backbone import SmallBackbone
-from concent_warp.train.flow.transformer import FlowTransformer
+from concent_warp.train.flow.transformer import FlowTransformer, RmsNorm
 
 
 class FlowPolicyNetwork(nn.Module):
@@ -53,7 +53,7 @@ class FlowPolicyNetwork(nn.Module):
         super().__init__()
         self.cfg = cfg
         self.backbone = _backbone(cfg, cameras, backbone)
-        self.project = nn.Sequential(nn.Linear(self.backbone.width, cfg.width), nn.RMSNorm(cfg.width))
+        self.project = nn.Sequential(nn.Linear(self.backbone.width, cfg.width), RmsNorm(cfg.width))
         self.state = nn.Sequential(nn.Linear(states, cfg.width), nn.SiLU(), nn.Linear(cfg.width, cfg.width))
         self.no_state = nn.Parameter(torch.zeros(cfg.width))
         self.transformer = FlowTransformer(actions, cfg.chunk, cfg.width, cfg.layers, cfg.heads, causal=cfg.causal)

@@ -21,6 +21,14 @@ ROTARY_BASE = 10_000.0
 """Ratio of the fastest and the slowest rotation (Su et al. 2021)."""
 
 
+class RmsNorm(nn.RMSNorm):
+    """RMSNorm in single precision, whatever precision is around it."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return normalised features, shape (..., W), of features (..., W)."""
+        return super().forward(x.float()).to(x.dtype)
+
+
 class Attention(nn.Module):
     """Attention of queries to keys, with normalised queries and keys (Henry et al. 2020)."""
 
@@ -30,7 +38,7 @@ class Attention(nn.Module):
         self.query = nn.Linear(width, width, bias=False)
         self.key_value = nn.Linear(width, 2 * width, bias=False)
         self.out = nn.Linear(width, width, bias=False)
-        self.norm_query, self.norm_key = nn.RMSNorm(width // heads), nn.RMSNorm(width // heads)
+        self.norm_query, self.norm_key = RmsNorm(width // heads), RmsNorm(width // heads)
 
     def forward(
         self,
@@ -85,7 +93,7 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.norm_attention, self.norm_feed = nn.RMSNorm(width), nn.RMSNorm(width)
+        self.norm_attention, self.norm_feed = RmsNorm(width), RmsNorm(width)
         self.attention, self.feed = Attention(width, heads), FeedForward(width)
 
     def forward(self, x: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
@@ -100,7 +108,7 @@ class FlowBlock(nn.Module):
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        self.norm = nn.RMSNorm(width, elementwise_affine=False)
+        self.norm = RmsNorm(width, elementwise_affine=False)
         self.attention, self.cross = Attention(width, heads), Attention(width, heads)
         self.feed = FeedForward(width)
 
@@ -136,7 +144,7 @@ class FlowTransformer(nn.Module):
         self.time = nn.Sequential(nn.Linear(TIME_WAVES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
         self.modulation = nn.Linear(width, 11 * width)
         self.blocks = nn.ModuleList(FlowBlock(width, heads) for _ in range(layers))
-        self.norm, self.out = nn.RMSNorm(width, elementwise_affine=False), nn.Linear(width, actions)
+        self.norm, self.out = RmsNorm(width, elementwise_affine=False), nn.Linear(width, actions)
         self.register_buffer("rotation", rotations(chunk, width // heads), persistent=False)
         for layer in (self.modulation, self.out):
             nn.init.zeros_(layer.weight)
