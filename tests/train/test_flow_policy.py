@@ -14,6 +14,7 @@ import torch
 from onnx.reference import ReferenceEvaluator
 
 import concent_warp as cw
+from concent_warp.train.flow.learning import FlowTraining
 from concent_warp.train.flow.network import FlowPolicyNetwork
 from concent_warp.train.flow.policy import POLICY
 from concent_warp.train.flow.receding_horizon import RecedingHorizon
@@ -169,27 +170,34 @@ def test_wrong_inputs_are_refused(policy):
         policy.act(SHOWN, STATES, UP, noise=torch.zeros(1, 4, 3))
 
 
-def test_continued_training_is_the_one_without_interruption(trained, tmp_path):
+@pytest.mark.parametrize("where", ["_step", "validated"])
+def test_continued_training_is_the_one_without_interruption(trained, tmp_path, monkeypatch, where):
     cfg = replace(TINY, steps=30, validate=10, checkpoint=1e6)
     whole = cw.train_flow(trained / "data", cfg, device="cpu", out=tmp_path / "whole")
+    method = getattr(FlowTraining, where)
 
-    def stop(said):
-        if said.step is not None and said.step.done == 20:
+    def interrupted(self, *given):
+        if self.done == {"_step": 17, "validated": 20}[where]:
             raise KeyboardInterrupt
+        return method(self, *given)
 
-    with pytest.raises(KeyboardInterrupt):
-        cw.train_flow(trained / "data", cfg, device="cpu", out=tmp_path / "run", progress=stop)
-    unfinished = cw.load_flow_policy(tmp_path / "run")
-    assert not (tmp_path / "run" / POLICY).exists()
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr(FlowTraining, where, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            cw.train_flow(trained / "data", cfg, device="cpu", out=run)
+    unfinished = cw.load_flow_policy(run)
+    assert not (run / POLICY).exists()
     with pytest.raises(cw.ConcentError, match="interrupted"):
-        cw.train_flow(trained / "data", cfg, device="cpu", out=tmp_path / "run")
+        cw.train_flow(trained / "data", cfg, device="cpu", out=run)
     with pytest.raises(cw.ConcentError, match="other settings"):
-        cw.train_flow(trained / "data", replace(cfg, batch=8), device="cpu", out=tmp_path / "run", resume=True)
-    resumed = cw.train_flow(trained / "data", cfg, device="cpu", out=tmp_path / "run", resume=True)
+        cw.train_flow(trained / "data", replace(cfg, batch=8), device="cpu", out=run, resume=True)
+    resumed = cw.train_flow(trained / "data", cfg, device="cpu", out=run, resume=True)
     for name, value in whole.network.state_dict().items():
         assert torch.equal(value, resumed.network.state_dict()[name]), name
-    assert not torch.equal(unfinished.network.no_state, resumed.network.no_state) or cfg.blank_state == 0
-    points = [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(tmp_path / "run")]
+    assert not torch.equal(unfinished.network.state[0].weight, resumed.network.state[0].weight)
+    points = [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(run)]
     assert points == [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(tmp_path / "whole")]
-    again = cw.train_flow(trained / "data", cfg, device="cpu", out=tmp_path / "run", resume=True)
-    assert torch.equal(again.network.action_mean, resumed.network.action_mean)
+    assert [point["steps"] for point in points] == [10, 20, 30]
+    again = cw.train_flow(trained / "data", cfg, device="cpu", out=run, resume=True)
+    assert torch.equal(again.network.no_state, resumed.network.no_state)

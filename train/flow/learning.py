@@ -76,6 +76,7 @@ class FlowTraining:
         self.data, self.cfg, self.folder, self.device = data, cfg, folder, torch.device(device)
         self.done, self.seconds = 0, 0.0
         self.validation: float | None = None
+        self.losses: list[torch.Tensor] = []
         self._between = True
         self.training, self.held = data.split(cfg.data.validation, cfg.seed)
         features = data.features
@@ -104,29 +105,27 @@ class FlowTraining:
             TrainError: The loss became non-finite.
         """
         cfg, begun, first, before = self.cfg, time.monotonic(), self.done, self.seconds
-        saved, losses = begun, []
+        saved = reported = begun
         with _random(self.device), self._curve() as write, ThreadPoolExecutor(1) as pool:
             self.network.train()
             waiting = pool.submit(self._batch, self.done)
             try:
+                if self.losses and self._is_validated_now():  # which an interruption prevented
+                    self._validate(write)
                 while self.done < cfg.steps:
                     rows, images = waiting.result()
                     if self.done + 1 < cfg.steps:
                         waiting = pool.submit(self._batch, self.done + 1)
-                    losses.append(self._step(rows, images))
-                    validate = self.done % cfg.validate == 0 or self.done == cfg.steps
-                    if not (validate or self.done % REPORT == 0):
+                    self.losses.append(self._step(rows, images))
+                    now, validated = time.monotonic(), self._is_validated_now()
+                    if not (validated or self.done % LOSSES == 0 or now - reported > REPORT_PERIOD):
                         continue
-                    loss = float(torch.stack(losses).mean())
-                    if not math.isfinite(loss):
-                        fix = "lower the learning rate"
-                        raise TrainError(f"the loss is not finite after {self.done} steps", found=loss, fix=fix)
-                    losses, now = [], time.monotonic()
+                    loss, reported = self._mean_loss(), now
                     self.seconds = before + now - begun
-                    if validate and len(self.held):
-                        self.validation = self.validated()
-                    if validate:
-                        write(self._point(loss))
+                    if validated:
+                        self._validate(write)
+                    elif self.done % LOSSES == 0:
+                        self.losses = []
                     left = (now - begun) / (self.done - first) * (cfg.steps - self.done)
                     if report is not None:
                         report(FlowStep(self.done, cfg.steps, loss, self.validation, left))
@@ -140,6 +139,29 @@ class FlowTraining:
                     self.save()
                 raise
         self.save()
+
+    def _is_validated_now(self) -> bool:
+        """Return whether there is a validation after the present number of steps."""
+        return self.done % self.cfg.validate == 0 or self.done == self.cfg.steps
+
+    def _validate(self, write: Callable[[Point], None]) -> None:
+        """Compute the loss of the validation, if there is one, and write the metrics of this step."""
+        if len(self.held):
+            self.validation = self.validated()
+        write(self._point(self._mean_loss()))
+        self.losses = []
+
+    def _mean_loss(self) -> float:
+        """Return the mean of the latest losses.
+
+        Raises:
+            TrainError: It is not finite.
+        """
+        loss = float(torch.stack(self.losses).mean())
+        if not math.isfinite(loss):
+            fix = "lower the learning rate"
+            raise TrainError(f"the loss is not finite after {self.done} steps", found=loss, fix=fix)
+        return loss
 
     def _step(self, rows: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
         """Take an optimiser step on frames (N,) with images (N, K, S, S, 3) uint8, and return the loss."""
@@ -270,6 +292,7 @@ class FlowTraining:
             "done": self.done,
             "seconds": self.seconds,
             "validation": self.validation,
+            "losses": torch.stack(self.losses).cpu() if self.losses else torch.zeros(0),
         }
         write_checkpoint(self.folder / TRAIN_CHECKPOINT, state)
 
@@ -303,6 +326,7 @@ class FlowTraining:
         except (ValueError, KeyError, TypeError) as error:
             raise TrainError("the optimiser has another state", where=self.folder, found=error) from None
         self.done, self.seconds, self.validation = int(state["done"]), float(state["seconds"]), state["validation"]
+        self.losses = list(state["losses"].to(self.device))
 
     def _check_size(self) -> None:
         """Raise an error where checkpoints would be too large to be read, before anything is learned."""
@@ -313,8 +337,10 @@ class FlowTraining:
             raise TrainError("checkpoints would be too large", expected=f"at most {most} bytes", found=size, fix=fix)
 
 
-REPORT = 20
-"""Steps between reports of progress."""
+LOSSES = 20
+"""Latest steps whose mean loss is reported, at most."""
+REPORT_PERIOD = 1.0
+"""Time between reports of progress, at most [s]."""
 BLOCK = 4096
 """Frames that go to the GPU at once."""
 
@@ -327,6 +353,7 @@ def read_training(folder: Path) -> dict[str, Any]:
     """
     keys = (
         "policy", "features", "backbone", "episodes", "network", "mean", "optimiser", "done", "seconds", "validation",
+        "losses",
     )  # fmt: skip
     return read_checkpoint(folder / TRAIN_CHECKPOINT, keys=keys, finite=WEIGHTS, error=TrainError)
 

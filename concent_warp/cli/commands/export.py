@@ -91,7 +91,8 @@ def _flow_policy(arguments: Arguments, checkpoint: Path) -> dict[str, Any]:
     make_folder(out.parent)
     described = policy.export(out)
     cameras, state, actions = (len(described[name]) for name in ("images", "proprioception", "action"))
-    say(f"images of {cameras} cameras and {state} numbers of state to {described['chunk']} times {actions} actions")
+    seen = f"images of {cameras} camera{'s' * (cameras != 1)}"
+    say(f"{seen} and {state} numbers of state to {described['chunk']} times {actions} actions")
     say_written(out)
     return described
 

@@ -36,8 +36,7 @@ class Arguments:
     recording: Path | None = None
     """Render the measured motion of a recording instead of a policy."""
     handover: Path | None = None
-    """Run folder of another policy (concent train, distil or train-flow), which drives for a random time before the
-    policy takes over: data of how to recover."""
+    """Run folder of a policy that drives first."""
     out: OutPath = Path("runs/dataset")
     """Folder of the data set."""
     format: Format = "lerobot"
