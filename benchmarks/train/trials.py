@@ -66,14 +66,14 @@ seeds speak for settings. Seeds 12 to 15 were used to choose; so was the seed of
 by the stress test. The trainings of seeds 12, 13, 20 and 21 kept their last policy, the others that of the best stress
 test.
 
-Trainings that ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead 0.015`
-with seeds 12 and 13; without edges seeds 20 to 25; insertion with seed 15; the whole task with seed 15 after 240 s (52
-% in training) and, with `turn 0.006`, seed 14 after 230 s (0 %). Ten with geometry fitted with edge spheres, seeds 30 to
-39, ended so after 160 of 300 iterations; their stress tests after 50, 100 and 150 were alike, so that 100 iterations
-were made the second time, of seeds 30 to 37; 38 and 39 found no time. Of the first time two policies were kept, seed
-33, which succeeds in 191 of 200 trials, and one of a round peg, seed 30 after 90 iterations, in 187 of 200 (`concent
-evaluate --checkpoint POLICY --world reality --episodes 200`; they are not in the repository). Trainings of seeds 30 to
-37 shared a GPU by twos.
+Trainings that ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead
+0.015` with seeds 12 and 13; without edges seeds 20 to 25; insertion with seed 15; the whole task with seed 15 after
+240 s (52 % in training) and, with `turn 0.006`, seed 14 after 230 s (0 %). Ten with geometry fitted with edge
+spheres, seeds 30 to 39, ended so after 160 of 300 iterations; their stress tests after 50, 100 and 150 were alike, so
+that 100 iterations were made the second time, of seeds 30 to 37; 38 and 39 found no time. Of the first time two
+policies were kept, seed 33, which succeeds in 191 of 200 trials, and one of a round peg, seed 30 after 90 iterations,
+in 187 of 200 (`concent evaluate --checkpoint POLICY --world reality --episodes 200`; they are not in the repository).
+Trainings of seeds 30 to 37 shared a GPU by twos.
 """
 
 
