@@ -18,7 +18,8 @@ from concent_warp.version import __version__
 _HOMES = {
     "comparison.compare": ("CompareCfg", "compare"),
     "comparison.result": ("Comparison",),
-    "deploy.cfg": ("EvaluateCfg", "PlayCfg", "RenderCfg"),
+    "deploy.cfg": ("EvaluateCfg", "HandoverCfg", "PlayCfg", "RenderCfg"),
+    "deploy.distil": ("distil",),
     "deploy.evaluate": ("evaluate",),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
@@ -78,6 +79,18 @@ _HOMES = {
     "simulate.engine": ("Rollout",),
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.distil.cfg": (
+        *("AugmentCfg", "DaggerCfg", "DistilCfg", "ImagesCfg"),
+        *("LooksCfg", "StudentNetworkCfg"),
+    ),
+    "train.distil.student": ("Student", "load_student"),
+    "train.flow.cfg": (
+        *("FlowDataCfg", "FlowPolicyCfg"),
+        *("SmallBackboneCfg", "TrainFlowCfg"),
+    ),
+    "train.flow.policy": ("FlowPolicy", "load_flow_policy"),
+    "train.flow.task_policy": ("TaskFlowPolicy",),
+    "train.flow.train_flow": ("FlowProgress", "train_flow"),
     "train.observation_cfg": ("SensorErrorsCfg",),
     "train.trials.evaluate": ("Evaluation",),
     "train.policy.load": ("Policy", "load_policy"),
@@ -91,7 +104,8 @@ __all__ = ["__version__", *sorted(_MODULE_OF)]  # pyright: ignore[reportUnsuppor
 if TYPE_CHECKING:
     from concent_warp.comparison.compare import CompareCfg, compare
     from concent_warp.comparison.result import Comparison
-    from concent_warp.deploy.cfg import EvaluateCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.cfg import EvaluateCfg, HandoverCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.distil import distil
     from concent_warp.deploy.evaluate import evaluate
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
@@ -165,6 +179,24 @@ if TYPE_CHECKING:
     from concent_warp.simulate.engine import Rollout
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.distil.cfg import (
+        AugmentCfg,
+        DaggerCfg,
+        DistilCfg,
+        ImagesCfg,
+        LooksCfg,
+        StudentNetworkCfg,
+    )
+    from concent_warp.train.distil.student import Student, load_student
+    from concent_warp.train.flow.cfg import (
+        FlowDataCfg,
+        FlowPolicyCfg,
+        SmallBackboneCfg,
+        TrainFlowCfg,
+    )
+    from concent_warp.train.flow.policy import FlowPolicy, load_flow_policy
+    from concent_warp.train.flow.task_policy import TaskFlowPolicy
+    from concent_warp.train.flow.train_flow import FlowProgress, train_flow
     from concent_warp.train.observation_cfg import SensorErrorsCfg
     from concent_warp.train.policy.load import Policy, load_policy
     from concent_warp.train.train import train

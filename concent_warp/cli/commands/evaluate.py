@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from concent_warp.checks import Bounds
-from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_flow_policy, given_flow_policy, given_policy_or_student
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
+from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.run_folder import check_folder, make_folder
 
@@ -29,9 +30,13 @@ class Arguments:
     """
 
     checkpoint: Path | None = None
-    """Run folder of a training, or its checkpoint file."""
+    """Run folder of a training, of a student that sees or of a flow policy, or its checkpoint file."""
     pretrained: Pretrained = None
     """Run a policy that comes with the package, shape_sorter where no name is given."""
+    task_of: str | None = None
+    """Policy whose task a flow policy is to do: a run folder of concent train, or one that comes with the package."""
+    instruction: str | None = None
+    """What a flow policy is told; the demonstration's task by default."""
     world: Literal["simulation", "stress", "reality", "both", "all"] = "both"
     """Where to run the policy: simulation as in training, the same under worse conditions (stress), Reality, both
     simulation and Reality, or all three."""
@@ -60,7 +65,14 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
     check_evaluation(cfg, worlds[-1], arguments.episodes)
     if arguments.out is not None:
         check_folder(arguments.out)
-    policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    if arguments.instruction is not None and arguments.task_of is None:
+        raise TrainError("an instruction is for flow policies", expected="--task-of", found=arguments.instruction)
+    if check_flow_policy(arguments.checkpoint, arguments.task_of):
+        assert arguments.checkpoint is not None
+        assert arguments.task_of is not None
+        policy = given_flow_policy(arguments.checkpoint, arguments.task_of, arguments.instruction, arguments.device)
+    else:
+        policy = given_policy_or_student(arguments.checkpoint, arguments.pretrained)
     if arguments.out is not None and cfg.videos:
         make_folder(arguments.out)
     from concent_warp.deploy.evaluate import evaluate, without_reality
