@@ -66,7 +66,7 @@ _HOMES = {
     "recording.load": ("load_recording",),
     "recording.logs.cfg": ("ImportCfg",),
     "recording.logs.import_log": ("import_log",),
-    "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "recording.recording": ("Channel", "Demonstration", "PointTrack", "PolicyLog", "Recording"),
     "render.dataset.from_recording": ("WriteLeRobotCfg", "write_lerobot"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
@@ -153,7 +153,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.logs.cfg import ImportCfg
     from concent_warp.recording.logs.import_log import import_log
-    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, PolicyLog, Recording
     from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
