@@ -20,6 +20,10 @@ _HOMES = {
     "comparison.result": ("Comparison",),
     "deploy.cfg": ("EvaluateCfg", "PlayCfg", "RenderCfg"),
     "deploy.evaluate": ("evaluate",),
+    "deploy.explain.cfg": ("ExplainCfg",),
+    "deploy.explain.explain": ("explain",),
+    "deploy.explain.page": ("write_explanation",),
+    "deploy.explain.result": ("Explanation", "TrialExplanation"),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
     "diagnosis.cfg": ("DiagnoseCfg",),
@@ -93,6 +97,10 @@ if TYPE_CHECKING:
     from concent_warp.comparison.result import Comparison
     from concent_warp.deploy.cfg import EvaluateCfg, PlayCfg, RenderCfg
     from concent_warp.deploy.evaluate import evaluate
+    from concent_warp.deploy.explain.cfg import ExplainCfg
+    from concent_warp.deploy.explain.explain import explain
+    from concent_warp.deploy.explain.page import write_explanation
+    from concent_warp.deploy.explain.result import Explanation, TrialExplanation
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
     from concent_warp.diagnosis.cfg import DiagnoseCfg

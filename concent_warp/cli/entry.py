@@ -41,6 +41,7 @@ GROUPS = {
     "from a model to a policy": {
         "train": "train a policy under the contact events of a demonstration",
         "evaluate": "count how often a policy succeeds, in simulation and Reality",
+        "explain": "find why trials of a policy failed: perception, physics or policy",
         "play": "show a policy live in the browser",
         "export": "write a policy as ONNX, or a recording as a LeRobot data set",
     },
@@ -68,6 +69,7 @@ EXAMPLES = {
     "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
     "train": "concent train demo.h5 --model model.toml -o runs/insert",
     "evaluate": "concent evaluate --checkpoint runs/insert --episodes 200",
+    "explain": "concent explain runs/insert trials --html explanation.html",
     "play": "concent play --checkpoint runs/insert",
     "export": "concent export --checkpoint runs/insert -o policy.onnx",
     "splat-fit": "concent splat-fit photographs -o runs/splats",

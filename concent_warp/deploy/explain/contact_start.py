@@ -15,23 +15,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from concent_warp.deploy.explain.cfg import ContactStartCfg
 from concent_warp.deploy.explain.measured_start import MeasuredStart
-
-
-@dataclass(frozen=True)
-class ContactStartCfg:
-    """Settings of the search for starts without overlaps."""
-
-    penetration: float = 5e-4
-    """Penetration that a firm grasp has in the model anyway [m]."""
-    penetration_std: float = 2e-4
-    """Penetration beyond it that counts as much as a standard deviation of the pose [m]."""
-    position_std: float = 1e-3
-    """Standard deviation of a mean tracked position [m]: the part of the tracker's errors that averaging leaves."""
-    orientation_std: float = 0.01
-    """The same of an orientation [rad]."""
-    iterations: int = 4
-    """Iterations of Powell's method."""
 
 
 class ContactStarts:

@@ -21,7 +21,7 @@ from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
-from concent_warp.train.trials.evaluate import Evaluation, run_episodes
+from concent_warp.train.trials.evaluate import run_episodes
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class SimulatedTrials:
 
     success: np.ndarray
     """Whether an episode succeeded, shape (T, K) bool."""
-    outcome: Evaluation
     recording: Recording
     """The episodes as instruments show them; of start t and repetition k is ``demo_<t K + k>``."""
     position: dict[int, np.ndarray] = field(default_factory=dict)
@@ -40,6 +39,12 @@ class SimulatedTrials:
     def rate(self) -> float:
         """Share of the episodes that succeed."""
         return float(self.success.mean())
+
+    def of_first(self, count: int) -> SimulatedTrials:
+        """Return the episodes from the first starts."""
+        episodes = count * self.success.shape[1]
+        chosen = replace(self.recording, demonstrations=self.recording.demonstrations[:episodes])
+        return replace(self, success=self.success[:count], recording=chosen)
 
 
 class OwnSimulation:
@@ -91,7 +96,6 @@ class OwnSimulation:
         found = run_episodes(environment, act, states, progress=progress, watch=watch)
         return SimulatedTrials(
             found.success.reshape(len(starts), self._repetitions),
-            found,
             recorder.recording(found, range(count)),
             {episode: np.array(place) for episode, place in positions.items()},
         )

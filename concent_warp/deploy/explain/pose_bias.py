@@ -14,38 +14,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from concent_warp.checks import Count
+from concent_warp.deploy.explain.cfg import PoseBiasCfg
 from concent_warp.deploy.explain.contact_start import ContactStarts, moved
 from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.misfit import misfit
 from concent_warp.deploy.explain.replay_trial import Replayer, TrialReadings
 from concent_warp.recording.recording import Demonstration
-
-
-@dataclass(frozen=True)
-class PoseBiasCfg:
-    """Settings of the search for an error of tracked poses."""
-
-    positions: tuple[float, ...] = (3e-3, 6e-3, 1e-2, 1.5e-2)
-    """Errors along each axis, to both sides, of which the best is the first guess [m]."""
-    orientations: tuple[float, ...] = (0.06, 0.12, 0.2)
-    """The same about each axis [rad]."""
-    scanned: Count = 2
-    """Trials that first guesses are judged by."""
-    position: float = 2.5e-3
-    """Standard deviation of the first samples about the first guess [m]."""
-    orientation: float = 0.03
-    """The same of orientations [rad]."""
-    samples: Count = 20
-    """Samples in each iteration."""
-    elite: Count = 6
-    """Samples of the smallest misfit, from which the next ones are taken."""
-    iterations: Count = 6
-    """Iterations."""
-    trials: Count = 3
-    """Most trials that it is fitted to."""
-    floor: tuple[float, float] = (3e-4, 5e-3)
-    """Smallest standard deviations of samples [m], [rad]: no smaller error is distinguished."""
 
 
 @dataclass(frozen=True)
