@@ -34,7 +34,7 @@ SEED = 400
 """First seed of the trials; other ones were used for development."""
 INTRODUCTION = """\
 `python -m benchmarks.deploy.explain`: the insertion policy of the package in Reality, which neither the model nor the
-policy knows, with one thing wrong on purpose; `concent explain` is given the recording of the trials and names the cause.
+policy knows, with one thing wrong on purpose; `concent explain` gets the recording of the trials and names the cause.
 20 cases of each cause: poses of the block, or of all objects, with a constant error (`--sensors.position-bias`,
 `--sensors.orientation-bias`); ten hidden effects (`--hide`) of two magnitudes; and policies that are too weak: smaller
 steps or leads of the commands, noise on the weights, trainings that were stopped early. A case has one seed, and as
@@ -154,8 +154,8 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
         shift = "" if bias is None else " ".join(f"{1e3 * v:+.1f}" for v in bias[:3])
         counts = f"{sum(one == row['cause'] for one in row.get('one by one', []))} of {len(row.get('one by one', []))}"
         detail.append(
-            [name, row["cause"], row["found"] or "no trial failed", counts, found, shift, f"{row['failed']} of {row['episodes']}",
-             f"{row.get('seconds', 0):.0f}"]
+            [name, row["cause"], row["found"] or "no trial failed", counts, found, shift,
+             f"{row['failed']} of {row['episodes']}", f"{row.get('seconds', 0):.0f}"]
         )  # fmt: skip
     head = ["cause", "all together", "95 %", "one by one", "95 %"]
     columns = ["case", "cause", "found", "one by one", "effect named", "error of poses found [mm]", "failed", "seconds"]
@@ -171,7 +171,7 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
 def _shares(right: Sequence[bool]) -> list[str]:
     """Return a share with its interval, as text."""
     if not right:
-        return ["–", "–"]
+        return ["-", "-"]
     low, high = wilson(sum(right), len(right))
     return [f"{sum(right)} of {len(right)}", f"{low:.0%} to {high:.0%}"]
 

@@ -144,9 +144,7 @@ class RenderCfg:
     """Settings of the lights."""
 
 
-def check_evaluation(
-    cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0, *, record: bool = False
-) -> None:
+def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0, *, record: bool = False) -> None:
     """Check the settings of an evaluation; `record` says whether its trials are to be recorded.
 
     Raises:

@@ -139,9 +139,7 @@ class TrialRecorder:
         log = None
         if trial.observation:
             log = PolicyLog(steps[: len(trial.observation)], np.array(trial.observation), np.array(trial.action))
-        return Demonstration(
-            name, task, success, action=action, measured=self._measured(m, trial), policy=log
-        )
+        return Demonstration(name, task, success, action=action, measured=self._measured(m, trial), policy=log)
 
     def _measured(self, m: mujoco.MjModel, trial: RecordedTrial) -> dict[str, Channel]:
         """Return the channels of the scene's sensors that the instruments read."""

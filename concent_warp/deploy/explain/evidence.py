@@ -15,6 +15,13 @@ from concent_warp.deploy.explain.pose_bias import PoseBias
 from concent_warp.deploy.explain.prepared import PreparedTrial
 from concent_warp.deploy.explain.remedy import remedy
 from concent_warp.deploy.explain.result import Cause, Explanation, TrialExplanation
+from concent_warp.deploy.explain.sentences import (
+    bias_sentence,
+    diagnosis_sentences,
+    free_motion_sentence,
+    other_policy_sentence,
+    trial_sentence,
+)
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.simulate.replay import interpolate
 from concent_warp.train.policy.load import Policy
@@ -38,13 +45,15 @@ class Evidence:
     usual: np.ndarray
     """The same of simulated trials, shape (S,)."""
     free: np.ndarray
-    """Joint errors in free motion over noise, of T failed and some successful trials; NaN where there was too little."""
+    """Joint errors in free motion over noise, of T failed and some successful trials; NaN for too little of it."""
     usual_free: np.ndarray
     """The same of simulated trials, shape (S,)."""
     windows: Sequence[np.ndarray]
     """Errors of the replays by window, shape (W,) each."""
     usual_windows: Sequence[np.ndarray]
     """The same of simulated trials."""
+    difference: float | None = None
+    """Largest difference of logged actions from those of the policy, asked again [-]; None without a log."""
     bias: PoseBias | None = None
     """The error of tracked poses that explains most."""
     diagnosis: Diagnosis | None = None
@@ -146,27 +155,18 @@ class Judge:
     def _remarks(self, evidence: Evidence, cause: Cause, numbers: dict[str, float | None]) -> list[str]:
         """Return sentences on the evidence of all trials together."""
         said = [
+            *other_policy_sentence(evidence.difference),
             f"From the same starts the policy succeeds in {evidence.own.rate:.0%} of {evidence.own.success.size} "
             "episodes in its own simulation.",
-            f"Replayed in the model, the trials are {numbers['misfit']:.1f} from their measurements (mean loss in units "
-            f"of noise); simulated trials {evidence.level:.1f}, up to {self.limit(evidence):.1f} agrees.",
+            f"Replayed in the model, the trials are {numbers['misfit']:.1f} from their measurements (mean loss in "
+            f"units of noise); simulated trials {evidence.level:.1f}, up to {self.limit(evidence):.1f} agrees.",
         ]
         if self.moves_otherwise(evidence):
-            said.append(
-                f"Before the object touches anything, joints are off by {numbers['free joint error']:.0f} x noise, in "
-                f"simulated trials by {numbers['free joint error of simulated trials']:.0f}: the robot moves otherwise."
-            )
-        if cause == "perception" and (bias := evidence.bias) is not None:
-            shift = ", ".join(f"{1e3 * v:+.1f}" for v in bias.value[:3])
-            turn = ", ".join(f"{np.degrees(v):+.1f}" for v in bias.value[3:])
-            said.append(
-                f"If the tracker shows the object ({shift}) mm off and turned by ({turn}) degrees, that explains "
-                f"{numbers['explained by perception']:.0%} of the difference."
-            )
+            said.append(free_motion_sentence(numbers))
+        if cause == "perception" and evidence.bias is not None:
+            said.append(bias_sentence(evidence.bias, numbers["explained by perception"]))
         if evidence.diagnosis is not None:
-            said += [f"{evidence.diagnosis.headline.capitalize()}.", *evidence.diagnosis.sentences()[:3]]
-            if numbers["explained by physics"] is not None:
-                said.append(f"With it in the model {numbers['explained by physics']:.0%} of the difference is explained.")
+            said += diagnosis_sentences(evidence.diagnosis, numbers["explained by physics"])
         if evidence.with_cause is not None and cause in ("perception", "physics"):
             said.append(
                 f"With this in its own simulation, the policy succeeds in {evidence.with_cause.rate:.0%} of "
@@ -191,7 +191,7 @@ class Judge:
                 own = "perception" if best == "perception" else "physics"
             elif cause == "physics":
                 own = "physics"
-        usual = np.concatenate([w for w in evidence.usual_windows] or [np.ones(1)])
+        usual = np.concatenate(list(evidence.usual_windows) or [np.ones(1)])
         threshold = float(max(np.quantile(usual, 0.99), self._cfg.least_ratio))
         above = np.flatnonzero(evidence.windows[k] > threshold)
         moment = float(above[0] * self._cfg.window) if len(above) and own != "policy" else self._stalled(trial)
@@ -202,7 +202,7 @@ class Judge:
             cause=own,
             moment=moment,
             left_prediction=left,
-            sentence=_sentence(own, moment, left, numbers),
+            sentence=trial_sentence(own, moment, left, numbers),
             evidence=numbers,
             divergence=evidence.windows[k],
             threshold=threshold,
@@ -266,19 +266,3 @@ def _median(values: np.ndarray) -> float | None:
     """Return the median of known values; None where there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
-
-
-def _sentence(cause: Cause, moment: float | None, left: float | None, numbers: dict[str, float | None]) -> str:
-    """Return a sentence on one trial."""
-    when = "" if moment is None else f" at {moment:.2f} s"
-    outside = "" if left is None else f"; outside the band of simulated episodes from {left:.2f} s on"
-    success = f"{numbers['success in own simulation']:.0%} of simulated episodes from its start succeed"
-    if cause == "policy":
-        limits = f"commands at a limit of the lead in {numbers['lead at limit']:.0%} of the steps"
-        return f"The policy fails in its own simulation too: {success}; no progress{' after' + when[3:] if when else ''}; {limits}{outside}."
-    if cause == "unexplained":
-        return f"No cause is found: {success}, misfit {numbers['misfit']:.1f}{outside}."
-    what = "An error of the tracked pose" if cause == "perception" else "Physics that the model lacks"
-    share = numbers[f"explained by {cause}"]
-    explained = "" if share is None else f" explains {share:.0%} of the difference"
-    return f"{what}{explained}: the model and the measurements part{when}; {success}{outside}."

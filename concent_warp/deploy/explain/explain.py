@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from concent_warp.checks import check_settings
 from concent_warp.deploy.explain.cfg import ExplainCfg
 from concent_warp.deploy.explain.evidence import Evidence, Judge
+from concent_warp.deploy.explain.measured_start import MeasuredStart
 from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
+from concent_warp.deploy.explain.policy_evidence import other_action
 from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, fit_pose_bias
 from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
 from concent_warp.deploy.explain.replay_trial import Replayer
@@ -22,7 +25,10 @@ from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ConcentError, RecordingError, TrainError
 from concent_warp.files import write_json
-from concent_warp.recording.recording import Recording
+from concent_warp.model import Model
+from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.train.environment.observation import ObservationLayout
+from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
 
 Progress = Callable[[float, str], None]
@@ -123,8 +129,8 @@ class _Explaining:
         total = sum(len(r.demonstrations) for r in self._recordings)
         return judge.explanation(evidence, [r.source for r, _ in self._chosen], self._failed, total)
 
-    def _simulate(self, starts: Sequence, begin: float, end: float, **options) -> SimulatedTrials:  # noqa: ANN003
-        """Run the policy's own simulation; see `OwnSimulation.run`."""
+    def _simulate(self, starts: Sequence[MeasuredStart], begin: float, end: float, **options: Any) -> SimulatedTrials:
+        """Run the policy's own simulation; see `OwnSimulation.run` for the options."""
         text = "asking the policy's own simulation"
         return self._own.run(starts, progress=lambda s: self._progress(begin + (end - begin) * s, text), **options)
 
@@ -148,8 +154,18 @@ class _Explaining:
             free=_known([t.free_error for t in (*trials, *others)]),
             usual_free=_known([t.free_error for t in simulated]),
             windows=[t.windows(replayer, contact, scale, width) for t in trials],
+            difference=self._difference(trials),
             usual_windows=[t.windows(replayer, contact, scale, width) for t in simulated],
         )
+
+    def _difference(self, trials: Sequence[PreparedTrial]) -> float | None:
+        """Return by how much logged actions differ from those of the policy, asked again; None without a log."""
+        act, cfg = self._own.act, self._policy.run.cfg.environment.observation
+        if act is None:
+            return None
+        size = ObservationLayout.of(self._own.task, cfg).size * cfg.history
+        found = [other_action(act, size, t.demonstration) for t in trials]
+        return max((one for one in found if one is not None), default=None)
 
     def _with_bias(self, evidence: Evidence) -> Evidence:
         """Search for an error of tracked poses, and see how much of all trials' misfit it explains."""
@@ -172,7 +188,7 @@ class _Explaining:
         """Search for a missing effect in failed trials, and see how much of all trials' misfit it explains."""
         cfg = self._cfg
         names = cfg.effects or (_robot_effects() if judge.moves_otherwise(evidence) else ())
-        recording = _joined([d for d in self._chosen[: cfg.diagnose_trials]])
+        recording = _joined(self._chosen[: cfg.diagnose_trials])
         settings = DiagnoseCfg(
             effects=self._possible(names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
             seed=cfg.seed, explain=False,
@@ -215,7 +231,7 @@ class _Explaining:
         except ConcentError:  # training supports no such effect
             return evidence
 
-    def _biased(self, bias: PoseBias):  # noqa: ANN202
+    def _biased(self, bias: PoseBias) -> SensorErrorsCfg:
         """Return the instruments of training with an error of tracked poses."""
         sensors, task = self._policy.run.cfg.environment.observation.sensors, self._own.task
         position, rotation = bias.value[:3].tolist(), bias.value[3:].tolist()
@@ -235,12 +251,12 @@ def _robot_effects() -> tuple[str, ...]:
     return tuple(n for n, kind in effect_classes().items() if kind.family == "joints" or n == "gravity_tilt")
 
 
-def _joined(trials: Sequence[tuple[Recording, object]]) -> Recording:
+def _joined(trials: Sequence[tuple[Recording, Demonstration]]) -> Recording:
     """Return one recording of trials from several ones, renumbered."""
     demonstrations = tuple(replace(d, name=f"demo_{k}", policy=None) for k, (_, d) in enumerate(trials))
     return Recording(trials[0][0].scene, demonstrations, source=trials[0][0].source)
 
 
-def _added(policy: Policy, diagnosis: Diagnosis):  # noqa: ANN202
+def _added(policy: Policy, diagnosis: Diagnosis) -> Model:
     """Return the policy's model with the effects that were accepted."""
     return replace(policy.run.model, effects=diagnosis.model.effects)

@@ -1,7 +1,7 @@
 """How far a replay is from a trial, as one number, and by when it differs.
 
-Errors are in units of their noise; joint errors also of what the trials of the policy's own simulation show, whose gains
-and masses vary. Large errors count logarithmically (Cauchy's loss), because after a contact that went another way
+Errors are in units of their noise; joint errors also of what the trials of the policy's own simulation show, whose
+gains and masses vary. Large errors count logarithmically (Cauchy's loss), because after a contact that went another way
 they say nothing more.
 """
 

@@ -21,6 +21,7 @@ from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.sample import ResetStates
 from concent_warp.train.task.movable_fixtures import mocap_id
 from concent_warp.train.task.task import Task
+from concent_warp.train.trials.episodes import PolicyFunction
 from concent_warp.train.trials.evaluate import run_episodes
 
 
@@ -54,6 +55,8 @@ class OwnSimulation:
         """Prepare the task; `repetitions` episodes start from each state."""
         self._policy, self._repetitions, self._seed = policy, repetitions, seed
         self.task: Task = policy.run.task()
+        self.act: PolicyFunction | None = None
+        """The policy, once it has run."""
 
     def run(
         self,
@@ -92,8 +95,8 @@ class OwnSimulation:
             for episode in episodes.tolist():
                 positions.setdefault(episode, []).append(place[episode].copy())
 
-        act = recorder.acting(self._policy.act_in(environment))
-        found = run_episodes(environment, act, states, progress=progress, watch=watch)
+        self.act = self._policy.act_in(environment)
+        found = run_episodes(environment, recorder.acting(self.act), states, progress=progress, watch=watch)
         return SimulatedTrials(
             found.success.reshape(len(starts), self._repetitions),
             recorder.recording(found, range(count)),

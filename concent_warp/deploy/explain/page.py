@@ -105,8 +105,8 @@ def _section(explanation: Explanation, names: Sequence[str]) -> str:
         f"<p><b>{escape(_capital(explanation.headline))}.</b></p><ul>{said}</ul>"
         "<h3>Trial by trial</h3>"
         "<p class='about'>The chart has the error of the replay over noise in windows of time, on a logarithmic scale "
-        "from 0.5 to 50. The dashed line is what simulated trials stay below, the red one the moment of which the table "
-        "speaks.</p>"
+        "from 0.5 to 50. The dashed line is what simulated trials stay below, the red one the moment in the "
+        "table.</p>"
         "<div class='scroll'><table><tr><th>trial</th><th>cause</th><th>moment [s]</th><th>leaves prediction [s]</th>"
         f"<th>replay against measurement</th><th>evidence</th></tr>{rows}</table></div>"
         f"<h3>All trials together</h3><div class='scroll'><table>{numbers}</table></div>"
@@ -148,7 +148,7 @@ def _height(value: float) -> float:
 
 def _number(value: float | None) -> str:
     """Return a number as text; a dash where there is none."""
-    return "–" if value is None or not np.isfinite(value) else f"{value:.2f}"
+    return "-" if value is None or not np.isfinite(value) else f"{value:.2f}"
 
 
 def _capital(text: str) -> str:

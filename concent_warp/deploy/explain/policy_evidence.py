@@ -1,4 +1,4 @@
-"""What a trial says about the policy itself: limits of its commands, unusual observations, whether the log is its own."""
+"""What a trial says about the policy itself: limits of its commands, unusual observations, actions asked again."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from concent_warp.deploy.explain.cfg import ExplainCfg
@@ -51,7 +52,7 @@ class PreparedTrial:
 class Preparation:
     """Makes trials of one task ready."""
 
-    def __init__(self, task: Task, scene: object, cfg: ExplainCfg) -> None:
+    def __init__(self, task: Task, scene: mujoco.MjModel, cfg: ExplainCfg) -> None:
         """Compile what trials are replayed in; `scene` is the compiled nominal scene."""
         self.task, self.cfg, self._scene = task, cfg, scene
         self.contact = ContactStarts(task.compiled, task.objects[0], cfg.start)

@@ -32,8 +32,10 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
             "--environment.observation.sensors.position-std 0.003 --environment.observation.sensors.constant-share 0.8",
         )
     if cause == "physics":
-        names = "" if diagnosis is None or not diagnosis.accepted else " --effects " + " ".join(
-            dict.fromkeys(f.name for f in diagnosis.accepted)
+        names = (
+            ""
+            if diagnosis is None or not diagnosis.accepted
+            else " --effects " + " ".join(dict.fromkeys(f.name for f in diagnosis.accepted))
         )
         return (
             "# add the missing effect to the model, with its intervals",

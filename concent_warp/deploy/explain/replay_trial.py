@@ -71,7 +71,7 @@ def trial_readings(m: mujoco.MjModel, task: Task, demonstration: Demonstration) 
 
 
 def _pose_noise(m: mujoco.MjModel, demonstration: Demonstration, body: int) -> tuple[float, float]:
-    """Return the stated noise of a body's tracked positions [m] and orientations [rad], else that of a usual tracker."""
+    """Return the stated noise of a body's tracked positions [m] and orientations [rad], else a usual tracker's."""
     found = [POSITION_STD, ORIENTATION_STD]
     for name, channel in demonstration.measured.items():
         row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, name)
