@@ -21,6 +21,10 @@ _HOMES = {
     "deploy.cfg": ("EvaluateCfg", "HandoverCfg", "PlayCfg", "RenderCfg"),
     "deploy.distil": ("distil",),
     "deploy.evaluate": ("evaluate",),
+    "deploy.explain.cfg": ("ExplainCfg",),
+    "deploy.explain.explain": ("explain",),
+    "deploy.explain.page": ("write_explanation",),
+    "deploy.explain.result": ("Explanation", "TrialExplanation"),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
     "diagnosis.cfg": ("DiagnoseCfg",),
@@ -67,7 +71,7 @@ _HOMES = {
     "recording.load": ("load_recording",),
     "recording.logs.cfg": ("ImportCfg",),
     "recording.logs.import_log": ("import_log",),
-    "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "recording.recording": ("Channel", "Demonstration", "PointTrack", "PolicyLog", "Recording"),
     "render.dataset.from_recording": ("WriteLeRobotCfg", "write_lerobot"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
@@ -107,6 +111,10 @@ if TYPE_CHECKING:
     from concent_warp.deploy.cfg import EvaluateCfg, HandoverCfg, PlayCfg, RenderCfg
     from concent_warp.deploy.distil import distil
     from concent_warp.deploy.evaluate import evaluate
+    from concent_warp.deploy.explain.cfg import ExplainCfg
+    from concent_warp.deploy.explain.explain import explain
+    from concent_warp.deploy.explain.page import write_explanation
+    from concent_warp.deploy.explain.result import Explanation, TrialExplanation
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
     from concent_warp.diagnosis.cfg import DiagnoseCfg
@@ -167,7 +175,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.logs.cfg import ImportCfg
     from concent_warp.recording.logs.import_log import import_log
-    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, PolicyLog, Recording
     from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report

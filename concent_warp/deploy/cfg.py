@@ -61,6 +61,8 @@ class EvaluateCfg(RealityWorldCfg):
     of the drives it bounds the force that the robot exerts."""
     videos: int = 0
     """Number of first episodes in Reality to record as MP4."""
+    record_failures: bool = False
+    """Whether only failed trials are recorded."""
     cameras: LiveCamerasCfg = field(default_factory=LiveCamerasCfg)
     """Reality's cameras, by which a student acts."""
 
@@ -164,8 +166,8 @@ class RenderCfg:
     """Settings of the hand-over from another policy, where one is given."""
 
 
-def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0) -> None:
-    """Check the settings of an evaluation.
+def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0, *, record: bool = False) -> None:
+    """Check the settings of an evaluation; `record` says whether its trials are to be recorded.
 
     Raises:
         TrainError: One is out of bounds, or concerns Reality while the policy runs in simulation.
@@ -180,3 +182,5 @@ def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: in
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     if cfg.videos and world != "reality":
         raise TrainError("videos are of Reality", fix="add --world reality")
+    if record and world != "reality":
+        raise TrainError("trials are recorded in Reality", fix="add --world reality")

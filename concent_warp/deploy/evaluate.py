@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +13,12 @@ import torch
 from concent_warp.checks import check_device
 from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
 from concent_warp.deploy.reality_world import reality_environment, reality_world
+from concent_warp.deploy.record_trials import TrialRecorder
 from concent_warp.files import all_or_none
 from concent_warp.reality.hidden.in_task import TaskWorld
 from concent_warp.reality.sensors.live_cameras import LiveCamerasCfg
 from concent_warp.reality.sensors.video import render_video, write_video
+from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.run_folder import claim_file, make_folder
 from concent_warp.scene.cameras import BASE_FOVY
 from concent_warp.train.distil.cfg import ImagesCfg
@@ -28,7 +30,10 @@ from concent_warp.train.policy.load import Policy
 from concent_warp.train.resets.reset_states import ResetStates
 from concent_warp.train.task.task import Task
 from concent_warp.train.trials.episodes import PolicyFunction
-from concent_warp.train.trials.evaluate import Evaluation, run_episodes
+from concent_warp.train.trials.evaluate import Evaluation, Watch, run_episodes
+
+TRIALS = "trials.h5"
+"""Recording of the trials, in the folder that is asked for."""
 
 
 def evaluate(
@@ -40,6 +45,7 @@ def evaluate(
     seed: int = 0,
     device: str | None = None,
     out: str | Path | None = None,
+    record: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
@@ -60,7 +66,8 @@ def evaluate(
             without one.
         out: Folder of the videos; by default the folder `videos` in the policy's run folder, or in the working
             directory for a pretrained policy.
-        overwrite: Replace existing videos.
+        record: Folder for the recording ``trials.h5`` of the trials in Reality, for `explain`.
+        overwrite: Replace existing videos and recordings.
         progress: Called with the share done, 0..1.
 
     Raises:
@@ -74,8 +81,10 @@ def evaluate(
         1.0
     """
     cfg = cfg or EvaluateCfg()
-    check_evaluation(cfg, world, episodes, seed)
+    check_evaluation(cfg, world, episodes, seed, record=record is not None)
     check_device(device)
+    if record is not None:
+        claim_file(Path(record) / TRIALS, overwrite=overwrite)
     default = Path("videos") if policy.pretrained else policy.folder / "videos"
     videos = _video_files(cfg, default if out is None else Path(out), overwrite=overwrite)
     policy = policy.scaled(cfg.action_scale, cfg.setpoint_lead_scale)
@@ -97,7 +106,11 @@ def evaluate(
         real = reality_world(task, settings, cfg) if world == "reality" else None
         act = _act_in(policy, environment, real, cfg.cameras, seed=seed, device=device)
         environment.read_log()
-        found = run_episodes(environment, act, states, progress=progress, watch=states_seen)
+        watches: list[Watch] = [states_seen]
+        recorder = None if record is None else TrialRecorder(run, environment, cfg.sensors)
+        if recorder is not None:
+            act, watches = recorder.acting(act), [states_seen, recorder]
+        found = run_episodes(environment, act, states, progress=progress, watch=_all(watches))
         share, buffers = environment.read_log()["overflow"], environment.buffers
         if share:
             repeated = "the scene needs more memory (<size memory>)" if buffers is None else "the episodes are repeated"
@@ -105,9 +118,30 @@ def evaluate(
         if not share or buffers is None:
             break
         settings = replace(settings, nconmax=2 * buffers[0], njmax=2 * buffers[1])
+    recorded = _write_trials(Path(record) / TRIALS, recorder, found, cfg) if record and recorder else None
     if videos:
         _write_videos(videos, states_seen, reality_world(task, settings, cfg), task, states, environment.control_step)
-    return replace(found, videos=tuple(videos))
+    return replace(found, videos=tuple(videos), recorded=recorded)
+
+
+def _all(watches: Sequence[Watch]) -> Watch:
+    """Return a watch that calls several ones."""
+
+    def watch(episodes: np.ndarray, qpos: np.ndarray) -> None:
+        for one in watches:
+            one(episodes, qpos)
+
+    return watch
+
+
+def _write_trials(path: Path, recorder: TrialRecorder, found: Evaluation, cfg: EvaluateCfg) -> Path | None:
+    """Write the recording of the trials that are asked for, and return its path; None where there are none."""
+    chosen = [k for k in range(len(found.success)) if not (cfg.record_failures and found.success[k])]
+    if not chosen:
+        return None
+    make_folder(path.parent)
+    write_hdf5(recorder.recording(found, chosen), path)
+    return path
 
 
 def _act_in(
@@ -194,4 +228,4 @@ def _write_videos(
 
 def without_reality(cfg: EvaluateCfg) -> EvaluateCfg:
     """Return the settings without hidden effects and videos, for an evaluation in simulation."""
-    return replace(cfg, hide=(), videos=0)
+    return replace(cfg, hide=(), videos=0, record_failures=False)

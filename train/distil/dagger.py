@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -292,24 +294,20 @@ class Dagger:
             log["teacher success"] = taught_succeeded / taught
         return log
 
-    def _writer(self) -> Any:
-        """Return a context with a function that writes an iteration's metrics to the run folder."""
-        from contextlib import contextmanager
+    @contextmanager
+    def _writer(self) -> Iterator[Report]:
+        """Yield a function that writes an iteration's metrics to the run folder."""
+        if self.folder is None or not self.process.is_rank_zero:
+            yield lambda _: None
+            return
+        with curve(self.folder, self.steps) as write:
 
-        @contextmanager
-        def writer() -> Any:
-            if self.folder is None or not self.process.is_rank_zero:
-                yield lambda _: None
-                return
-            with curve(self.folder, self.steps) as write:
-                yield lambda this: write(
-                    {
-                        "iteration": this.iteration, "steps": this.steps, "seconds": this.seconds, **this.log,
-                        "collecting": this.collecting, "updating": this.updating, "steps_per_second": this.rate,
-                    }
-                )  # fmt: skip
+            def write_iteration(this: Iteration) -> None:
+                point = {"iteration": this.iteration, "steps": this.steps, "seconds": this.seconds, **this.log}
+                spent = {"collecting": this.collecting, "updating": this.updating}
+                write({**point, **spent, "steps_per_second": this.rate})
 
-        return writer()
+            yield write_iteration
 
     def weights(self) -> dict[str, Any]:
         """Return the student's state, with iterations, steps and seconds of training."""

@@ -46,8 +46,10 @@ class Arguments:
     """Seed of the initial states."""
     out: OptionalOutPath = None
     """Folder for the videos; by default the folder videos in the run folder, of a pretrained policy here."""
+    record: Path | None = None
+    """Folder for a recording of the trials in Reality, as instruments and tracker show them, for concent explain."""
     overwrite: bool = False
-    """Replace videos that are there."""
+    """Replace videos and recordings that are there."""
     json: bool = False
     """Print one JSON object with the outcome of every episode instead of sentences."""
     device: DeviceOption = None
@@ -62,9 +64,10 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         "all": ("simulation", "stress", "reality"),
     }
     worlds = several[arguments.world] if arguments.world in ("both", "all") else (arguments.world,)
-    check_evaluation(cfg, worlds[-1], arguments.episodes)
-    if arguments.out is not None:
-        check_folder(arguments.out)
+    check_evaluation(cfg, worlds[-1], arguments.episodes, record=arguments.record is not None)
+    for folder in (arguments.out, arguments.record):
+        if folder is not None:
+            check_folder(folder)
     if arguments.instruction is not None and arguments.task_of is None:
         raise TrainError("an instruction is for flow policies", expected="--task-of", found=arguments.instruction)
     if check_flow_policy(arguments.checkpoint, arguments.task_of):
@@ -88,6 +91,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
                 seed=arguments.seed,
                 device=arguments.device,
                 out=arguments.out,
+                record=arguments.record if world == "reality" else None,
                 overwrite=arguments.overwrite,
                 progress=progress,
             )
@@ -96,6 +100,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
             say(f"{world}{hidden}: {found[world].sentence()}")
             if found[world].videos:
                 say_written(*found[world].videos)
+            if (recorded := found[world].recorded) is not None:
+                say_written(recorded)
     if arguments.json:
         named = str(arguments.checkpoint) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
         document: dict[str, Any] = {
