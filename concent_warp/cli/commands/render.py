@@ -36,7 +36,7 @@ class Arguments:
     recording: Path | None = None
     """Render the measured motion of a recording instead of a policy."""
     handover: Path | None = None
-    """Run folder of a policy that drives first."""
+    """Run folder of the first driver."""
     out: OutPath = Path("runs/dataset")
     """Folder of the data set."""
     format: Format = "lerobot"
