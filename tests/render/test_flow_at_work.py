@@ -79,6 +79,16 @@ def test_a_policy_of_the_state_drives_too(folder):
     assert all(length <= longest - 5 for length in rows(folder / "state"))
 
 
+def test_a_student_drives_by_images_of_its_own(folder):
+    teacher = cw.load_policy("shape_sorter")
+    dagger = cw.DaggerCfg(iterations=1, worlds=2, steps=2, updates=1, batch=2)
+    images = cw.ImagesCfg(cameras=("wrist",), size=16, samples=1)
+    cw.distil(teacher, cw.DistilCfg(states=4, images=images, dagger=dagger), device="cpu", out=folder / "student")
+    command = [*COMMON, "--episodes", "2", "--keep", "all", "--handover", str(folder / "student")]
+    assert main([*command, "--handover.time", "0.5", "0.5", "-o", str(folder / "by_student")]) == 0
+    assert len(rows(folder / "by_student")) == 2
+
+
 def test_wrong_drivers_are_refused(folder, capsys):
     def said(*options: str) -> str:
         assert main([*COMMON, "-o", str(folder / "bad"), *options]) == 2

@@ -36,7 +36,7 @@ class Arguments:
     recording: Path | None = None
     """Render the measured motion of a recording instead of a policy."""
     handover: Path | None = None
-    """Run folder of the first driver."""
+    """Run folder of a policy that drives first: data of how to recover."""
     out: OutPath = Path("runs/dataset")
     """Folder of the data set."""
     format: Format = "lerobot"
@@ -45,7 +45,7 @@ class Arguments:
     resume: bool = False
     """Continue an interrupted data set, or one with fewer episodes."""
     overwrite: bool = False
-    """Replace an earlier data set in the folder."""
+    """Replace a data set in the folder."""
     cfg: Annotated[RenderCfg, tyro.conf.arg(name="")] = field(default_factory=RenderCfg)
 
 
