@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +54,8 @@ def test_the_policy_acts_as_logged_when_it_is_asked_again(policy: cw.Policy, tri
     from concent_warp.train.environment.worlds import make_environment
 
     task = policy.run.task()
-    environment = make_environment(
-        task, cw.EnvironmentCfg(worlds=1, edges=policy.run.cfg.environment.edges), policy.run.evaluation_states(task, 1, 0),
-        device="cpu",
-    )  # fmt: skip
+    cfg = replace(policy.run.cfg.environment, worlds=1)
+    environment = make_environment(task, cfg, policy.run.evaluation_states(task, 1, 0), device="cpu")
     act = policy.act_in(environment)
     difference = other_action(act, 155, trials[0])
     assert difference is not None
@@ -65,8 +64,6 @@ def test_the_policy_acts_as_logged_when_it_is_asked_again(policy: cw.Policy, tri
 
 
 def test_a_log_of_another_length_is_refused(trials: Recording, tmp_path: Path) -> None:
-    from dataclasses import replace
-
     log = trials[0].policy
     assert log is not None
     wrong = replace(trials[0], policy=replace(log, action=log.action[1:]))
