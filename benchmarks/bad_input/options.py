@@ -23,6 +23,7 @@ NEEDED = {
     "distil": "shape_sorter --device cpu -o out",
     "train-flow": "dataset --device cpu -o out",
     "evaluate": "--pretrained --device cpu",
+    "explain": "shape_sorter recording.h5 -o out",
     "play": "--pretrained",
     "export": "--pretrained -o out.onnx",
     "splat-fit": "images -o out",
@@ -38,7 +39,7 @@ NEEDED = {
 SIGNED = (
     "--jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
     "--reality.sensing.camera-target", "--environment.reward.engineered.hole", "--environment.reward.engineered.seat",
-    "-position", "-yaw", "--start",
+    "-position", "-yaw", "-bias", "--start",
 )  # fmt: skip
 """Ends of options that may be -1."""
 SENSELESS = {"FLOAT": ("nan", "-1", "inf", "1e300"), "INT": ("-1", "9" * 300, "1.5", "nan", "-1")}
@@ -84,6 +85,11 @@ WRONG = {
         "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",
         "--pretrained nobody", "-o scene.xml", "--pretrained a b",
         "--task-of shape_sorter", "--instruction dance",
+        "--world simulation --record out", "--world reality --record scene.xml", "--sensors.biased lid",
+    ),
+    "explain": (
+        "gone.h5", "--effects magic", "--jobs 0", "--action-scale 0", "--html scene.xml", "--most-trials 0",
+        "--seed -1",
     ),
     "play": (
         "--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0",

@@ -16,8 +16,9 @@ SERVO = ROOT / "concent_warp" / "examples" / "servo.h5"
 SHIPPED = ROOT / "train" / "pretrained" / "shape_sorter"
 QUICK = "--reality.expert.speed 2"
 SPHERES, GENERATIONS, POPULATION = 60, 4, 4
-RECORDING, MODEL, SERVO_MODEL, TRAINED, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, DATASET = (
-    "demo.h5", "model.toml", "servo.toml", "trained", "photographs", "empty.h5", "video.h5", "log", "dataset",
+RECORDING, MODEL, SERVO_MODEL, TRAINED, TRIALS, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, DATASET = (
+    "demo.h5", "model.toml", "servo.toml", "trained", "trials", "photographs", "empty.h5", "video.h5", "log",
+    "dataset",
 )  # fmt: skip
 """Names of the inputs."""
 TRAIN = (
@@ -102,7 +103,12 @@ WRITING = [
     Writing(
         "evaluate",
         f"evaluate --checkpoint {{inputs}}/{TRAINED} --world reality --episodes 2 --videos 2 --device cpu "
-        "--out {out}",
+        "--out {out} --record {out}/trials",
+    ),
+    Writing(
+        "explain",
+        f"explain {{inputs}}/{TRAINED} {{inputs}}/{TRIALS} --no-diagnose --most-trials 1 --repetitions 2 "
+        "--html {out}/page.html --out {out}/run",
     ),
     Writing("export, ONNX", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.onnx"),
     Writing("export, TorchScript", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.pt"),
@@ -164,6 +170,7 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
         SERVO_MODEL: f"add joint_damping --model servo.xml --out {SERVO_MODEL}",
         TRAINED: f"{TRAIN} --iterations 2 --out {TRAINED}",
         DATASET: f"render --pretrained --episodes 2 --size 32 --cameras base --device cpu --keep all --out {DATASET}",
+        TRIALS: f"evaluate --checkpoint {TRAINED} --world reality --episodes 2 --device cpu --record {TRIALS}",
         FOOTAGE: f"record --out {FOOTAGE} --seeds 10 {QUICK} --reality.footage.cameras base "
         "--reality.footage.size 64 64 --reality.footage.rate 5 --reality.footage.no-objects",
         VIDEO: f"record --out {VIDEO} --seeds 0 {QUICK} --reality.sensing.images --reality.sensing.image-rate 10 "
