@@ -1,4 +1,4 @@
-"""Recordings of given motions in Reality: commands and initial states from a motion file, as ``concent suggest`` writes it."""
+"""Recordings of given motions in Reality: initial states and commands, as ``concent suggest`` writes them."""
 
 from __future__ import annotations
 

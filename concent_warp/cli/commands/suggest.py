@@ -30,8 +30,8 @@ from concent_warp.run_folder import claim_file, command_line, lock_folder, make_
 
 @dataclass(frozen=True)
 class Arguments:
-    """Find the motion whose recording decides what a diagnosis leaves open: the effects of a group, or an interval that is
-    too wide. It is written as commands that run, within the limits of the recording, with an animation.
+    """Find the motion whose recording decides what a diagnosis leaves open: the effects of a group, or an interval
+    that is too wide. It is written as commands that run, within the limits of the recording, with an animation.
 
     Exit status 3: nothing is open, or no motion within the limits decides it; no file is written.
     """
@@ -39,8 +39,8 @@ class Arguments:
     recording: tyro.conf.Positional[tuple[Path, ...]]
     """Recording; several of the same scene are taken together."""
     out: OutPath = Path("motion.h5")
-    """Motion file to write (.h5), for concent record --motion and concent replay; beside it the commands (.csv) and a page
-    with the animation (.html)."""
+    """Motion file to write (.h5), for concent record --motion and concent replay; beside it the commands (.csv) and a
+    page with the animation (.html)."""
     model: Path | None = None
     """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     diagnosis: Path | None = None
@@ -59,8 +59,8 @@ class Arguments:
     population: Annotated[int, Bounds(4, 4096)] = SuggestCfg.population
     """Trajectories in one batch of simulations."""
     max_interval: Positive = SuggestCfg.max_interval
-    """Half the 95 % interval of a parameter over its distance from the null value, above which an effect is not known well
-    enough [-]."""
+    """Half the 95 % interval of a parameter over its distance from the null value, above which an effect is not known
+    well enough [-]."""
     limits: MotionLimitsCfg = field(default_factory=MotionLimitsCfg)
     trajectory: TrajectoryCfg = field(default_factory=TrajectoryCfg)
     engine: EngineOption = "mujoco"

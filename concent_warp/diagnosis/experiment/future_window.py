@@ -1,4 +1,4 @@
-"""A motion that was not recorded yet, as windows with the readings that instruments will take, and what models predict."""
+"""A motion that was not recorded yet as a window with the readings to come, and what models predict of these."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ sensors' noise, after what errors of the initial state could account for is proj
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,12 +28,11 @@ from concent_warp.diagnosis.experiment.trajectory import motion_trajectory
 from concent_warp.errors import ConcentError
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.files import write_json
-from concent_warp.fit.effects.observation import ObservedRecording, Reading, Window, start_spread
+from concent_warp.fit.effects.observation import ObservedRecording, Window
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
-from concent_warp.fit.effects.prediction import Prediction, SimulationRequest, turn
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
-from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS
+from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
 

@@ -18,8 +18,8 @@ class MotionLimitsCfg:
     """Limits of a suggested motion, relative to the present recording unless they are absolute."""
 
     reach: Positive = 1.0
-    """Range of the commands and of the joint positions over the recorded one, about its middle [-]. Limits of joints and
-    actuators in the model hold besides."""
+    """Range of the commands and of the joint positions over the recorded one, about its middle [-]. Limits of joints
+    and actuators in the model hold besides."""
     speed: Positive = 1.0
     """Highest speed of a joint over the highest one in the recording [-]."""
     force: Share = 0.9
@@ -78,8 +78,8 @@ class SuggestCfg:
 
     method: Method = "best"
     """Where the motion is looked for: "menu" (sweeps, reversals, chirps, holds, repetitions, pushes and drops),
-    "optimised" (trajectories whose parameters are searched), "best" of both, or "random" (one such trajectory within the
-    limits, for comparison)."""
+    "optimised" (trajectories whose parameters are searched), "best" of both, or "random" (one such trajectory within
+    the limits, for comparison)."""
     duration: PositiveDuration = 8.0
     """Longest motion [s]."""
     evaluations: Count = 96
@@ -95,13 +95,14 @@ class SuggestCfg:
     """Squared error by which a refitted hypothesis must exceed the true one, over that of all data, old and new, to be
     excluded [-]: 2.5 times what a diagnosis counts as equal (`SearchCfg.near_equal`)."""
     max_nominal_values: int = 8
-    """Most nominal values (masses, lengths, gains, latencies within their tolerance, `NominalCfg`) that a refit may shift
-    in the search [-]; where there are more, they are open for the best motions only, as simulations grow with them."""
+    """Most nominal values (masses, lengths, gains, latencies within their tolerance, `NominalCfg`) that a refit may
+    shift in the search [-]; where there are more, they are open for the best motions only, as simulations grow with
+    them."""
     step: Positive = 0.1
     """Step of finite differences, over the standard deviation of a parameter or of an initial state [-]."""
     window: PositiveDuration = 2.0
-    """Longest window in which free bodies that can be touched are predicted from a measured state [s], as in a diagnosis
-    (`ObservationCfg.max_contact_length`)."""
+    """Longest window in which free bodies that can be touched are predicted from a measured state [s], as in a
+    diagnosis (`ObservationCfg.max_contact_length`)."""
     seed: int = 0
     """Seed of the search."""
     limits: MotionLimitsCfg = field(default_factory=MotionLimitsCfg)

@@ -1,8 +1,8 @@
 """What hypotheses predict for motions that were not recorded yet, and how far one can then be told from another.
 
-Let y_i be the readings that hypothesis i predicts, in units of their noise, F_j the dependence of those of hypothesis j on
-its parameters, A their dependence on the initial states of the windows, in units of the standard deviations with which
-the data at hand leave both open. Where i is true, refitting j to old and new data leaves the squared error
+Let y_i be the readings that hypothesis i predicts, in units of their noise, F_j the dependence of those of hypothesis
+j on its parameters, A their dependence on the initial states of the windows, in units of the standard deviations with
+which the data at hand leave both open. Where i is true, refitting j to old and new data leaves the squared error
 
     2 E_ij = min over p, a of  |y_i - y_j - F_j p - A a|^2 + |p|^2 + |a|^2,
 
@@ -41,8 +41,8 @@ class Forecast:
     """Expected log likelihood ratio [nat] of the true hypothesis (row) to another one (column) that is refitted to old
     and new data, shape (H, H)."""
     separation: np.ndarray
-    """What a refit leaves of the difference of the predictions, RMS over the noise in the channel where it is largest [-],
-    shape (H, H)."""
+    """What a refit leaves of the difference of the predictions, RMS over the noise in the channel where it is largest
+    [-], shape (H, H)."""
     channels: tuple[tuple[str, ...], ...]
     """These channels, H by H names."""
     count: int
@@ -150,7 +150,7 @@ def _windows(
     length = longest if has_touchable_free_body(recorded.m) else motion.duration
     while start < motion.duration - 1e-6:
         span = min(length, motion.duration - start)
-        row = min(int(round(start / recorded.m.opt.timestep)), len(course.time) - 1)
+        row = min(round(start / recorded.m.opt.timestep), len(course.time) - 1)
         action = {name: replace(c, time=c.time - start) for name, c in motion.action.items()}
         rest = replace(motion, qpos=course.qpos[0, row], qvel=course.qvel[0, row], action=action, duration=span)
         made = future_window(recorded, rest, span)
@@ -184,7 +184,7 @@ def _predicted(hypothesis: Hypothesis, windows: Sequence[Window], engine: Engine
 def _parameter_slopes(
     hypothesis: Hypothesis, windows: Sequence[Window], base: Sequence[Readings], engine: EngineName, step: float
 ) -> list[np.ndarray]:
-    """Return the change of a hypothesis's readings per standard deviation of its free parameters, (count, P) a window."""
+    """Return the change of the readings per standard deviation of free parameters, (count, P) a window."""
     prediction = Prediction(hypothesis.model, (), windows, engine=engine)
     free = np.flatnonzero(hypothesis.std > 0)
     low, high = (np.array([getattr(p, name) for p in prediction.parameters]) for name in ("low", "high"))

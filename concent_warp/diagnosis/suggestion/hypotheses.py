@@ -1,7 +1,7 @@
 """The hypotheses that the next recording is to tell apart: what a diagnosis leaves open, fitted to the data at hand.
 
-Two kinds: the effects of a group, one hypothesis each beside all other accepted effects; or the ends of the interval of a
-parameter that is not known well enough.
+Two kinds: the effects of a group, one hypothesis each beside all other accepted effects; or the ends of the interval
+of a parameter that is not known well enough.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from concent_warp.diagnosis.result import Diagnosis
-from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
 from concent_warp.diagnosis.search.nominal_values import possible_nominal_effects
+from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
 from concent_warp.documents import is_number, read_json
 from concent_warp.effects.effect import AddedEffect
 from concent_warp.effects.registry import effect_class
@@ -71,8 +71,8 @@ class OpenQuestion:
     def narrowed(self, evidence: float) -> float:
         """Return the width that is left after a recording.
 
-        The ends of a 95 % interval are 2 x 1.96 standard deviations s apart, and tell them apart with an evidence E [nat]
-        adds the information 2 E / (2 x 1.96 s)^2 to 1 / s^2.
+        The ends of a 95 % interval are 2 x 1.96 standard deviations s apart, and tell them apart with an evidence E
+        [nat] adds the information 2 E / (2 x 1.96 s)^2 to 1 / s^2.
         """
         return self.width / float(np.sqrt(1 + 2 * evidence / (2 * NORMAL_QUANTILE) ** 2))
 
@@ -149,7 +149,7 @@ def fitted_hypotheses(
     fitted = {name: fit(model) for name, model in question.models.items()}
     if question.parameter is None:
         return [Hypothesis(name, one, _spread(one)) for name, one in fitted.items()]
-    ((name, one),) = fitted.items()
+    (one,) = fitted.values()
     effect, k, low, high = question.parameter
     added = one.effects[effect]
     parameter = added.effect.parameters(_before(one, effect).compile())[k]
@@ -169,7 +169,8 @@ def read_diagnosis(path: Path, model: Model) -> dict[str, Any]:
     """Return a saved diagnosis as its JSON object.
 
     Args:
-        path: What ``concent diagnose --json`` printed (``.json``), or the model that ``--apply`` wrote (``.toml``), which
+        path: What ``concent diagnose --json`` printed (``.json``), or the model that ``--apply`` wrote (``.toml``),
+        which
             has the accepted effects with their intervals, and no groups.
         model: The model that was diagnosed.
 
@@ -276,14 +277,14 @@ def _with(model: Model, findings: Sequence[Mapping[str, Any]]) -> Model:
 
 def _with_nominal(model: Model, rows: Sequence[Mapping[str, Any]]) -> Model:
     """Return a model with the nominal values that a diagnosis has fitted, before its other effects."""
-    values = {str(row.get("name")): row.get("value") for row in rows if isinstance(row, Mapping)}
+    values = {str(r["name"]): float(r["value"]) for r in rows if "name" in r and is_number(r.get("value"))}
     compiled, added = model.compile(), []
     for effect in possible_nominal_effects(model) if values else ():
         for target in effect.target:
             (one,) = [type(effect)(target)]
             names = [p.name for p in one.parameters(compiled)]
-            if set(names) & set(values):
-                added.append(AddedEffect(one, tuple(float(values[name]) for name in names)))
+            if set(names) <= set(values):
+                added.append(AddedEffect(one, tuple(values[name] for name in names)))
     return replace(model, effects=(*added, *model.effects))
 
 

@@ -69,7 +69,8 @@ class _Extremes:
             np.max([p.high for p in parts], axis=0),
             np.max([p.speed for p in parts], axis=0),
             np.max([p.force for p in parts], axis=0),
-            *boxes,
+            boxes[0],
+            boxes[1],
             frozenset().union(*(p.pairs for p in parts)),
         )
 
@@ -203,7 +204,7 @@ class MotionLimits:
         return self.m.joint(joint).name or f"joint {joint}"
 
     def _extremes(self, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, away: Iterable[int] = ()) -> _Extremes:
-        """Return what a motion reaches, from positions (K + 1, nq), velocities (K + 1, nv) and commands (K or more, nu)."""
+        """Return what a motion reaches, from positions (T, nq), velocities (T, nv) and commands (K, nu)."""
         m, far = self.m, set(away)
         data = mujoco.MjData(m)
         links = sorted(self.links)

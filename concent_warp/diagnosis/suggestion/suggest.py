@@ -66,7 +66,8 @@ def suggest(
         model: The model that was, or is to be, diagnosed.
         recording: The data at hand.
         cfg: Settings.
-        diagnosis: Of the model with this recording; its JSON object; or a file, see `read_diagnosis`. Without, the model
+        diagnosis: Of the model with this recording; its JSON object; or a file, see `read_diagnosis`. Without, the
+        model
             is diagnosed first.
         diagnose_cfg: Settings of that diagnosis.
         engine: Which engine simulates motions and fits; batches of motions are for "warp" on a CUDA device, too.
@@ -213,11 +214,11 @@ def _searched(
         return Suggestion(f"No motion is within the limits{why}.", question.sentence, models=models)
     candidate, forecast = best
     pairs, enough = _pairs(hypotheses, forecast, needed(forecast)), needed(forecast)
-    if not any(pair.resolved for pair in pairs):
+    if cfg.method != "random" and not any(pair.resolved for pair in pairs):
         most = max(pairs, key=lambda pair: pair.evidence)
         return Suggestion(
-            f"No motion within the limits separates {' and '.join(models)}: the best one, {candidate.name}, is expected to "
-            f"bring {most.evidence:.2g} nat, of {enough:.2g} needed.",
+            f"No motion within the limits separates {' and '.join(models)}: the best, {candidate.name}, is expected "
+            f"to bring {most.evidence:.2g} nat, of {enough:.2g} needed.",
             question.sentence,
             pairs=pairs,
             needed=enough,
@@ -314,8 +315,8 @@ def _suggestion(
 def motion_recording(recorded: RecordedRange, candidate: Candidate, model: Model, engine: EngineName) -> Recording:
     """Return motions as a recording: scene, initial states and commands.
 
-    Where nothing is commanded, as in throws, it has the readings that a model predicts in the place of measurements, since
-    they tell how long a motion lasts.
+    Where nothing is commanded, as in throws, it has the readings that a model predicts in the place of measurements,
+    since they tell how long a motion lasts.
 
     Args:
         recorded: The present recording.

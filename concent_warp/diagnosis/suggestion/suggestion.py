@@ -1,4 +1,4 @@
-"""A suggested recording: motions as commands that run, the evidence that they are expected to bring, and their files."""
+"""A suggested recording: motions as commands that run, the evidence that they will bring, and their files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ class Suggestion:
         >>> import concent_warp as cw
         >>> recording = cw.load_recording(cw.example("servo"))
         >>> model = cw.Model.from_recording(recording)
-        >>> diagnosis = cw.diagnose(model, recording, cw.DiagnoseCfg(effects=("joint_friction",), jobs=1, explain=False))
+        >>> cfg = cw.DiagnoseCfg(effects=("joint_friction",), jobs=1, explain=False)
+        >>> diagnosis = cw.diagnose(model, recording, cfg)
         >>> cw.suggest(model, recording, diagnosis=diagnosis).found
         False
     """

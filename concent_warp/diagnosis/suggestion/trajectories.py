@@ -26,8 +26,10 @@ Source = Literal["optimised", "random"]
 class Family(Protocol):
     """Motions by parameters."""
 
-    name: str
-    """Of the kind of motion."""
+    @property
+    def name(self) -> str:
+        """Of the kind of motion."""
+        ...
 
     @property
     def size(self) -> int:

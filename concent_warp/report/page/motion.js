@@ -11,31 +11,13 @@ for (const one of data.motions) {
 }
 for (const line of data.predictions) { line.t = numbers(line.time); line.v = numbers(line.value); }
 
-function product(p, q) {
-  const [a, b, c, d] = p, [e, f, g, h] = q;
-  return [a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g, a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e];
-}
-function turnedBy(q, v) {
-  const [w, ...u] = q, t = Vec.cross(u, v).map((x) => 2 * x), s = Vec.cross(u, t);
-  return v.map((x, i) => x + w * t[i] + s[i]);
-}
-function parts(geom, p, q) {
-  const at = Vec.plus(p, turnedBy(q, geom.position)), way = product(q, geom.quaternion), [a, b, c] = geom.size, colour = geom.colour;
-  const make = (shape, scale, shift = 0) => ({ shape, position: Vec.plus(at, turnedBy(way, [0, 0, shift])), quaternion: way, scale, colour });
-  if (geom.shape === "mesh") return [make(`mesh:${geom.mesh}`, [1, 1, 1])];
-  if (geom.shape === "sphere") return [make("sphere", [a, a, a])];
-  if (geom.shape === "ellipsoid") return [make("sphere", [a, b, c])];
-  if (geom.shape === "cylinder") return [make("cylinder", [a, a, b])];
-  if (geom.shape === "capsule") return [make("cylinder", [a, a, b]), make("sphere", [a, a, a], b), make("sphere", [a, a, a], -b)];
-  return [make("box", [a, b, c])];
-}
 function items() {
   const one = data.motions[state.motion], found = [];
   let frame = 0;
   while (frame + 1 < one.at.length && one.at[frame + 1] <= state.time + 1e-6) frame++;
   data.bodies.forEach((body, b) => {
     const k = 7 * (frame * data.bodies.length + b), row = Array.from(one.poses.subarray(k, k + 7));
-    if (Number.isFinite(row[0])) for (const geom of body.geoms) found.push(...parts(geom, row.slice(0, 3), row.slice(3)));
+    if (Number.isFinite(row[0])) for (const geom of body.geoms) found.push(...geomItems(geom, row.slice(0, 3), row.slice(3), geom.colour));
   });
   return found;
 }
