@@ -14,7 +14,7 @@ from concent_warp.reality.rigs.registry import RIGS
 from concent_warp.recording.recording import Channel, Recording
 from concent_warp.scene.scene import Scene
 
-PART = 0.25
+PART = 0.1
 """Share of each recording that is the first one: of its time, or of its throws. Short recordings leave more open."""
 SHIFT = 8000
 """Added to the seeds of `hidden_effects_data.cases`, so that the data are those of no other page."""

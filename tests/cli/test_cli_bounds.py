@@ -30,6 +30,7 @@ NEGATIVE = {
     "--eye": COORDINATE,
     "--lights.ground": COORDINATE,
     "--start": COORDINATE,
+    "--limits.workspace": COORDINATE,
     "--reality.expert.grip-height": COORDINATE,
     "--reality.sensing.camera-position": COORDINATE,
     "--reality.sensing.camera-target": COORDINATE,

@@ -86,7 +86,7 @@ class SuggestCfg:
     """Trajectories that are simulated in the search of each kind."""
     population: Annotated[int, Bounds(4, 4096)] = 12
     """Trajectories in one batch of simulations."""
-    max_hypotheses: Annotated[int, Bounds(2, 64)] = 4
+    max_hypotheses: Annotated[int, Bounds(2, 64)] = 6
     """Most hypotheses that are compared, the likeliest first; the cost grows with their number."""
     max_interval: Positive = 0.25
     """Half the 95 % interval of a parameter over its distance from the null value, above which an effect that is not in

@@ -45,7 +45,17 @@ class Rated:
     """What it exceeds."""
 
 
-@dataclass
+@dataclass(frozen=True)
+class Found:
+    """What a search has found."""
+
+    best: tuple[Candidate, Forecast] | None
+    """The best candidate within the limits with its forecast; None where there is none."""
+    exceeded: tuple[str, ...]
+    """Which limits other candidates exceed."""
+
+
+@dataclass(frozen=True)
 class Search:
     """One search."""
 
@@ -59,8 +69,8 @@ class Search:
     evaluations: Evaluations
     report: Report
 
-    def run(self) -> tuple[Candidate, Forecast] | None:
-        """Return the best candidate within the limits with its forecast; None where there is none."""
+    def run(self) -> Found:
+        """Return the best candidate within the limits."""
         method = self.cfg.method
         rated: list[Rated] = []
         if method == "random":
@@ -70,7 +80,6 @@ class Search:
         if method in ("best", "optimised"):
             rated += self.optimised()
         inside = [one for one in rated if one.excess == 0 and np.isfinite(one.score)]
-        self.refused = [one for one in rated if one.excess > 0]
         best: tuple[Candidate, Forecast] | None = None
         for source in ("menu", "optimised", "random"):
             kind = sorted((r for r in inside if r.candidate.source == source), key=lambda r: -r.score)
@@ -79,7 +88,7 @@ class Search:
                 found = self.forecast([one.candidate], careful=True)[0]
                 if found is not None and (best is None or self.score(found) > self.score(best[1])):
                     best = one.candidate, found
-        return best
+        return Found(best, tuple(sorted({word for one in rated for word in one.words})))
 
     @cached_property
     def _open(self) -> list[Hypothesis]:
@@ -91,9 +100,6 @@ class Search:
         """The same where these are few enough for the search."""
         few = max(h.nominal for h in self._open) <= self.cfg.max_nominal_values
         return self._open if few else self.hypotheses
-
-    refused: Sequence[Rated] = ()
-    """Candidates out of the limits, after `run`."""
 
     def score(self, found: Forecast) -> float:
         """Return the score of a forecast."""

@@ -206,13 +206,12 @@ def _searched(
     scored = _Prefixed(evaluations, key_of(identity, values, question.width))
     sub = lambda share, text: report(0.3 + 0.65 * share, text)  # noqa: E731
     search = Search(hypotheses, recorded, limits, cfg, engine, needed, scored, sub)
-    best = search.run()
+    found = search.run()
     models = {h.name: h.model for h in hypotheses}
-    if best is None:
-        words = sorted({word for one in search.refused for word in one.words})
-        why = f": all exceed them ({', '.join(words[:4])})" if words else ""
+    if found.best is None:
+        why = f": all exceed them ({', '.join(found.exceeded[:4])})" if found.exceeded else ""
         return Suggestion(f"No motion is within the limits{why}.", question.sentence, models=models)
-    candidate, forecast = best
+    candidate, forecast = found.best
     pairs, enough = _pairs(hypotheses, forecast, needed(forecast)), needed(forecast)
     if cfg.method != "random" and not any(pair.resolved for pair in pairs):
         most = max(pairs, key=lambda pair: pair.evidence)
