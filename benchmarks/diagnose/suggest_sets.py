@@ -11,7 +11,8 @@ from concent_warp.reality.hidden.hidden_effect import HiddenEffectOfRig
 from concent_warp.reality.hidden.registry import hidden
 from concent_warp.reality.record_motion import record_rig_motion
 from concent_warp.reality.rigs.registry import RIGS
-from concent_warp.recording.recording import Channel, Recording
+from concent_warp.recording.cut import beginning
+from concent_warp.recording.recording import Recording
 from concent_warp.scene.scene import Scene
 
 PART = 0.1
@@ -54,15 +55,7 @@ def shortened(recording: Recording, part: float) -> Recording:
     count = len(recording.demonstrations)
     if count > 1:
         return replace(recording, demonstrations=recording.demonstrations[: max(round(part * count), 1)])
-    (whole,) = recording.demonstrations
-    end = part * whole.duration
-
-    def cut(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-        return {
-            name: replace(c, time=c.time[c.time <= end], value=c.value[c.time <= end]) for name, c in channels.items()
-        }
-
-    return replace(recording, demonstrations=(replace(whole, action=cut(whole.action), measured=cut(whole.measured)),))
+    return beginning(recording, part * recording.demonstrations[0].duration)
 
 
 def second_recording(one: SuggestSet, motion: Recording) -> Recording:

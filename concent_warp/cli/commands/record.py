@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.markup import escape
 
+from concent_warp.checks import PositiveDuration
 from concent_warp.cli.options import OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.errors import SceneError
@@ -21,6 +22,7 @@ from concent_warp.reality.record_motion import record_motion, record_rig_motion,
 from concent_warp.reality.rigs.registry import RIGS
 from concent_warp.reality.rigs.rig import record_rig
 from concent_warp.reality.world import HiddenEffect
+from concent_warp.recording.cut import beginning
 from concent_warp.recording.formats.hdf5 import write_hdf5
 from concent_warp.recording.load import load_recording
 from concent_warp.recording.recording import Recording
@@ -61,6 +63,8 @@ class Arguments:
     """Motion to perform in place of the demonstration, as concent suggest writes it; --seeds are those of the noise."""
     hide: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Effects that act in Reality and that the recording does not mention, such as joint_friction=1.2."""
+    longest: PositiveDuration | None = None
+    """Longest demonstration [s]; what comes later is left out."""
     overwrite: bool = False
     """Replace the file if it is there."""
     reality: RealityCfg = field(default_factory=RealityCfg)
@@ -119,6 +123,8 @@ def run(arguments: Arguments) -> Recording:
         quiet_warp()
     with progress_bar("recording") as progress:
         recording = _recorded(arguments, motion, effects, progress)
+    if arguments.longest is not None:
+        recording = beginning(recording, arguments.longest)
     make_folder(arguments.out.parent)
     write_hdf5(recording, arguments.out)
     for demonstration in recording.demonstrations:

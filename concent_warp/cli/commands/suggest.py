@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +21,7 @@ from concent_warp.cli.options import EngineOption, NoiseOption, OutPath
 from concent_warp.cli.terminal import say, say_written
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.suggestion.cfg import Method, MotionLimitsCfg, SuggestCfg, TrajectoryCfg
-from concent_warp.diagnosis.suggestion.suggest import suggest, suggestion_json
+from concent_warp.diagnosis.suggestion.suggest import EVALUATIONS_FILE, suggest, suggestion_json
 from concent_warp.diagnosis.suggestion.suggestion import Suggestion, motion_files
 from concent_warp.errors import ConcentError
 from concent_warp.files import all_or_none, write_text
@@ -106,7 +108,7 @@ def run(arguments: Arguments) -> Suggestion:
     if arguments.overwrite and marker.is_file():
         shutil.rmtree(folder)
     make_folder(folder)
-    with lock_folder(folder):
+    with lock_folder(folder), _discarded_if_empty(folder):
         write_text(marker, f"{command_line()}\n")
         with work_progress("searching") as progress, say_how_to_resume(marker):
             found = suggest(
@@ -134,6 +136,17 @@ def run(arguments: Arguments) -> Suggestion:
     if not found.found:
         raise SystemExit(NOTHING_FOUND)
     return found
+
+
+@contextmanager
+def _discarded_if_empty(folder: Path) -> Iterator[None]:
+    """Remove the folder of a state after an error within the context, if nothing was saved in it."""
+    try:
+        yield
+    except ConcentError:
+        if not (folder / EVALUATIONS_FILE).is_file() and not any((folder / "diagnosis").glob("*.npz")):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def _say_suggestion(found: Suggestion) -> None:

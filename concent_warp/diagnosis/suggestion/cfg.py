@@ -98,7 +98,7 @@ class SuggestCfg:
     """Most nominal values (masses, lengths, gains, latencies within their tolerance, `NominalCfg`) that a refit may
     shift in the search [-]; where there are more, they are open for the best motions only, as simulations grow with
     them."""
-    step: Positive = 0.1
+    step: Positive = 0.3
     """Step of finite differences, over the standard deviation of a parameter or of an initial state [-]."""
     window: PositiveDuration = 2.0
     """Longest window in which free bodies that can be touched are predicted from a measured state [s], as in a

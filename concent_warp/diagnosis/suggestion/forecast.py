@@ -16,19 +16,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
+from scipy.linalg import block_diag
 
 from concent_warp.diagnosis.experiment.future_window import difference_in_noise, future_window
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.suggestion.hypotheses import Hypothesis
 from concent_warp.errors import ConcentError
-from concent_warp.fit.effects.observation import ObservedRecording, Window
+from concent_warp.fit.effects.observation import NumericalScatter, ObservedRecording, Window
 from concent_warp.fit.effects.observe import has_touchable_free_body, keeps_close
 from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
+from concent_warp.fit.effects.scatter import with_scatter
 from concent_warp.simulate.select import EngineName
 
+REFITS = 5
+"""Steps of a simulated refit."""
 Readings = list[np.ndarray]
 """Predicted readings of a window, one (T, dim) for each channel."""
 
@@ -115,7 +120,8 @@ def forecasts(
         window: Longest window where free bodies can be touched [s].
         step: Step of finite differences [standard deviations].
         starts: Whether initial states are estimated too, else they are known.
-        careful: Whether windows end where errors of their initial states are no longer of proportional effect.
+        careful: Whether windows end where errors of their initial states are no longer of proportional effect, the
+            numerical scatter of contacts counts as noise, as in a diagnosis, and refits are simulated.
         seed: Seed of the disturbances that determine that.
     """
     windows, owner = [], []
@@ -128,12 +134,17 @@ def forecasts(
         base = [_predicted(h, windows, engine) for h in hypotheses]
         slopes = [_parameter_slopes(h, windows, of_h, engine, step) for h, of_h in zip(hypotheses, base, strict=True)]
         of_starts = _start_slopes(hypotheses[0], windows, base[0], engine, step) if starts else None
+        scatter = _scatter(hypotheses[0], recorded, windows, base[0], engine) if careful else [None] * len(windows)
     except (ConcentError, ValueError, mujoco.FatalError):
         return [None] * len(candidates)
     found: list[Forecast | None] = []
     for k in range(len(candidates)):
         rows = [w for w, of in enumerate(owner) if of == k]
-        found.append(_forecast(hypotheses, rows, windows, base, slopes, of_starts) if rows else None)
+        found.append(
+            _forecast(hypotheses, rows, windows, base, slopes, of_starts, scatter, engine if careful else None)
+            if rows
+            else None
+        )
     return found
 
 
@@ -223,6 +234,30 @@ def _start_slopes(
     return found
 
 
+def _scatter(
+    hypothesis: Hypothesis,
+    recorded: RecordedRange,
+    windows: Sequence[Window],
+    base: Sequence[Readings],
+    engine: EngineName,
+) -> list[NumericalScatter | None]:
+    """Return the numerical scatter of a hypothesis's predictions in each window, None where nothing touches."""
+    filled = [
+        replace(w, readings=tuple(replace(r, value=v) for r, v in zip(w.readings, seen, strict=True)))
+        for w, seen in zip(windows, base, strict=True)
+    ]
+    return [w.scatter for w in with_scatter(hypothesis.model, filled, engine, recorded.observation)]
+
+
+def _whitened(scatter: NumericalScatter | None, value: np.ndarray) -> np.ndarray:
+    """Return differences (count,) or (count, P) in units of noise and scatter together."""
+    if scatter is None:
+        return value
+    if value.ndim == 1:
+        return scatter.whitened(value)
+    return np.stack([scatter.whitened(column) for column in value.T], axis=1) if value.size else value
+
+
 def _forecast(
     hypotheses: Sequence[Hypothesis],
     rows: Sequence[int],
@@ -230,56 +265,110 @@ def _forecast(
     base: Sequence[Sequence[Readings]],
     slopes: Sequence[Sequence[np.ndarray]],
     starts: Sequence[np.ndarray] | None,
+    scatter: Sequence[NumericalScatter | None],
+    engine: EngineName | None,
 ) -> Forecast | None:
-    """Return the forecast of the candidate that some of the windows belong to."""
-    size = len(hypotheses)
+    """Return the forecast of the candidate that some of the windows belong to; with an engine, refits are simulated."""
+    size, own = len(hypotheses), [windows[w] for w in rows]
     evidence, separation = np.zeros((size, size)), np.zeros((size, size))
     channels = [[""] * size for _ in range(size)]
-    for j in range(size):
-        free = slopes[j][rows[0]].shape[1]
-        eliminated, normal = [], np.eye(free)
-        for w in rows:
-            flat = slopes[j][w]
-            eliminated.append(None if starts is None else _Eliminated(starts[w]))
-            if free:
-                normal = normal + flat.T @ _without(eliminated[-1], flat)
+    for j, hypothesis in enumerate(hypotheses):
+        refit = _Refit(
+            hypothesis,
+            own,
+            [_whitened(scatter[w], slopes[j][w]) for w in rows],
+            None if starts is None else [_whitened(scatter[w], starts[w]) for w in rows],
+            [scatter[w] for w in rows],
+        )
         for i in range(size):
             if i == j:
                 continue
-            apart = [difference_in_noise(windows[w], base[i][w], base[j][w]) for w in rows]
-            if not all(np.isfinite(d).all() for d in apart) or not np.isfinite(normal).all():
+            found = refit.to([base[i][w] for w in rows], [base[j][w] for w in rows], engine)
+            if found is None:
                 return None
-            gradient = np.zeros(free)
-            for d, w, one in zip(apart, rows, eliminated, strict=True):
-                gradient = gradient + slopes[j][w].T @ _without(one, d)
-            refit = np.linalg.solve(normal, gradient) if free else gradient
-            total, squares = 0.0, dict[str, list[np.ndarray]]()
-            for d, w, one in zip(apart, rows, eliminated, strict=True):
-                left = d - slopes[j][w] @ refit
-                total += float(left @ _without(one, left))
-                left = left - (0.0 if one is None else one.shift(left))
-                for r in windows[w].readings:
-                    squares.setdefault(r.channel, []).append(left[r.rows])
-            evidence[i, j] = 0.5 * (total + float(refit @ refit))
+            cost, left = found
+            evidence[i, j] = 0.5 * cost
+            squares, start = dict[str, list[np.ndarray]](), 0
+            for window in own:
+                for r in window.readings:
+                    squares.setdefault(r.channel, []).append(left[start + r.rows.start : start + r.rows.stop])
+                start += window.count
             ratios = {name: float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) for name, parts in squares.items()}
             channels[i][j] = max(ratios, key=lambda name: ratios[name])
             separation[i, j] = ratios[channels[i][j]]
-    return Forecast(evidence, separation, tuple(map(tuple, channels)), sum(windows[w].count for w in rows))
+    return Forecast(evidence, separation, tuple(map(tuple, channels)), sum(w.count for w in own))
 
 
 @dataclass(frozen=True)
-class _Eliminated:
-    """Initial states that are estimated along with what is measured."""
+class _Refit:
+    """Fits of a hypothesis to what others predict in W windows, from the data at hand as its prior."""
 
-    slope: np.ndarray
-    """Dependence of the readings on them, in units of noise and of their standard deviations, shape (count, 2 nv)."""
+    hypothesis: Hypothesis
+    windows: Sequence[Window]
+    slopes: Sequence[np.ndarray]
+    """Dependence of the readings on free parameters, in units of noise and standard deviations, (count, P) a window."""
+    starts: Sequence[np.ndarray] | None
+    """The same on initial states, (count, 2 nv) a window; None where these are known."""
+    scatter: Sequence[NumericalScatter | None]
 
-    def shift(self, value: np.ndarray) -> np.ndarray:
-        """Return what the best initial state takes up of differences, shape (count,) or (count, P)."""
-        normal = self.slope.T @ self.slope + np.eye(self.slope.shape[1])
-        return self.slope @ np.linalg.solve(normal, self.slope.T @ value)
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """Dependence of all readings on the parameters, then on the initial states of each window."""
+        blocks = [] if self.starts is None else [block_diag(*self.starts)]
+        return np.concatenate([np.concatenate(self.slopes), *blocks], axis=1)
 
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Normal matrix of the fits with their prior."""
+        return self.jacobian.T @ self.jacobian + np.eye(self.jacobian.shape[1])
 
-def _without(eliminated: _Eliminated | None, value: np.ndarray) -> np.ndarray:
-    """Return differences (count,) or (count, P) without what initial states take up."""
-    return value if eliminated is None else value - eliminated.shift(value)
+    def to(
+        self, target: Sequence[Readings], own: Sequence[Readings], engine: EngineName | None
+    ) -> tuple[float, np.ndarray] | None:
+        """Return squared error and prior of the best fit, and what it leaves (count,); None where one is not finite.
+
+        Args:
+            target: What the true hypothesis predicts, a window each.
+            own: What this one predicts before the fit.
+            engine: What simulates the fits (Gauss-Newton steps with the slopes as they are, the best one counts); None
+                for the linear fit alone.
+        """
+        apart = self._apart(target, own)
+        if not np.isfinite(apart).all() or not np.isfinite(self.normal).all():
+            return None
+        fitted = np.linalg.solve(self.normal, self.jacobian.T @ apart)
+        left = apart - self.jacobian @ fitted
+        if engine is None:
+            return float(left @ left + fitted @ fitted), left
+        best, at = (float(apart @ apart), apart), np.zeros(len(fitted))
+        step = fitted
+        for _ in range(REFITS):
+            tried = at + step
+            apart = self._apart(target, self._simulated(tried, engine))
+            cost = float(apart @ apart + tried @ tried) if np.isfinite(apart).all() else np.inf
+            if cost < best[0]:
+                best, at = (cost, apart), tried
+                step = np.linalg.solve(self.normal, self.jacobian.T @ apart - at)
+            else:
+                step = 0.5 * step
+        return best
+
+    def _apart(self, target: Sequence[Readings], own: Sequence[Readings]) -> np.ndarray:
+        """Return the differences of readings in all windows, in units of noise, shape (count,)."""
+        parts = zip(self.scatter, self.windows, target, own, strict=True)
+        return np.concatenate([_whitened(one, difference_in_noise(w, a, b)) for one, w, a, b in parts])
+
+    def _simulated(self, fitted: np.ndarray, engine: EngineName) -> list[Readings]:
+        """Return what the hypothesis predicts in each window after a fit."""
+        prediction = Prediction(self.hypothesis.model, (), self.windows, engine=engine)
+        free = np.flatnonzero(self.hypothesis.std > 0)
+        low, high = (np.array([getattr(p, name) for p in prediction.parameters]) for name in ("low", "high"))
+        values = prediction.start.copy()
+        values[free] += fitted[: len(free)] * self.hypothesis.std[free]
+        values = np.clip(values, np.minimum(low, prediction.start), np.maximum(high, prediction.start))
+        offsets = fitted[len(free) :].reshape(len(self.windows), -1)
+        requests = [
+            SimulationRequest(k, values, offset * w.spread if len(offset) else None)
+            for k, (w, offset) in enumerate(zip(self.windows, offsets, strict=True))
+        ]
+        return _observed(self.hypothesis, prediction, requests)

@@ -155,7 +155,7 @@ class MotionLimits:
         if self.cfg.workspace:
             return np.array(self.cfg.workspace, dtype=float).reshape(2, 3)
         margin = self.cfg.workspace_margin
-        return self.recording.box + np.array([[-margin], [margin]])
+        return self.recording.box + np.array([[-margin], [margin]])  # infinite where nothing is a link
 
     def excess(self, motion: ProposedMotion, course: Course) -> Excess:
         """Return by how much a motion exceeds the limits, whichever hypothesis is true.
@@ -177,10 +177,11 @@ class MotionLimits:
         over = np.maximum(reached.force / self.force - 1, 0)
         sizes |= {f"force of {self.m.actuator(k).name}": float(v) for k, v in enumerate(over)}
         boxes = [reached.box] + ([reached.bodies] if self.cfg.workspace else [])
-        space, size = self.workspace, np.maximum(np.ptp(self.workspace, axis=0), 1e-6)
-        for box in boxes:
+        space = self.workspace
+        size = np.maximum(space[1] - space[0], 1e-6) if np.isfinite(space).all() else np.ones(3)
+        for box in boxes if np.isfinite(space).all() else ():
             out = np.maximum(np.maximum(space[0] - box[0], box[1] - space[1]), 0)
-            sizes["workspace"] = max(sizes.get("workspace", 0.0), float(np.nan_to_num(out / size).max(initial=0.0)))
+            sizes["workspace"] = max(sizes.get("workspace", 0.0), float((out / size).max()))
         if not self.cfg.contacts:
             for a, b in reached.pairs - self.recording.pairs:
                 sizes[f"contact of {self.m.body(a).name} and {self.m.body(b).name}"] = 1.0

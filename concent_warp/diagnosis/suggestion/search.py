@@ -52,7 +52,7 @@ class Found:
     best: tuple[Candidate, Forecast] | None
     """The best candidate within the limits with its forecast; None where there is none."""
     exceeded: tuple[str, ...]
-    """Which limits other candidates exceed."""
+    """Which limits the candidate exceeds that is nearest to them all."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Search:
                 found = self.forecast([one.candidate], careful=True)[0]
                 if found is not None and (best is None or self.score(found) > self.score(best[1])):
                     best = one.candidate, found
-        return Found(best, tuple(sorted({word for one in rated for word in one.words})))
+        return Found(best, min(rated, key=lambda r: r.excess).words if rated else ())
 
     @cached_property
     def _open(self) -> list[Hypothesis]:

@@ -209,15 +209,15 @@ def _searched(
     found = search.run()
     models = {h.name: h.model for h in hypotheses}
     if found.best is None:
-        why = f": all exceed them ({', '.join(found.exceeded[:4])})" if found.exceeded else ""
+        why = f": the nearest one exceeds {', '.join(found.exceeded[:4])}" if found.exceeded else ""
         return Suggestion(f"No motion is within the limits{why}.", question.sentence, models=models)
     candidate, forecast = found.best
     pairs, enough = _pairs(hypotheses, forecast, needed(forecast)), needed(forecast)
     if cfg.method != "random" and not any(pair.resolved for pair in pairs):
         most = max(pairs, key=lambda pair: pair.evidence)
         return Suggestion(
-            f"No motion within the limits separates {' and '.join(models)}: the best, {candidate.name}, is expected "
-            f"to bring {most.evidence:.2g} nat, of {enough:.2g} needed.",
+            f"No motion within the limits separates {' and '.join(models)}: the best, {candidate.name}, is "
+            f"expected to bring {most.evidence:.2g} nat, of {enough:.2g} needed. Wider limits may do.",
             question.sentence,
             pairs=pairs,
             needed=enough,
@@ -272,27 +272,22 @@ def _suggestion(
     """Return the suggestion of a candidate."""
     first = hypotheses[0]
     strongest = max(pairs, key=lambda pair: pair.evidence)
-    weakest = min(pairs, key=lambda pair: pair.evidence)
     motions = tuple(motion_trajectory(first.model, m, engine, recorded.cfg.rate) for m in candidate.motions)
     moved = courses(hypotheses, recorded, candidate.motions, engine)
     parts = [(m, c) for m, c in zip(candidate.motions, moved, strict=True) if c is not None]
     duration = sum(m.duration for m in candidate.motions)
     text = f"{candidate.text[0].upper()}{candidate.text[1:]} ({duration:.1f} s)."
     if question.parameter is not None:
+        weakest = min(pair.evidence for pair in pairs)
         brings = (
             f"It is expected to narrow the interval from {100 * question.width:.0f} % to "
-            f"{100 * question.narrowed(weakest.evidence):.0f} %"
+            f"{100 * question.narrowed(weakest):.0f} %."
         )
     else:
-        brings = (
-            f"Whichever of {' and '.join(h.name for h in hypotheses)} is true, it is expected to bring at least "
-            f"{weakest.evidence:.3g} nat against the others, of {needed:.3g} needed"
-        )
-    open_pairs = sorted({tuple(sorted((p.true, p.other))) for p in pairs if not p.resolved})
-    left = f" It leaves open {'; '.join(' or '.join(pair) for pair in open_pairs)}." if open_pairs else ""
+        brings = _brings([h.name for h in hypotheses], pairs, needed)
     sentence = (
-        f"{text} {brings}; the predictions of {strongest.true} and {strongest.other} differ by "
-        f"{ratio_text(strongest.separation)} noise ({channel_text(strongest.channel)}).{left}"
+        f"{text} {brings} The predictions of {strongest.true} and {strongest.other} differ by "
+        f"{ratio_text(strongest.separation)} noise ({channel_text(strongest.channel)}), the second one refitted."
     )
     return Suggestion(
         sentence=sentence,
@@ -308,6 +303,22 @@ def _suggestion(
         channel=strongest.channel,
         models={h.name: h.model for h in hypotheses},
         recording=motion_recording(recorded, candidate, first.model, engine),
+    )
+
+
+def _brings(names: list[str], pairs: tuple[SuggestedPair, ...], needed: float) -> str:
+    """Return what a motion tells apart in a sentence."""
+    decided = [pair for pair in pairs if pair.resolved]
+    least = min(pair.evidence for pair in decided)
+    if len(decided) == len(pairs):
+        return (
+            f"Whichever of {', '.join(names)} is true, it is expected to bring at least {least:.3g} nat against each "
+            f"of the others, of {needed:.3g} needed."
+        )
+    left = sorted({tuple(sorted((p.true, p.other))) for p in pairs if not p.resolved})
+    return (
+        f"It is expected to decide {len(decided)} of {len(pairs)} questions, with at least {least:.3g} nat, of "
+        f"{needed:.3g} needed, and to leave open {'; '.join(' or '.join(pair) for pair in left)}."
     )
 
 
