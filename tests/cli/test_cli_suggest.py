@@ -80,12 +80,13 @@ def test_an_interruption_says_how_to_go_on(suggest, monkeypatch, capsys):
         return rate(self, candidates, starts=starts)
 
     monkeypatch.setattr(Search, "_rated", stopped)
-    assert suggest("-o", "motion.h5") == 130
+    small = ["-o", "motion.h5", "--population", "4"]
+    assert suggest(*small) == 130
     assert "--resume" in capsys.readouterr().err
     monkeypatch.setattr(Search, "_rated", rate)
-    assert suggest("-o", "motion.h5") == 2
+    assert suggest(*small) == 2
     assert "was interrupted" in capsys.readouterr().err
-    assert suggest("-o", "motion.h5", "--resume") == 0
+    assert suggest(*small, "--resume") == 0
     assert sorted(path.name for path in Path().iterdir()) == ["motion.csv", "motion.h5", "motion.html"]
 
 

@@ -160,7 +160,8 @@ def _say_suggestion(found: Suggestion) -> None:
 
     table = Table(header_style="bold")
     for name in ("if true", "against", "evidence [nat]", "x noise", "channel", ""):
-        table.add_column(name, justify="right" if name in ("evidence [nat]", "x noise") else "left")
+        right = name in ("evidence [nat]", "x noise")
+        table.add_column(name, justify="right" if right else "left", overflow="fold")
     for pair in found.pairs:
         cells = [
             pair.true,

@@ -75,6 +75,19 @@ class _Extremes:
         )
 
 
+def check_workspace(cfg: MotionLimitsCfg) -> None:
+    """Check that a stated workspace is a box.
+
+    Raises:
+        ConcentError: It is none.
+    """
+    box = cfg.workspace
+    if box and (len(box) != 6 or not np.all(np.array(box[:3]) < np.array(box[3:]))):
+        raise ConcentError(
+            "the workspace is no box", expected="x, y, z of its lowest and of its highest corner", found=list(box)
+        )
+
+
 @dataclass(frozen=True)
 class MotionLimits:
     """Limits of motions in a scene."""
@@ -84,11 +97,7 @@ class MotionLimits:
     engine: EngineName
 
     def __post_init__(self) -> None:
-        box = self.cfg.workspace
-        if box and (len(box) != 6 or not np.all(np.array(box[:3]) < np.array(box[3:]))):
-            raise ConcentError(
-                "the workspace is no box", expected="x, y, z of its lowest and of its highest corner", found=list(box)
-            )
+        check_workspace(self.cfg)
 
     @property
     def m(self) -> mujoco.MjModel:

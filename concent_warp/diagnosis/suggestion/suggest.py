@@ -30,7 +30,7 @@ from concent_warp.diagnosis.suggestion.hypotheses import (
     open_question,
     read_diagnosis,
 )
-from concent_warp.diagnosis.suggestion.limits import MotionLimits
+from concent_warp.diagnosis.suggestion.limits import MotionLimits, check_workspace
 from concent_warp.diagnosis.suggestion.search import Search
 from concent_warp.diagnosis.suggestion.suggestion import SuggestedPair, Suggestion
 from concent_warp.effects.effect import AddedEffect
@@ -96,6 +96,7 @@ def suggest(
     """
     cfg, report = cfg or SuggestCfg(), progress or _ignore
     check_settings(cfg)
+    check_workspace(cfg.limits)
     model.check_recording(recording)
     folder = None if state is None else Path(state)
     if folder is not None:
