@@ -159,7 +159,7 @@ def _say_suggestion(found: Suggestion) -> None:
     from rich.table import Table
 
     table = Table(header_style="bold")
-    for name in ("if true", "against", "evidence [nat]", "x noise", "channel", ""):
+    for name in ("if true", "against", "evidence [nat]", "x noise", ""):
         right = name in ("evidence [nat]", "x noise")
         table.add_column(name, justify="right" if right else "left", overflow="fold")
     for pair in found.pairs:
@@ -168,7 +168,6 @@ def _say_suggestion(found: Suggestion) -> None:
             pair.other,
             f"{pair.evidence:.3g}",
             f"{pair.separation:.2g}",
-            pair.channel,
             "decided" if pair.resolved else "open",
         ]
         table.add_row(*map(escape, cells))

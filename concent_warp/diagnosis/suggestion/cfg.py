@@ -15,7 +15,13 @@ Method = Literal["best", "menu", "optimised", "random"]
 
 @dataclass(frozen=True)
 class MotionLimitsCfg:
-    """Limits of a suggested motion, relative to the present recording unless they are absolute."""
+    """Limits of a suggested motion, relative to the present recording unless they are absolute.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.MotionLimitsCfg(speed=0.5, workspace=(-0.3, -0.3, 0.0, 0.3, 0.3, 0.5)).speed
+        0.5
+    """
 
     reach: Positive = 1.0
     """Range of the commands and of the joint positions over the recorded one, about its middle [-]. Limits of joints
