@@ -33,6 +33,7 @@ NEGATIVE = {
     **{f"--{prefix}sensors.{name}-bias": COORDINATE
        for prefix in ("", "environment.observation.", "stress.")
        for name in ("position", "orientation")},
+    "--limits.workspace": COORDINATE,
     "--reality.expert.grip-height": COORDINATE,
     "--reality.sensing.camera-position": COORDINATE,
     "--reality.sensing.camera-target": COORDINATE,
