@@ -35,6 +35,9 @@ _HOMES = {
     "diagnosis.experiment.suggested": ("SuggestedExperiment",),
     "diagnosis.forces.cfg": ("LocateForcesCfg",),
     "diagnosis.result": ("Diagnosis", "Finding"),
+    "diagnosis.suggestion.cfg": ("MotionLimitsCfg", "SuggestCfg"),
+    "diagnosis.suggestion.suggest": ("suggest",),
+    "diagnosis.suggestion.suggestion": ("Suggestion",),
     "effects.effect": ("Effect", "Parameter"),
     "effects.registry": ("effect_class", "effect_classes"),
     "errors": (
@@ -125,6 +128,9 @@ if TYPE_CHECKING:
     from concent_warp.diagnosis.forces.cfg import LocateForcesCfg
     from concent_warp.diagnosis.forces.locate import locate_forces
     from concent_warp.diagnosis.result import Diagnosis, Finding
+    from concent_warp.diagnosis.suggestion.cfg import MotionLimitsCfg, SuggestCfg
+    from concent_warp.diagnosis.suggestion.suggest import suggest
+    from concent_warp.diagnosis.suggestion.suggestion import Suggestion
     from concent_warp.effects.effect import Effect, Parameter
     from concent_warp.effects.registry import effect_class, effect_classes
     from concent_warp.errors import (

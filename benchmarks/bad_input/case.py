@@ -13,6 +13,7 @@ READERS = {
     "events": "events {} --model model.toml -o out",
     "locate": "locate {} --png out.png",
     "diagnose": "diagnose {} --jobs 1 -o out",
+    "suggest": "suggest {} --diagnosis found.json --method menu -o motion.h5",
     "add": "add joint_friction --model model.toml --target elbow --fit {} -o out.toml",
     "geometry": "geometry {} -o out.toml",
     "train": "train {} --model model.toml --device cpu -o out",

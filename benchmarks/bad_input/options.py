@@ -17,12 +17,14 @@ NEEDED = {
     "events": "recording.h5 --model model.toml -o out",
     "compare": "recording.h5",
     "diagnose": "recording.h5 -o out",
+    "suggest": "recording.h5 --diagnosis found.json -o out.h5",
     "locate": "recording.h5",
     "add": "joint_friction --model model.toml --fit recording.h5 -o out.toml",
     "train": "recording.h5 --model model.toml --device cpu -o out",
     "distil": "shape_sorter --device cpu -o out",
     "train-flow": "dataset --device cpu -o out",
     "evaluate": "--pretrained --device cpu",
+    "explain": "shape_sorter recording.h5 -o out",
     "play": "--pretrained",
     "export": "--pretrained -o out.onnx",
     "splat-fit": "images -o out",
@@ -38,7 +40,7 @@ NEEDED = {
 SIGNED = (
     "--jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
     "--reality.sensing.camera-target", "--environment.reward.engineered.hole", "--environment.reward.engineered.seat",
-    "-position", "-yaw", "--start",
+    "-position", "-yaw", "-bias", "--start", "--limits.workspace",
 )  # fmt: skip
 """Ends of options that may be -1."""
 SENSELESS = {"FLOAT": ("nan", "-1", "inf", "1e300"), "INT": ("-1", "9" * 300, "1.5", "nan", "-1")}
@@ -53,6 +55,10 @@ WRONG = {
     ),
     "diagnose": (
         "--effects magic", "--window 0", "--jobs 0", "--additions 0",
+    ),
+    "suggest": (
+        "--method magic", "--duration 0", "--evaluations 0", "--population 1", "--max-interval 0", "--jobs 0",
+        "--diagnosis gone.json", "--diagnosis scene.xml", "--limits.workspace 1 2 3", "-o out.csv", "--model gone.xml",
     ),
     "locate": (
         "--window 0", "--png out.what", "--html scene.xml",
@@ -84,6 +90,11 @@ WRONG = {
         "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",
         "--pretrained nobody", "-o scene.xml", "--pretrained a b",
         "--task-of shape_sorter", "--instruction dance",
+        "--world simulation --record out", "--world reality --record scene.xml", "--sensors.biased lid",
+    ),
+    "explain": (
+        "gone.h5", "--effects magic", "--jobs 0", "--action-scale 0", "--html scene.xml", "--most-trials 0",
+        "--seed -1",
     ),
     "play": (
         "--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0",
@@ -113,7 +124,8 @@ WRONG = {
     ),
     "record": (
         "--seeds -1", "--robot gone.xml", "--robot.tcp-site gone", "--robot.gripper-actuators gone",
-        "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1",
+        "--reality.task.timestep 1e-9", "--reality.sensing.image-size 0 1", "--rig magic", "--motion gone.h5",
+        "--motion recording.h5", "--hide magic=1", "--hide joint_friction", "--rig pendulum --task stacking",
     ),
     "calibrate": (
         "--method magic", "--cameras nothing", "--tag-size 0", "--start 1 2", "--target-body nothing",

@@ -156,6 +156,29 @@ def toss_rows() -> np.ndarray:
     return rows
 
 
+def open_diagnosis(joint: str, size: float) -> dict[str, object]:
+    """Return a diagnosis, as JSON has it, that cannot distinguish friction of a joint from damping.
+
+    Args:
+        joint: Name of the joint.
+        size: Torque [N m] and damping [N m s/rad].
+    """
+    names = {"joint_friction": "torque", "joint_damping": "damping"}
+    effects = [
+        {
+            "name": name,
+            "target": [joint],
+            "accepted": name == "joint_friction",
+            "step": 0,
+            "parameters": [
+                {"name": f"{parameter}[{joint}]", "value": size, "interval": [size / 2, 2 * size], "null": 0.0}
+            ],
+        }
+        for name, parameter in names.items()
+    ]
+    return {"verdict": "group", "groups": [list(names)], "effects": effects}
+
+
 def write_all(folder: Path) -> None:
     """Write sound inputs of every kind into an empty folder."""
     import torch
@@ -167,6 +190,7 @@ def write_all(folder: Path) -> None:
     write_log(folder)
     write_dataset(folder / "dataset")
     (folder / "scene.xml").write_text(SCENE)
+    (folder / "found.json").write_text(json.dumps(open_diagnosis("elbow", 0.1)))
     (folder / "servo.json").write_text(json.dumps(servo_log()))
     torch.save(torch.from_numpy(toss_rows()).float(), folder / "toss.pt")
     policy = FOLDER / "shape_sorter"

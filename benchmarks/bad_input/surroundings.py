@@ -15,6 +15,7 @@ WRITERS = {
     "events": "events recording.h5 --model model.toml -o {}",
     "compare": "compare recording.h5 --html {}.html",
     "diagnose": "diagnose recording.h5 --jobs 1 -o {}",
+    "suggest": "suggest recording.h5 --diagnosis found.json --method menu -o {}.h5",
     "locate": "locate recording.h5 --png {}.png",
     "add": "add joint_friction --model model.toml --target elbow -o {}.toml",
     "train": "train policy/demonstration.h5 --model policy/model.toml --events policy/events.json --device cpu -o {}",

@@ -95,10 +95,12 @@ def _perception() -> list[Case]:
         ((0, 0, -0.012), ()), ((0.008, 0.003, 0), ("block",)), ((-0.008, -0.003, 0), ("block",)),
         ((0.008, 0, 0.003), ("block",)),
     ]  # fmt: skip
-    turns = (0.12, 0.15, 0.18, -0.12, -0.15, -0.18)
+    turns: tuple[Vector, ...] = (
+        (0, 0, 0.13), (0, 0, 0.15), (0, 0, 0.18), (0, 0, 0.2), (0, 0.12, 0), (0, 0.15, 0),
+    )  # fmt: skip
     return [
         *(Case(f"shift {k}", "perception", shift=shift, biased=biased) for k, (shift, biased) in enumerate(shifts)),
-        *(Case(f"turn {angle:g}", "perception", turn=(0.0, 0.0, angle)) for angle in turns),
+        *(Case(f"turn {k}", "perception", turn=turn) for k, turn in enumerate(turns)),
     ]
 
 

@@ -10,6 +10,7 @@ the same command; each result is kept as soon as it is there.
 
 from __future__ import annotations
 
+import gc
 import time
 import traceback
 from collections.abc import Sequence
@@ -117,6 +118,7 @@ class Benchmark:
             for world in WORLDS:
                 if self.kept.wanted(f"{key} {world}"):
                     self._attempt(f"{key} {world}", partial(self._trial, policy, world), teacher, variant, seed)
+            gc.collect()  # an environment refers to itself: its memory on the GPU is needed for the next one
         self.kept.close()
 
     def _distilled(self, teacher: Policy, variant: str, seed: int, key: str) -> cw.Student | None:

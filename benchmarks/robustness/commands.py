@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -16,8 +17,9 @@ SERVO = ROOT / "concent_warp" / "examples" / "servo.h5"
 SHIPPED = ROOT / "train" / "pretrained" / "shape_sorter"
 QUICK = "--reality.expert.speed 2"
 SPHERES, GENERATIONS, POPULATION = 60, 4, 4
-RECORDING, MODEL, SERVO_MODEL, TRAINED, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, DATASET = (
-    "demo.h5", "model.toml", "servo.toml", "trained", "photographs", "empty.h5", "video.h5", "log", "dataset",
+RECORDING, MODEL, SERVO_MODEL, TRAINED, TRIALS, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, DATASET, OPEN_DIAGNOSIS = (
+    "demo.h5", "model.toml", "servo.toml", "trained", "trials", "photographs", "empty.h5", "video.h5", "log",
+    "dataset", "found.json",
 )  # fmt: skip
 """Names of the inputs."""
 TRAIN = (
@@ -95,6 +97,10 @@ WRITING = [
         f"diagnose {SERVO} --effects joint_friction --jobs 1 --out {{out}}/pieces --apply {{out}}/m.toml "
         "--html {out}/report.html",
     ),
+    Writing(
+        "suggest",
+        f"suggest {SERVO} --diagnosis {{inputs}}/{OPEN_DIAGNOSIS} --method menu --out {{out}}/motion.h5",
+    ),
     Writing("locate", f"locate {SERVO} --png {{out}}/forces.png --html {{out}}/report.html"),
     Writing("add", f"add joint_friction --model {{inputs}}/{SERVO_MODEL} --fit {SERVO} --out {{out}}/m.toml"),
     Writing("train", f"{TRAIN} --iterations 4 --out {{out}}/run"),
@@ -102,7 +108,12 @@ WRITING = [
     Writing(
         "evaluate",
         f"evaluate --checkpoint {{inputs}}/{TRAINED} --world reality --episodes 2 --videos 2 --device cpu "
-        "--out {out}",
+        "--out {out} --record {out}/trials",
+    ),
+    Writing(
+        "explain",
+        f"explain {{inputs}}/{TRAINED} {{inputs}}/{TRIALS} --no-diagnose --most-trials 1 --repetitions 2 "
+        "--html {out}/page.html --out {out}/run",
     ),
     Writing("export, ONNX", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.onnx"),
     Writing("export, TorchScript", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.pt"),
@@ -164,6 +175,7 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
         SERVO_MODEL: f"add joint_damping --model servo.xml --out {SERVO_MODEL}",
         TRAINED: f"{TRAIN} --iterations 2 --out {TRAINED}",
         DATASET: f"render --pretrained --episodes 2 --size 32 --cameras base --device cpu --keep all --out {DATASET}",
+        TRIALS: f"evaluate --checkpoint {TRAINED} --world reality --episodes 2 --device cpu --record {TRIALS}",
         FOOTAGE: f"record --out {FOOTAGE} --seeds 10 {QUICK} --reality.footage.cameras base "
         "--reality.footage.size 64 64 --reality.footage.rate 5 --reality.footage.no-objects",
         VIDEO: f"record --out {VIDEO} --seeds 0 {QUICK} --reality.sensing.images --reality.sensing.image-rate 10 "
@@ -179,6 +191,10 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
             if done.code:
                 raise SystemExit(f"concent {line}: status {done.code}: {done.said}")
             print(f"made {name} in {done.seconds:.0f} s", flush=True)
+    if (names is None or OPEN_DIAGNOSIS in names) and not (inputs / OPEN_DIAGNOSIS).exists():
+        from benchmarks.bad_input.sound_inputs import open_diagnosis
+
+        (inputs / OPEN_DIAGNOSIS).write_text(json.dumps(open_diagnosis("hinge", 0.03)))
     if (names is None or PHOTOGRAPHS in names) and not (inputs / PHOTOGRAPHS / "transforms.json").exists():
         _photograph(inputs / PHOTOGRAPHS)
     if (names is None or LOG in names) and not (inputs / LOG).exists():

@@ -18,9 +18,10 @@ from concent_warp.errors import ConcentError, printable
 from concent_warp.run_folder import command_line, processes, versions
 from concent_warp.version import __version__
 
-DONE, FAULT, ERROR, INTERRUPTED, CLOSED, TERMINATED = 0, 1, 2, 130, 141, 143
-"""Exit codes: done; an error that no check foresaw; an input or setting that cannot be worked with; and, as shells
-count, 128 with the number of a signal: interrupted, output closed by its reader, terminated."""
+DONE, FAULT, ERROR, NOTHING_FOUND, INTERRUPTED, CLOSED, TERMINATED = 0, 1, 2, 3, 130, 141, 143
+"""Exit codes: done; an error that no check foresaw; an input or setting that cannot be worked with; what was looked
+for is not there, as a motion that decides a diagnosis; and, as shells count, 128 with the number of a signal:
+interrupted, output closed by its reader, terminated."""
 WAIT_FOR_RANK_ZERO = 10.0
 """How long other processes wait for the first one to say what is wrong [s]."""
 

@@ -35,6 +35,7 @@ GROUPS = {
     "which effect is missing": {
         "compare": "compare one model or two with a recording",
         "diagnose": "name the physical effect that a model lacks, or say why not",
+        "suggest": "find the motion to record next, where that is open",
         "locate": "find which joints and objects lack forces, and where",
         "add": "add a physical effect to a model and fit it to a recording",
     },
@@ -67,6 +68,7 @@ EXAMPLES = {
     "events": "concent events demo.h5 --model model.toml -o events",
     "compare": "concent compare demo.h5 --model model.toml --baseline scene.xml",
     "diagnose": "concent diagnose demo.h5 --model scene.xml --html report.html",
+    "suggest": "concent suggest demo.h5 --model scene.xml --diagnosis found.json -o motion.h5",
     "locate": "concent locate demo.h5 --model scene.xml --png forces.png",
     "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
     "train": "concent train demo.h5 --model model.toml -o runs/insert",
@@ -105,7 +107,8 @@ def _usage() -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
-    0: done. 1: an error that no check foresaw. 2: an input or a setting cannot be worked with. 130, 143: interrupted,
+    0: done. 1: an error that no check foresaw. 2: an input or a setting cannot be worked with. 3: there is nothing to
+    suggest. 130, 143: interrupted,
     terminated. 141: the reader of the output has gone. What is wrong is said in one sentence on standard error.
 
     Args:

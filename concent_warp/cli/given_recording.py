@@ -7,19 +7,23 @@ from pathlib import Path
 
 from concent_warp.errors import RecordingError
 from concent_warp.recording.load import load_recording
+from concent_warp.recording.merge import merged
 from concent_warp.recording.recording import Recording
 
 
-def given_recording(path: Path, demonstrations: Sequence[str] = (), noise: Sequence[str] = ()) -> Recording:
-    """Return a recording.
+def given_recording(
+    path: Path | Sequence[Path], demonstrations: Sequence[str] = (), noise: Sequence[str] = ()
+) -> Recording:
+    """Return a recording, or several of the same scene as one.
 
     Args:
-        path: File or folder.
+        path: File or folder, or several.
         demonstrations: Names of those to take; all where there are none.
         noise: Noise of channels, such as ``angle=0.001``.
 
     Raises:
-        RecordingError: It cannot be read, there is no such demonstration or channel, or the noise is no number.
+        RecordingError: It cannot be read, there is no such demonstration or channel, the noise is no number, or
+            recordings are of different scenes.
     """
     stated = {}
     for text in noise:
@@ -30,4 +34,7 @@ def given_recording(path: Path, demonstrations: Sequence[str] = (), noise: Seque
             channel = ""
         if not channel:
             raise RecordingError("noise is not stated so", expected="--noise CHANNEL=NUMBER", found=repr(text[:80]))
-    return load_recording(path).only(demonstrations).with_noise(stated)
+    paths = [path] if isinstance(path, Path) else path
+    if not paths:
+        raise RecordingError("no recording is given", fix="name the file of at least one")
+    return merged([load_recording(one) for one in paths]).only(demonstrations).with_noise(stated)

@@ -21,7 +21,7 @@ from concent_warp.reality.sensors.footage import FootageCfg, footage
 from concent_warp.reality.sensors.sensing import SensingCfg, measure, reading_steps
 from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import HiddenEffect, WorldCfg
-from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
 from concent_warp.scene.tabletop import yaw_quaternion
@@ -172,28 +172,51 @@ def _perform(
 
     truth = _judge(model, log, task)
     actions = {model.actuator(i).name: Channel(path.time, action[:, i]) for i in range(model.nu)}
+    sensed = sensed_motion(cfg, scene, world, model, log, effects, rng)
+    return Demonstration(name, task.text, truth.success, qpos, qvel, actions, *sensed), truth
+
+
+def sensed_motion(
+    cfg: RealityCfg,
+    scene: Scene,
+    world: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    log: WorldLog,
+    effects: tuple[HiddenEffect, ...],
+    rng: np.random.Generator,
+) -> tuple[dict[str, Channel], dict[str, PointTrack], dict[str, ImageStream]]:
+    """Return what the instruments show of a motion in Reality: readings, tracked points and images.
+
+    Args:
+        cfg: Settings.
+        scene: The nominal scene.
+        world: Reality, and `model` the same compiled.
+        model: See `world`.
+        log: The motion.
+        effects: Hidden effects.
+        rng: Random numbers of the noise.
+    """
     measured = measure(cfg.sensing, model, np.array(log.time), np.array(log.sensordata), rng)
     points = {
         body: PointTrack(np.array(log.frames), np.array(log.points[body]), np.array(log.visible[body]))
         for body in log.points
     }
-    image = {}
+    image, time, states = {}, np.array(log.time), np.array(log.qpos)
     if cfg.sensing.images:
-        rows = reading_steps(truth.time, cfg.sensing.image_rate)
+        rows = reading_steps(time, cfg.sensing.image_rate)
         # A generator of its own, so that all else is the same with and without images.
         image[CAMERA] = record_depth_images(
-            cfg.sensing, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0]
+            cfg.sensing, world, scene.objects(), time[rows], states[rows], rng.spawn(1)[0]
         )
     if cfg.footage.cameras:
-        rows = reading_steps(truth.time, cfg.footage.rate)
-        image |= footage(cfg.footage, world, scene.objects(), truth.time[rows], truth.qpos[rows], rng.spawn(1)[0])
+        rows = reading_steps(time, cfg.footage.rate)
+        image |= footage(cfg.footage, world, scene.objects(), time[rows], states[rows], rng.spawn(1)[0])
     for effect in effects:
         if effect.measure is not None:
             for channel, stream in measured.items():
-                time, value = effect.measure(channel, stream.time, stream.value)
-                measured[channel] = replace(stream, time=time, value=value)
-    demonstration = Demonstration(name, task.text, truth.success, qpos, qvel, actions, measured, points, image)
-    return demonstration, truth
+                at, value = effect.measure(channel, stream.time, stream.value)
+                measured[channel] = replace(stream, time=at, value=value)
+    return measured, points, image
 
 
 def _judge(model: mujoco.MjModel, log: WorldLog, task: Task) -> Truth:

@@ -67,7 +67,7 @@ def page_data(
         "geometry": geometry_data(models, events),
         "demonstrations": found,
         "history": [] if fit is None else fit.history,
-        "view": _camera_views(last, demonstrations[0]),
+        "view": camera_views(last, demonstrations[0]),
         "places": [_place_data(comparison, number, place) for number, place in numbered_spans(comparison)],
     }
 
@@ -164,7 +164,7 @@ def _schedule_data(sequence: ContactEventSequence) -> dict[str, Any]:
     return {"rows": rows, "targets": targets, "stages": stages}
 
 
-def _camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
+def camera_views(model: Model, demonstration: Demonstration) -> dict[str, Any]:
     """Return where the camera of the replay may stand: before the whole scene, or with an object.
 
     Distances follow from the sizes of the objects and from how far apart they are at the start.

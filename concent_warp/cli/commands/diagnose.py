@@ -39,8 +39,8 @@ class Arguments:
     promising ones, judge them on held-out data against what chance makes of the whole search, add the best, repeat.
     """
 
-    recording: tyro.conf.Positional[Path]
-    """Recording."""
+    recording: tyro.conf.Positional[tuple[Path, ...]]
+    """Recording; several of the same scene are taken together."""
     model: Path | None = None
     """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     demonstrations: tuple[str, ...] = ()

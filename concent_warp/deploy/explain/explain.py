@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from concent_warp.deploy.explain.result import Explanation
 from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.tasks import Progress, ignore_progress
 from concent_warp.effects.registry import effect_classes
 from concent_warp.errors import ConcentError, RecordingError, TrainError
 from concent_warp.files import write_json
@@ -31,8 +32,6 @@ from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
 
-Progress = Callable[[float, str], None]
-"""Called with the share done, 0..1, and what is being done."""
 JOINT_SCALE = 2.5
 """Joint errors over noise of simulated trials where there are none to take it from."""
 
@@ -73,7 +72,7 @@ def explain(
     cfg = cfg or ExplainCfg()
     check_settings(cfg, TrainError)
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    found = _Explaining(policy, given, cfg, progress or (lambda share, text: None), out).run()
+    found = _Explaining(policy, given, cfg, progress or ignore_progress, out).run()
     if out is not None:
         write_json(Path(out) / RESULT, found.to_json())
     return found

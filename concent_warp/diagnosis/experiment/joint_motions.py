@@ -132,7 +132,7 @@ def _trajectories(recorded: RecordedRange, drives: Drives) -> Iterator[ProposedM
         return np.concatenate([lead, drives.middle + drives.half * np.concatenate(parts)[:, None]])
 
     def motion(name: str, text: str, parts: Sequence[np.ndarray]) -> ProposedMotion:
-        return _commanded(recorded, drives, name, f"{text}{_cleared_text(recorded)}", trajectory(parts))
+        return commanded_motion(recorded, drives, name, f"{text}{_cleared_text(recorded)}", trajectory(parts))
 
     if len(drives.ids) == 1:
         span = f"between {drives.low[0]:.2g} and {drives.high[0]:.2g} {unit}"
@@ -167,7 +167,9 @@ def _cleared_text(recorded: RecordedRange) -> str:
     return f", with {' and '.join(names)} out of the way" if names else ""
 
 
-def _commanded(recorded: RecordedRange, drives: Drives, name: str, text: str, command: np.ndarray) -> ProposedMotion:
+def commanded_motion(
+    recorded: RecordedRange, drives: Drives, name: str, text: str, command: np.ndarray
+) -> ProposedMotion:
     """Return a motion from commands (K, D); the other actuators hold still."""
     cfg = recorded.cfg
     command = command[: int(cfg.max_duration * cfg.rate)]

@@ -55,6 +55,11 @@ class ProposedMotion:
     """Change of the set-up."""
 
 
+def changes_set_up(motion: ProposedMotion) -> bool:
+    """Return whether the set-up has to be changed for a motion: a payload added, the table turned."""
+    return motion.change is not _unchanged
+
+
 @dataclass(frozen=True)
 class RecordedRange:
     """Range of states, commands and sampling intervals in the present recording."""

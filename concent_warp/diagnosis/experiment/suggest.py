@@ -9,7 +9,7 @@ sensors' noise, after what errors of the initial state could account for is proj
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 from concent_warp.checks import check_settings
 from concent_warp.comparison.units import channel_text, ratio_text
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
+from concent_warp.diagnosis.experiment.future_window import difference_in_noise, future_window, predicted_readings
 from concent_warp.diagnosis.experiment.joint_motions import drive_motions
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.object_motions import body_motions
@@ -27,12 +28,11 @@ from concent_warp.diagnosis.experiment.trajectory import motion_trajectory
 from concent_warp.errors import ConcentError
 from concent_warp.estimation.sensors import kind_and_unit
 from concent_warp.files import write_json
-from concent_warp.fit.effects.observation import ObservedRecording, Reading, Window, start_spread
+from concent_warp.fit.effects.observation import ObservedRecording, Window
 from concent_warp.fit.effects.observe import channel_noises, keeps_close
-from concent_warp.fit.effects.prediction import Prediction, SimulationRequest, turn
+from concent_warp.fit.effects.prediction import Prediction, SimulationRequest
 from concent_warp.model import Model
-from concent_warp.recording.recording import Channel, Demonstration, Recording
-from concent_warp.simulate.replay import UNIT_QUATERNION_SENSORS
+from concent_warp.recording.recording import Recording
 from concent_warp.simulate.select import EngineName
 
 
@@ -118,7 +118,7 @@ def _known_start_separations(
     models: Mapping[str, Model], recorded: RecordedRange, motion: ProposedMotion, engine: EngineName
 ) -> Separations | None:
     """Return how far hypotheses differ in a motion from the very same start; None where one cannot be simulated."""
-    window = _future_window(recorded, motion, motion.duration)
+    window = future_window(recorded, motion, motion.duration)
     return None if window is None else _separations(models, motion, window, engine)
 
 
@@ -133,13 +133,13 @@ def _uncertain_start_separations(
 
     Over the time in which errors of the start have proportional effects: chaotic motion cannot be predicted.
     """
-    whole = _future_window(recorded, motion, motion.duration)
+    whole = future_window(recorded, motion, motion.duration)
     if whole is None:
         return None
     model = motion.change(recorded.model)
     source = ObservedRecording(model, recorded.recording, recorded.noise, cfg.observation)
     reach = keeps_close(source, whole.demonstration, 0.0, whole.end, engine, cfg.seed)
-    if (window := _future_window(recorded, motion, reach)) is None:
+    if (window := future_window(recorded, motion, reach)) is None:
         return None
     starts = _start_effects(model, window, engine, cfg.probe)
     return None if starts is None else _separations(models, motion, window, engine, starts)
@@ -156,7 +156,7 @@ def _start_effects(model: Model, window: Window, engine: EngineName, probe: floa
         engine: Which engine simulates.
         probe: Step of the finite difference [standard deviations].
     """
-    values = _readings(model, window, engine)
+    values = predicted_readings(model, window, engine)
     if not all(np.isfinite(v).all() for v in values):
         return None
     filled = tuple(replace(r, value=v) for r, v in zip(window.readings, values, strict=True))
@@ -164,31 +164,6 @@ def _start_effects(model: Model, window: Window, engine: EngineName, probe: floa
     steps = probe * np.diag(window.spread)
     found = prediction.residuals([SimulationRequest(0, prediction.start, step) for step in steps])
     return np.stack(found, axis=1) / probe
-
-
-def _future_window(recorded: RecordedRange, motion: ProposedMotion, duration: float) -> Window | None:
-    """Return the beginning of a motion as a window to be recorded; None where nothing is measured."""
-    m = recorded.m
-    channels, readings, clock, count = recorded.channels(motion.away), [], [], 0
-    for name in channels:
-        row = m.sensor(name).id
-        orientation = int(m.sensor_type[row]) in map(int, UNIT_QUATERNION_SENSORS)
-        time = np.arange(0.0, duration, max(recorded.period[name], m.opt.timestep))
-        value = np.zeros((len(time), int(m.sensor_dim[row])))
-        dim = 3 if orientation else value.shape[1]
-        rows = slice(count, count + dim * len(time))
-        readings.append(Reading(name, rows, time, value, recorded.noise[name], orientation))
-        clock.append(np.repeat(time, dim))
-        count = rows.stop
-    if not count:
-        return None
-    measured = {r.channel: Channel(r.time, r.value, noise_std=r.std) for r in readings}
-    d = Demonstration(motion.name, qpos=motion.qpos, qvel=motion.qvel, action=motion.action, measured=measured)
-    spread = start_spread(m, {c: recorded.noise[c] for c in channels}, recorded.observation)
-    clocks = np.concatenate(clock)
-    return Window(
-        d, 0, 0.0, duration, motion.qpos, motion.qvel, spread, tuple(readings), count, clocks, start_shown=False
-    )
 
 
 def _separations(
@@ -209,7 +184,7 @@ def _separations(
             (count, 2 nv), which is projected out.
     """
     try:
-        seen = {name: _readings(motion.change(model), window, engine) for name, model in models.items()}
+        seen = {name: predicted_readings(motion.change(model), window, engine) for name, model in models.items()}
     except (ConcentError, ValueError, mujoco.FatalError):
         # A payload may break a rule of the scene on its bodies; the motion is left out.
         return None
@@ -217,30 +192,12 @@ def _separations(
         return None
     found: Separations = {}
     for a, b in itertools.combinations(models, 2):
-        residual = _difference(window, seen[a], seen[b])
+        residual = difference_in_noise(window, seen[a], seen[b])
         if starts is not None:
             normal = starts.T @ starts + np.eye(starts.shape[1])
             residual = residual - starts @ np.linalg.solve(normal, starts.T @ residual)
         sizes = [(float(np.sqrt(np.mean(residual[r.rows] ** 2))), r.channel) for r in window.readings]
         found[a, b] = max(sizes)
-    return found
-
-
-def _readings(model: Model, window: Window, engine: EngineName) -> list[np.ndarray]:
-    """Return what instruments would read in a window from time 0, one (T, dim) for each of its readings."""
-    prediction = Prediction(model, (), [window], engine=engine)
-    (reader,) = prediction.readers([SimulationRequest(0, prediction.start)])
-    for added in model.effects:
-        if added.effect.measures:
-            reader = added.effect.measure(model.scene.model, reader, added.array)
-    return [reader(r.channel, r.time) for r in window.readings]
-
-
-def _difference(window: Window, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> np.ndarray:
-    """Return how far two sets of readings are apart in units of noise, shape (count,)."""
-    found = np.empty(window.count)
-    for r, a, b in zip(window.readings, first, second, strict=True):
-        found[r.rows] = r.in_noise(turn(b, a) if r.orientation else a - b)
     return found
 
 
@@ -274,12 +231,12 @@ def _predictions(
     motion: ProposedMotion, models: Mapping[str, Model], recorded: RecordedRange, channel: str, engine: EngineName
 ) -> dict[str, TimeSeries]:
     """Return what each hypothesis predicts for the readings of a channel during a motion."""
-    window = _future_window(recorded, motion, motion.duration)
+    window = future_window(recorded, motion, motion.duration)
     assert window is not None
     (k,) = [i for i, r in enumerate(window.readings) if r.channel == channel]
     kind, unit = kind_and_unit(recorded.m, recorded.m.sensor(channel).id)
     unit = "-" if kind == "orientation" else unit  # readings are quaternions
     return {
-        name: TimeSeries(window.readings[k].time, _readings(motion.change(model), window, engine)[k], unit)
+        name: TimeSeries(window.readings[k].time, predicted_readings(motion.change(model), window, engine)[k], unit)
         for name, model in models.items()
     }

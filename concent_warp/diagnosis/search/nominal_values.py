@@ -85,7 +85,7 @@ class NominalSensitivities:
 
 def nominal_sensitivities(base: FittedModel) -> NominalSensitivities:
     """Return the sensitivities of a fitted model's residuals to all its nominal values."""
-    kinds = _nominal_effects_of(base.model)
+    kinds = possible_nominal_effects(base.model)
     names = tuple((effect.name, target) for effect in kinds for target in effect.target)
     rows = sum(len(piece.residual) for piece in base.pieces)
     columns = np.concatenate(_sensitivities(base, kinds)) if kinds else np.zeros((rows, 0))
@@ -113,7 +113,7 @@ def nominal_errors(
     spread = np.zeros(len(last.fit.values))
     parts = zip(last.model.effects, last.prediction().split, strict=True)
     own = [k for added, part in parts if not added.effect.nominal for k in range(part.start, part.stop)]
-    kinds = _nominal_effects_of(last.model)
+    kinds = possible_nominal_effects(last.model)
     if not own or not kinds or not cfg.nominal.enabled:
         return spread
     weights = [np.sqrt(huber_weight(piece.residual, last.limit))[:, None] for piece in last.pieces]
@@ -140,7 +140,7 @@ def considered_std(j: np.ndarray, k: np.ndarray, excess: float, prior: float) ->
     return np.sqrt(np.maximum(np.diag(move @ within @ move.T), 0.0))
 
 
-def _nominal_effects_of(model: Model) -> list[Effect]:
+def possible_nominal_effects(model: Model) -> list[Effect]:
     """Return all nominal values of a model as effects, less those that an effect of the model is."""
     compiled, found = model.compile(), []
     for kind in NOMINAL:
@@ -172,7 +172,7 @@ def _visible(base: FittedModel, cfg: NominalCfg) -> tuple[list[Effect], float]:
     held-out error that a linear step within their prior promises to remove.
     """
     present = {a.effect.name for a in base.model.effects}
-    kinds = [e for e in _nominal_effects_of(base.model) if e.name not in present]
+    kinds = [e for e in possible_nominal_effects(base.model) if e.name not in present]
     if not kinds:
         return [], 0.0
     by_window = _sensitivities(base, kinds)

@@ -6,7 +6,7 @@ them), of the table under a sliding object, of air, and effects that add bodies.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -102,8 +102,12 @@ class TaskWorld:
             raise ConcentError("Reality cannot be built with these hidden effects", found=found) from None
 
 
-def parse_effects(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
+def parse_effects(given: Sequence[str], among: Collection[str] = APPLICABLE) -> tuple[tuple[str, float], ...]:
     """Return names and magnitudes of effects written as ``name=value``.
+
+    Args:
+        given: What was written.
+        among: Effects that can be hidden.
 
     Raises:
         ConcentError: One is written otherwise, is not there, or is given twice.
@@ -119,8 +123,8 @@ def parse_effects(given: Sequence[str]) -> tuple[tuple[str, float], ...]:
             raise ConcentError(
                 "a hidden effect is not right", expected="name=value, as in joint_friction=1.2", found=repr(text)
             )
-        if name not in APPLICABLE:
-            raise ConcentError(f"no effect {name!r} can be hidden", expected=f"one of {', '.join(APPLICABLE)}")
+        if name not in among:
+            raise ConcentError(f"no effect {name!r} can be hidden", expected=f"one of {', '.join(among)}")
         if name in found:
             raise ConcentError("an effect is hidden twice", found=name)
         found[name] = value

@@ -165,12 +165,24 @@ def record_rig(rig: Rig, effects: Sequence[HiddenEffect] = (), demonstrations: i
     for k in range(demonstrations * rig.throws):
         rng = np.random.default_rng([seed, k])
         trial = rig.plan(rng, k)
-        motion, qpos, qvel = perform(model, trial, effects, rig.physics)
-        estimate = _estimated_start(rig, model, qpos, qvel, rng) if rig.start != "unknown" else (None, None)
-        measured = sensor_channels(rig, model, motion, effects, rng)
-        action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
-        taken.append(Demonstration(f"demo_{k}", rig.name, None, *estimate, action=action, measured=measured))
+        taken.append(recorded_trial(rig, model, trial, effects, rng, f"demo_{k}"))
     return Recording(rig.scene.xml, tuple(taken), source=f"reality rig {rig.name}")
+
+
+def recorded_trial(
+    rig: Rig,
+    model: mujoco.MjModel,
+    trial: RigTrial,
+    effects: Sequence[HiddenEffect],
+    rng: np.random.Generator,
+    name: str,
+) -> Demonstration:
+    """Return what a rig's instruments record of one motion in Reality."""
+    motion, qpos, qvel = perform(model, trial, effects, rig.physics)
+    estimate = _estimated_start(rig, model, qpos, qvel, rng) if rig.start != "unknown" else (None, None)
+    measured = sensor_channels(rig, model, motion, effects, rng)
+    action = {name: Channel(time, value) for name, (time, value) in trial.action.items()}
+    return Demonstration(name, rig.name, None, *estimate, action=action, measured=measured)
 
 
 def perform(

@@ -254,3 +254,27 @@ function steer(canvas, camera) {
     else if (e.key === "-") camera.zoom(1.1);
   });
 }
+
+// ---- bodies ---------------------------------------------------------------------------------------------------
+const IDENTITY = [1, 0, 0, 0];
+function turned(q, v) {
+  const [w, x, y, z] = q, t = Vec.cross([x, y, z], v).map((c) => 2 * c);
+  return Vec.plus(Vec.plus(v, t, w), Vec.cross([x, y, z], t));
+}
+function times(p, q) {
+  return [p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3], p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+    p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1], p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]];
+}
+/** Items of one geom of a body at a pose. */
+function geomItems(geom, position, quaternion, colour) {
+  const at = Vec.plus(position, turned(quaternion, geom.position)), q = times(quaternion, geom.quaternion), [a, b, c] = geom.size;
+  const item = (shape, scale, offset = 0) => ({ shape, scale, colour, quaternion: q, position: offset ? Vec.plus(at, turned(q, [0, 0, offset])) : at });
+  switch (geom.shape) {
+    case "capsule": return [item("cylinder", [a, a, b]), item("sphere", [a, a, a], b), item("sphere", [a, a, a], -b)];
+    case "cylinder": return [item("cylinder", [a, a, b])];
+    case "sphere": return [item("sphere", [a, a, a])];
+    case "ellipsoid": return [item("sphere", [a, b, c])];
+    case "mesh": return [item(`mesh:${geom.mesh}`, [1, 1, 1])];
+    default: return [item("box", [a, b, c])];
+  }
+}

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from concent_warp.diagnosis.experiment.future_window import future_window
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.suggest import (
-    _future_window,
     _separations,
     _start_effects,
     suggest_experiment,
@@ -93,7 +93,7 @@ def test_frictions_alike_at_one_speed_are_distinguished_by_another():
     bench = RecordedRange(Model(Scene(CART)), recording, channel_noises(Model(Scene(CART)), recording))
     d = recording.demonstrations[0]
     same = ProposedMotion("same", "do it again", 4.0, np.zeros(1), np.zeros(1), d.action)
-    window = _future_window(bench, same, same.duration)
+    window = future_window(bench, same, same.duration)
     assert window is not None
     again = _separations(frictions(), same, window, "mujoco")
     assert again is not None
@@ -147,7 +147,7 @@ def test_what_an_error_of_the_start_explains_does_not_count():
     at_rest = Demonstration("rest", qpos=np.zeros(1), qvel=np.zeros(1), measured={"rail_position": channel})
     bench = RecordedRange(plain, Recording(plain.scene.xml, (at_rest,)), {"rail_position": NOISE})
     motion = ProposedMotion("coast", "let it coast", 1.0, np.zeros(1), np.array([0.1]))
-    window = _future_window(bench, motion, 1.0)
+    window = future_window(bench, motion, 1.0)
     assert window is not None
     models = {"plain": plain, "biased": biased}
     raw = _separations(models, motion, window, "mujoco")
@@ -164,7 +164,7 @@ def test_motion_in_which_a_model_diverges_is_left_out():
     recording = one_speed()
     bench = RecordedRange(plain, recording, {"rail_position": NOISE})
     motion = ProposedMotion("burst", "burst", 0.5, np.zeros(1), np.array([1e12]), recording.demonstrations[0].action)
-    window = _future_window(bench, motion, 0.5)
+    window = future_window(bench, motion, 0.5)
     assert window is not None
     assert _separations({"a": plain, "b": plain}, motion, window, "mujoco") is None
 

@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from concent_warp.diagnosis.experiment import suggest
 from concent_warp.diagnosis.experiment.cfg import SuggestExperimentCfg
+from concent_warp.diagnosis.experiment.future_window import difference_in_noise, future_window
 from concent_warp.diagnosis.experiment.motions import ProposedMotion, RecordedRange
 from concent_warp.diagnosis.experiment.suggest import (
-    _difference,
     _experiment,
-    _future_window,
     _score,
     _separations,
     _start_effects,
@@ -70,7 +69,7 @@ def motion(known: RecordedRange, duration: float = 0.5, **changes: Any) -> Propo
 def test_a_future_window_has_the_samples_of_each_channel_that_is_measured():
     known = recorded()
     made = motion(known)
-    window = _future_window(known, made, 0.3)
+    window = future_window(known, made, 0.3)
     assert window is not None
     assert [r.channel for r in window.readings] == list(NOISE)
     times = [np.arange(0, 0.3, step) for step in (0.01, 0.05, 0.01)]
@@ -84,25 +83,25 @@ def test_a_future_window_has_the_samples_of_each_channel_that_is_measured():
     np.testing.assert_array_equal(window.qpos, made.qpos)
     np.testing.assert_array_equal(window.qvel, made.qvel)
     assert not window.start_shown  # it starts as the motion does, whatever the instruments show
-    gone = _future_window(known, replace(made, away=("ball",)), 0.3)
+    gone = future_window(known, replace(made, away=("ball",)), 0.3)
     assert gone is not None
     assert [r.channel for r in gone.readings] == ["rail_position"]
-    assert _future_window(recorded(place=1e-3), replace(made, away=("ball",)), 0.3) is None
+    assert future_window(recorded(place=1e-3), replace(made, away=("ball",)), 0.3) is None
     fine = RecordedRange(known.model, known.recording, {"angle": 1e-3})
     fine.period["angle"] = 0.001
-    quick = _future_window(fine, made, 0.1)
+    quick = future_window(fine, made, 0.1)
     assert quick is not None
     np.testing.assert_allclose(quick.readings[0].time, np.arange(0, 0.1, 0.004))
 
 
 def test_readings_differ_by_their_noise_and_orientations_by_their_angle():
     known = recorded()
-    window = _future_window(known, motion(known), 0.3)
+    window = future_window(known, motion(known), 0.3)
     assert window is not None
     rng = np.random.default_rng(0)
     turns = [Rotation.from_rotvec(rng.normal(0, 0.3, (30, 3))) for _ in range(2)]
     sets = [[rng.normal(size=(30, 1)), rng.normal(size=(6, 3)), turn.as_quat(scalar_first=True)] for turn in turns]
-    found = _difference(window, sets[0], sets[1])
+    found = difference_in_noise(window, sets[0], sets[1])
     np.testing.assert_allclose(found[:30], (sets[0][0] - sets[1][0]).ravel() / 1e-3)
     np.testing.assert_allclose(found[30:48], (sets[0][1] - sets[1][1]).ravel() / 2e-3)
     angle = np.linalg.norm(found[48:].reshape(30, 3), axis=1) * 1e-2
@@ -118,7 +117,7 @@ def test_hypotheses_are_separated_in_the_channel_where_they_differ_most():
         "bias": plain.add(SensorBias("rail_position", "angle"), [3e-3, 0.5]),
         "gain": plain.add(SensorGain("rail_position", "angle"), [0.2, 0.0]),
     }
-    window = _future_window(known, made, 0.5)
+    window = future_window(known, made, 0.5)
     assert window is not None
     found = _separations(models, made, window, "mujoco")
     assert found is not None
@@ -146,7 +145,7 @@ def test_hypotheses_are_separated_in_the_channel_where_they_differ_most():
 def test_effects_of_the_start_are_those_of_its_standard_deviations():
     known = recorded()
     made = motion(known)
-    window = _future_window(known, made, 0.3)
+    window = future_window(known, made, 0.3)
     assert window is not None
     found = _start_effects(known.model, window, "mujoco", 0.1)
     assert found is not None
@@ -162,7 +161,7 @@ def test_effects_of_the_start_are_those_of_its_standard_deviations():
     assert twice is not None
     np.testing.assert_allclose(twice[rail.rows], found[rail.rows], rtol=1e-2, atol=1e-3)
     wild = motion(known, qvel=np.full(14, 1e12))
-    lost = _future_window(known, wild, 0.3)
+    lost = future_window(known, wild, 0.3)
     assert lost is not None
     assert _start_effects(known.model, lost, "mujoco", 0.1) is None
 

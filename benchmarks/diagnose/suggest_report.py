@@ -1,0 +1,129 @@
+"""The page of `suggest.py`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.diagnose.suggest_sets import PART, summary
+from benchmarks.pages import FOLDER, machine_line, table, write_page
+from concent_warp.diagnosis.suggestion.cfg import Method
+from concent_warp.files import write_text
+
+NAME = "suggest"
+METHODS: tuple[Method, ...] = ("best", "menu", "random")
+TITLES = {
+    "best": "suggested (best of menu and search)",
+    "menu": "best of the fixed menu",
+    "random": "random trajectory",
+}
+DATA = FOLDER / "data" / f"{NAME}.jsonl"
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a file, the last one of each name; lines that were cut off are left out."""
+    found: dict[str, dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        found[row["name"]] = row
+    return sorted(found.values(), key=lambda row: row["name"])
+
+
+def write_report(rows: Sequence[Mapping[str, Any]], count: int) -> None:
+    """Write the page and its data.
+
+    Args:
+        rows: Rows that were measured; those of the data of the page where there are none.
+        count: Number of data sets.
+    """
+    kept = list(rows) or read_rows(DATA)
+    if not kept:
+        raise SystemExit("nothing was measured yet")
+    write_text(DATA, "".join(json.dumps(row) + "\n" for row in kept))
+    write_page(NAME, page(kept, count))
+
+
+def page(rows: Sequence[Mapping[str, Any]], count: int) -> str:
+    """Return the page."""
+    whole = [row for row in rows if "error" not in row]
+    asked = [row for row in whole if row["group"] is not None]
+    hosts = " ".join(dict.fromkeys(machine_line(row["machine"]) for row in rows))
+    separable = [row for row in asked if row["methods"]["best"]["outcome"] != "none"]
+    hours = sum(row["seconds"] for row in rows) / 3600
+    text = f"""# Suggested recordings
+
+Written by `benchmarks/diagnose/suggest.py`; do not edit. {hosts}
+
+`python -m benchmarks.diagnose.suggest`: how often the recording that `concent suggest` asks for resolves a group,
+that is effects that a diagnosis cannot distinguish. The data are those of the [hidden effects](hidden_effects.md)
+with one or two effects of the library and one demonstration, on other seeds; the first recording is the first {
+        100 * PART:.0f} % of each (of its time, or of its throws), since short recordings leave more open. {
+        len(whole)
+    } of {count}
+data sets are done, {len(rows) - len(whole)} ended in an error; {len(asked)} of them in a group that the hidden effect
+is in. {hours:.1f} hours of one core in all.
+
+Each motion is performed in Reality with the same hidden effect, and both recordings are diagnosed together. All methods
+have the same longest duration and the same limits; none knows the truth.
+
+"""
+    head = ["motion", "data sets", "right", "wrong", "still open", "nothing suggested", "error"]
+    text += table(head, [_shares(asked, method) for method in METHODS])
+    text += """
+*Right*: the hidden effect is named alone. *Wrong*: others are named without it. *Still open*: it is named with others.
+*Nothing suggested*: all motions within the limits are expected to leave the hypotheses as close as they are, as mass
+and drive gain of a pendulum, whose ratio alone acts. A random trajectory is performed even where it is expected to
+bring little, unless it is expected to bring nothing.
+"""
+    if separable:
+        text += f"\nWhere something was suggested by the first method ({len(separable)} data sets):\n\n"
+        text += table(head, [_shares(separable, method) for method in METHODS])
+    text += "\n## Data sets\n\nGroup of the first diagnosis, the hidden effect in bold; what each method came to.\n\n"
+    text += table(["data set", "group", *METHODS, "motion", "duration [s]"], [_row(row) for row in asked])
+    text += "\n## Time\n\nSeconds on one core, median.\n\n"
+    text += table(["rig", "groups", "first diagnosis", "suggestion", "second diagnosis"], _times(asked))
+    text += """
+## What this does not show
+
+Measured data; set-ups that are changed (a payload, a turned table), which could separate more; a second suggestion
+after the first; and how much the evidence depends on errors of formulas, which are small in Reality.
+"""
+    return text
+
+
+def _shares(rows: Sequence[Mapping[str, Any]], method: str) -> list[str]:
+    """Return the row of a method."""
+    found, count = summary(rows, method), max(len(rows), 1)
+    cells = [f"{found[key]} ({100 * found[key] / count:.0f} %)" for key in ("right", "wrong", "open", "none")]
+    return [TITLES[method], str(len(rows)), *cells, str(found["error"])]
+
+
+def _row(row: Mapping[str, Any]) -> list[str]:
+    """Return the row of a data set."""
+    group = ", ".join(f"**{name}**" if name == row["true"] else name for name in row["group"])
+    best = row["methods"]["best"]
+    name = best.get("name") or "-"
+    duration = f"{best['duration']:.1f}" if best.get("duration") else "-"
+    return [f"`{row['name']}`", group, *(row["methods"][m]["outcome"] for m in METHODS), name, duration]
+
+
+def _times(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the times by rig."""
+    found = []
+    for rig in dict.fromkeys(row["rig"] for row in rows):
+        own = [row for row in rows if row["rig"] == rig]
+        best = [row["methods"]["best"] for row in own]
+        columns = [
+            [row["first"]["seconds"] for row in own],
+            [b["seconds"] for b in best if "seconds" in b],
+            [b["second"]["seconds"] for b in best if "second" in b],
+        ]
+        found.append([rig, str(len(own)), *(f"{np.median(c):.0f}" if c else "-" for c in columns)])
+    return found

@@ -1,0 +1,91 @@
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from concent_warp.diagnosis.suggestion import suggest as module
+from concent_warp.diagnosis.suggestion.cfg import MotionLimitsCfg, SuggestCfg
+from concent_warp.diagnosis.suggestion.evaluations import Evaluations
+from concent_warp.diagnosis.suggestion.search import Search
+from concent_warp.diagnosis.suggestion.suggest import EVALUATIONS_FILE, suggest
+from concent_warp.errors import ConcentError
+from concent_warp.model import Model
+from concent_warp.recording.load import load_recording
+from concent_warp.scene.scene import Scene
+from tests.diagnosis.suggestion.carts import one_speed, open_group
+
+RECORDING = one_speed(friction=0.2)
+MODEL = Model(Scene(RECORDING.scene))
+QUICK = SuggestCfg(evaluations=16, population=8, duration=3.0)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return suggest(MODEL, RECORDING, QUICK, diagnosis=open_group())
+
+
+def test_a_motion_is_found_that_decides_a_group(found):
+    assert found.found
+    assert all(pair.resolved and pair.evidence >= found.needed for pair in found.pairs)
+    assert found.duration <= 3.0
+    assert found.used["speed"] <= 1.0
+    assert found.used["force"] <= 1.0
+    assert set(found.predictions) == {"joint_friction", "joint_damping"}
+    assert "nat" in found.sentence
+
+
+def test_its_files_hold_the_same_commands(found, tmp_path):
+    written = found.save(tmp_path / "motion.h5")
+    assert [path.name for path in written] == ["motion.h5", "motion.csv"]
+    sent = load_recording(tmp_path / "motion.h5")[0].action["drive"]
+    with (tmp_path / "motion.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["time", "drive"]
+    table = np.array(rows[1:], dtype=float)
+    assert np.interp(table[:, 0], sent.time, sent.value) == pytest.approx(table[:, 1], abs=1e-6)
+    assert np.abs(np.diff(table[:, 1])).max() <= 0.1 * 0.01 * 1.05
+
+
+def test_the_search_does_no_worse_than_the_menu_and_than_chance(found):
+    others = [
+        suggest(MODEL, RECORDING, replace(QUICK, method=method), diagnosis=open_group())
+        for method in ("menu", "random")
+    ]
+    least = [min(pair.evidence for pair in one.pairs) for one in (found, *others)]
+    assert least[0] >= 0.99 * max(least)
+
+
+def test_nothing_is_suggested_where_no_motion_is_within_the_limits():
+    still = replace(QUICK, method="menu", limits=MotionLimitsCfg(workspace=(5, 5, 5, 6, 6, 6)))
+    nothing = suggest(MODEL, RECORDING, still, diagnosis=open_group())
+    assert not nothing.found
+    assert nothing.sentence == "No motion is within the limits: the nearest one exceeds workspace."
+    with pytest.raises(ConcentError, match="there is no motion to write"):
+        nothing.save("motion.h5")
+
+
+def test_an_interrupted_search_continues_with_the_same_result(found, tmp_path, monkeypatch):
+    rate, calls = Search._rated, []
+
+    def stopped(self, candidates, *, starts):
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(len(candidates))
+        return rate(self, candidates, starts=starts)
+
+    monkeypatch.setattr(Search, "_rated", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        suggest(MODEL, RECORDING, QUICK, diagnosis=open_group(), state=tmp_path)
+    known = len(Evaluations(tmp_path / EVALUATIONS_FILE).known)
+    assert known >= sum(calls)
+    fresh = []
+    monkeypatch.setattr(
+        Search,
+        "_rated",
+        lambda self, candidates, *, starts: fresh.append(len(candidates)) or rate(self, candidates, starts=starts),
+    )
+    monkeypatch.setattr(module, "fit_effects", lambda *_, **__: pytest.fail("fitted again"))
+    again = suggest(MODEL, RECORDING, QUICK, diagnosis=open_group(), state=tmp_path)
+    assert again.to_json() == found.to_json()
+    assert sum(fresh) == len(Evaluations(tmp_path / EVALUATIONS_FILE).known) - known
