@@ -195,7 +195,8 @@ def test_continued_training_is_the_one_without_interruption(trained, tmp_path, m
     resumed = cw.train_flow(trained / "data", cfg, device="cpu", out=run, resume=True)
     for name, value in whole.network.state_dict().items():
         assert torch.equal(value, resumed.network.state_dict()[name]), name
-    assert not torch.equal(unfinished.network.state[0].weight, resumed.network.state[0].weight)
+    states = [policy.network.state_dict()["state.0.weight"] for policy in (unfinished, resumed)]
+    assert not torch.equal(*states)
     points = [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(run)]
     assert points == [{k: v for k, v in p.items() if k != "seconds"} for p in read_curve(tmp_path / "whole")]
     assert [point["steps"] for point in points] == [10, 20, 30]
