@@ -18,8 +18,13 @@ from concent_warp.version import __version__
 _HOMES = {
     "comparison.compare": ("CompareCfg", "compare"),
     "comparison.result": ("Comparison",),
-    "deploy.cfg": ("EvaluateCfg", "PlayCfg", "RenderCfg"),
+    "deploy.cfg": ("EvaluateCfg", "HandoverCfg", "PlayCfg", "RenderCfg"),
+    "deploy.distil": ("distil",),
     "deploy.evaluate": ("evaluate",),
+    "deploy.explain.cfg": ("ExplainCfg",),
+    "deploy.explain.explain": ("explain",),
+    "deploy.explain.page": ("write_explanation",),
+    "deploy.explain.result": ("Explanation", "TrialExplanation"),
     "deploy.play": ("play",),
     "deploy.render_dataset": ("Dataset", "render"),
     "diagnosis.cfg": ("DiagnoseCfg",),
@@ -69,7 +74,7 @@ _HOMES = {
     "recording.load": ("load_recording",),
     "recording.logs.cfg": ("ImportCfg",),
     "recording.logs.import_log": ("import_log",),
-    "recording.recording": ("Channel", "Demonstration", "PointTrack", "Recording"),
+    "recording.recording": ("Channel", "Demonstration", "PointTrack", "PolicyLog", "Recording"),
     "render.dataset.from_recording": ("WriteLeRobotCfg", "write_lerobot"),
     "report.cfg": ("ReportCfg",),
     "report.report": ("write_report",),
@@ -81,6 +86,18 @@ _HOMES = {
     "simulate.engine": ("Rollout",),
     "simulate.replay_recording": ("replay",),
     "train.cfg": ("EnvironmentCfg", "PpoCfg", "TrainCfg"),
+    "train.distil.cfg": (
+        *("AugmentCfg", "DaggerCfg", "DistilCfg", "ImagesCfg"),
+        *("LooksCfg", "StudentNetworkCfg"),
+    ),
+    "train.distil.student": ("Student", "load_student"),
+    "train.flow.cfg": (
+        *("FlowDataCfg", "FlowPolicyCfg"),
+        *("SmallBackboneCfg", "TrainFlowCfg"),
+    ),
+    "train.flow.policy": ("FlowPolicy", "load_flow_policy"),
+    "train.flow.task_policy": ("TaskFlowPolicy",),
+    "train.flow.train_flow": ("FlowProgress", "train_flow"),
     "train.observation_cfg": ("SensorErrorsCfg",),
     "train.trials.evaluate": ("Evaluation",),
     "train.policy.load": ("Policy", "load_policy"),
@@ -94,8 +111,13 @@ __all__ = ["__version__", *sorted(_MODULE_OF)]  # pyright: ignore[reportUnsuppor
 if TYPE_CHECKING:
     from concent_warp.comparison.compare import CompareCfg, compare
     from concent_warp.comparison.result import Comparison
-    from concent_warp.deploy.cfg import EvaluateCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.cfg import EvaluateCfg, HandoverCfg, PlayCfg, RenderCfg
+    from concent_warp.deploy.distil import distil
     from concent_warp.deploy.evaluate import evaluate
+    from concent_warp.deploy.explain.cfg import ExplainCfg
+    from concent_warp.deploy.explain.explain import explain
+    from concent_warp.deploy.explain.page import write_explanation
+    from concent_warp.deploy.explain.result import Explanation, TrialExplanation
     from concent_warp.deploy.play import play
     from concent_warp.deploy.render_dataset import Dataset, render
     from concent_warp.diagnosis.cfg import DiagnoseCfg
@@ -159,7 +181,7 @@ if TYPE_CHECKING:
     from concent_warp.recording.load import load_recording
     from concent_warp.recording.logs.cfg import ImportCfg
     from concent_warp.recording.logs.import_log import import_log
-    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+    from concent_warp.recording.recording import Channel, Demonstration, PointTrack, PolicyLog, Recording
     from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
     from concent_warp.report.cfg import ReportCfg
     from concent_warp.report.report import write_report
@@ -171,6 +193,24 @@ if TYPE_CHECKING:
     from concent_warp.simulate.engine import Rollout
     from concent_warp.simulate.replay_recording import replay
     from concent_warp.train.cfg import EnvironmentCfg, PpoCfg, TrainCfg
+    from concent_warp.train.distil.cfg import (
+        AugmentCfg,
+        DaggerCfg,
+        DistilCfg,
+        ImagesCfg,
+        LooksCfg,
+        StudentNetworkCfg,
+    )
+    from concent_warp.train.distil.student import Student, load_student
+    from concent_warp.train.flow.cfg import (
+        FlowDataCfg,
+        FlowPolicyCfg,
+        SmallBackboneCfg,
+        TrainFlowCfg,
+    )
+    from concent_warp.train.flow.policy import FlowPolicy, load_flow_policy
+    from concent_warp.train.flow.task_policy import TaskFlowPolicy
+    from concent_warp.train.flow.train_flow import FlowProgress, train_flow
     from concent_warp.train.observation_cfg import SensorErrorsCfg
     from concent_warp.train.policy.load import Policy, load_policy
     from concent_warp.train.train import train

@@ -67,6 +67,11 @@ class DatasetFilming:
                 self._watched = world
 
     @property
+    def images(self) -> np.ndarray:
+        """Latest images of the W worlds, shape (W, C, H, W', 3) uint8."""
+        return self._images
+
+    @property
     def running(self) -> list[int]:
         """Worlds whose episode has not ended."""
         return list(self._open)
@@ -78,11 +83,12 @@ class DatasetFilming:
         if self._watched is not None and self._watched in self._open:
             self.album.add(layers, self._watched)
 
-    def add(self, world: int, state: np.ndarray, action: np.ndarray) -> None:
-        """Add the frame of a world, with its state and the action taken in it."""
+    def add(self, world: int, state: np.ndarray, action: np.ndarray, *, recorded: bool = True) -> None:
+        """Add the frame of a world, with state and action; unless `recorded`, to its video alone."""
         _, episode, film = self._open[world]
         images = dict(zip(self.camera.cameras, self._images[world], strict=True))
-        episode.add(images, state, action)
+        if recorded:
+            episode.add(images, state, action)
         if film is not None:
             film.add(np.concatenate(list(images.values()), axis=1))
 

@@ -39,12 +39,13 @@ class RawImages:
 class PosedWorlds:
     """Worlds of a model, posed for cameras: MuJoCo-Warp's model and data without a simulation."""
 
-    def __init__(self, model: mujoco.MjModel, worlds: int, *, device: str = "cpu") -> None:
+    def __init__(self, model: mujoco.MjModel, worlds: int, *, varied: Sequence[str] = (), device: str = "cpu") -> None:
         """Put a model on a device.
 
         Args:
             model: Compiled model with its cameras.
             worlds: W.
+            varied: Fields of the model with values of their own in each world, see `field`.
             device: Warp's name of the device.
         """
         import mujoco_warp as mjw
@@ -55,7 +56,8 @@ class PosedWorlds:
             visible_model = _bare(model)
             data = mjw.make_data(visible_model, nworld=worlds, nconmax=1, njmax=1)
             try:
-                self.simulator: tuple[Any, Any] = mjw.put_model(visible_model), data
+                placed = mjw.put_model(visible_model, batch_sizes=dict.fromkeys(varied, worlds))
+                self.simulator: tuple[Any, Any] = placed, data
             except NotImplementedError as error:
                 found = " ".join(str(error).split())
                 raise RenderError("MuJoCo-Warp, which traces the images, cannot hold this scene", found=found) from None
@@ -82,11 +84,17 @@ class PosedWorlds:
                 target.copy_(torch.as_tensor(value))
         self._place()
 
+    def field(self, name: str) -> torch.Tensor:
+        """Return a field of the model that varies, shape (W, ...); what is written to it is seen in the next image."""
+        import warp as wp
+
+        return wp.to_torch(getattr(self.simulator[0], name))
+
     def camera_poses(self, cameras: Sequence[str]) -> torch.Tensor:
         """Return poses of cameras, position [m] and wxyz, looking along -z with y up, shape (W, C, 7)."""
         import torch
 
-        rows = _camera_ids(self.model, cameras)
+        rows = camera_ids(self.model, cameras)
         return torch.cat([self.camera_position[:, rows], _matrix_quaternions(self._camera_matrix[:, rows])], dim=-1)
 
     def _pose(self) -> None:
@@ -109,6 +117,7 @@ class RawCamera:
         leave_out: Sequence[str] = (),
         objects: Literal["visual", "spheres"] = "visual",
         shadows: bool = False,
+        samples: int = 1,
     ) -> None:
         """Set cameras up.
 
@@ -119,6 +128,7 @@ class RawCamera:
             leave_out: Bodies that are not shown.
             objects: Whether bodies with contact spheres show these or their own shapes.
             shadows: Whether lights cast shadows.
+            samples: Colour samples along each edge of a pixel; depth and segmentation are those of the first.
 
         Raises:
             RenderError: The model has no such camera, or a size is not right.
@@ -128,7 +138,7 @@ class RawCamera:
 
         if min(size) < 1:
             raise RenderError("the size of images is not right", expected="at least 1 x 1", found=size)
-        rows = _camera_ids(stage.model, cameras)
+        rows = camera_ids(stage.model, cameras)
         self.stage, self.cameras, self.size = stage, tuple(cameras), size
         height, width = size
         shown = _grouped(stage.model, leave_out, objects)
@@ -136,6 +146,7 @@ class RawCamera:
             self._context = mjw.create_render_context(
                 shown, nworld=stage.worlds, cam_res=(width, height), cam_active=rows, render_rgb=True,
                 render_depth=True, render_seg=True, use_shadows=shadows, enabled_geom_groups=[VISIBLE_GROUP],
+                samples_per_pixel=samples,
             )  # fmt: skip
             shape = (stage.worlds, len(rows), height, width)
             self._colour: Any = wp.zeros(shape, dtype=wp.vec3)
@@ -235,7 +246,7 @@ def body_id(model: mujoco.MjModel, name: str) -> int:
     return found
 
 
-def _camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
+def camera_ids(model: mujoco.MjModel, cameras: Sequence[str]) -> list[int]:
     """Return the ids of cameras.
 
     Raises:
@@ -254,7 +265,7 @@ def _intrinsics(model: mujoco.MjModel, cameras: Sequence[str], size: tuple[int, 
     """
     height, width = size
     found = np.tile(np.eye(3), (len(cameras), 1, 1))
-    for matrix, row in zip(found, _camera_ids(model, cameras), strict=True):
+    for matrix, row in zip(found, camera_ids(model, cameras), strict=True):
         focal = height / 2 / np.tan(np.radians(float(model.cam_fovy[row])) / 2)
         matrix[0, 0] = matrix[1, 1] = focal
         matrix[:2, 2] = (width - 1) / 2, (height - 1) / 2

@@ -13,7 +13,7 @@ import pytest
 
 INDIRECT = {"onnxscript": "torch.onnx"}
 """Declared packages that another one imports for a function that is used, with the name of that function's module."""
-OPTIONAL = ("logs", "features", "sam2")
+OPTIONAL = ("logs", "features", "sam2", "florence2")
 """Extras that the package imports where they are needed, with a sentence that names them where they are missing."""
 
 

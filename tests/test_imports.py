@@ -20,6 +20,7 @@ HEAVY = {
 ABOUT_WARP = (
     *("concent_warp.kernels", "concent_warp.train", "concent_warp.render", "concent_warp.simulate.warp_"),
     *("concent_warp.deploy.evaluate", "concent_warp.deploy.play", "concent_warp.deploy.reality_world"),
+    *("concent_warp.deploy.distil", "concent_warp.deploy.simulated_images", "concent_warp.deploy.reality_images"),
 )
 """Modules that are all about such a package: whoever needs them imports them where needed."""
 ANSWER = 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from concent_warp.checks import Bounds, Duration, Share
+from concent_warp.checks import Bounds, Duration, Share, Signed
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,12 @@ class SensorErrorsCfg:
     """Share of frames in which an object is not found."""
     latency: Annotated[tuple[float, float], Bounds(0, 100, ascending=True)] = (1.0, 2.0)
     """Time from a frame to its pose [frames]; sampled once for each episode."""
+    position_bias: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
+    """Error of every tracked position in all episodes [m], world frame, as of a wrongly calibrated camera."""
+    orientation_bias: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
+    """Error of every tracked orientation in all episodes, a rotation vector [rad], world frame."""
+    biased: tuple[str, ...] = ()
+    """Objects that the last two settings concern; all where empty."""
 
 
 @dataclass(frozen=True)

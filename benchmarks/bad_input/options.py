@@ -21,7 +21,10 @@ NEEDED = {
     "locate": "recording.h5",
     "add": "joint_friction --model model.toml --fit recording.h5 -o out.toml",
     "train": "recording.h5 --model model.toml --device cpu -o out",
+    "distil": "shape_sorter --device cpu -o out",
+    "train-flow": "dataset --device cpu -o out",
     "evaluate": "--pretrained --device cpu",
+    "explain": "shape_sorter recording.h5 -o out",
     "play": "--pretrained",
     "export": "--pretrained -o out.onnx",
     "splat-fit": "images -o out",
@@ -37,7 +40,7 @@ NEEDED = {
 SIGNED = (
     "--jobs", "--eye", "--lights.ground", "--reality.expert.grip-height", "--reality.sensing.camera-position",
     "--reality.sensing.camera-target", "--environment.reward.engineered.hole", "--environment.reward.engineered.seat",
-    "-position", "-yaw", "--start", "--limits.workspace",
+    "-position", "-yaw", "-bias", "--start", "--limits.workspace",
 )  # fmt: skip
 """Ends of options that may be -1."""
 SENSELESS = {"FLOAT": ("nan", "-1", "inf", "1e300"), "INT": ("-1", "9" * 300, "1.5", "nan", "-1")}
@@ -78,9 +81,20 @@ WRONG = {
         "--environment.action.gripper-actuators hand", "--environment.action.tool-site gone", "--iterations 0",
         "--environment.randomisation.mass 2 1", "--ppo.activation wish",
     ),
+    "distil": (
+        "--device cuda:7", "--images.cameras ceiling", "--images.cameras base base", "--images.networks gone",
+        "--images.splats block", "--images.delay 2 1", "--network.channels 12", "--network.hidden", "--iterations 0",
+        "--worlds 1000000000", "--dagger.label guess", "--size 4",
+    ),
     "evaluate": (
         "--world dream", "--device cuda:7", "--episodes 0", "--seed -1", "--checkpoint gone", "--action-scale 0",
         "--pretrained nobody", "-o scene.xml", "--pretrained a b",
+        "--task-of shape_sorter", "--instruction dance",
+        "--world simulation --record out", "--world reality --record scene.xml", "--sensors.biased lid",
+    ),
+    "explain": (
+        "gone.h5", "--effects magic", "--jobs 0", "--action-scale 0", "--html scene.xml", "--most-trials 0",
+        "--seed -1",
     ),
     "play": (
         "--port -1", "--port 70000", "--device cuda:7", "--world both", "--episodes 0", "--speed 0",
@@ -98,6 +112,12 @@ WRONG = {
     "render": (
         "--format mp4", "--keep none", "--splats block=gone.ply", "--splats block", "--codec h999", "--size 0",
         "--networks gone", "--cameras nobody", "--pretrained", "--rate 0", "--lights.elevation 80 35",
+        "--handover gone", "--handover.time 2 1",
+    ),
+    "train-flow": (
+        "--cameras nobody", "--backbone magic", "--backbone florence2", "--backbone florence2 --weights gone",
+        "--weights gone", "--device cuda:7", "--policy.execute 17", "--policy.width 100", "--policy.size 2",
+        "--data.state nothing", "--data.action nothing",
     ),
     "demo": (
         "--seeds -1", "--seeds one", "--engine drake", "--unseen-seeds 99999999999", "--count 0", "--fit.held-out 1",

@@ -126,6 +126,20 @@ def write_log(folder: Path) -> None:
     (folder / "map.toml").write_text(LOG_MAP)
 
 
+def write_dataset(folder: Path) -> None:
+    """Write a LeRobot data set of two short episodes."""
+    from concent_warp.render.dataset.layout import EpisodeLayout
+    from concent_warp.render.dataset.lerobot import LeRobotWriter
+
+    writer = LeRobotWriter(folder, EpisodeLayout(10, ("front",), (16, 16), ("elbow",), ("elbow",)))
+    for key in range(2):
+        episode = writer.begin(key, "swing")
+        for angle in ANGLE[:3]:
+            episode.add({"front": np.full((16, 16, 3), 90, np.uint8)}, np.array([angle]), np.array([angle]))
+        episode.save()
+    writer.finish()
+
+
 def servo_log() -> dict[str, object]:
     """Return the log of a servo that swings a payload."""
     entries = [
@@ -174,6 +188,7 @@ def write_all(folder: Path) -> None:
     write_recording_and_model(folder)
     write_csv_folder(folder / "csv")
     write_log(folder)
+    write_dataset(folder / "dataset")
     (folder / "scene.xml").write_text(SCENE)
     (folder / "found.json").write_text(json.dumps(open_diagnosis("elbow", 0.1)))
     (folder / "servo.json").write_text(json.dumps(servo_log()))

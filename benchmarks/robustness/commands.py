@@ -17,8 +17,9 @@ SERVO = ROOT / "concent_warp" / "examples" / "servo.h5"
 SHIPPED = ROOT / "train" / "pretrained" / "shape_sorter"
 QUICK = "--reality.expert.speed 2"
 SPHERES, GENERATIONS, POPULATION = 60, 4, 4
-RECORDING, MODEL, SERVO_MODEL, TRAINED, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, OPEN_DIAGNOSIS = (
-    "demo.h5", "model.toml", "servo.toml", "trained", "photographs", "empty.h5", "video.h5", "log", "found.json",
+RECORDING, MODEL, SERVO_MODEL, TRAINED, TRIALS, PHOTOGRAPHS, FOOTAGE, VIDEO, LOG, DATASET, OPEN_DIAGNOSIS = (
+    "demo.h5", "model.toml", "servo.toml", "trained", "trials", "photographs", "empty.h5", "video.h5", "log",
+    "dataset", "found.json",
 )  # fmt: skip
 """Names of the inputs."""
 TRAIN = (
@@ -28,6 +29,14 @@ TRAIN = (
 NETWORKS = (
     "--network.size 16 --network.width 16 --network.factors 1 2 --flow.batch 8 --enlarge.batch 8 "
     "--super-resolution.width 16 --super-resolution.blocks 2 --crop 10 --device cpu"
+)
+DISTIL = (
+    "distil shape_sorter --states 4 --size 16 --images.samples 1 --worlds 2 --dagger.steps 2 --dagger.updates 2 "
+    "--dagger.batch 4 --network.channels 8 8 --network.hidden 16 --device cpu"
+)
+TRAIN_FLOW = (
+    f"train-flow {{inputs}}/{DATASET} --batch 4 --checkpoint 0.2 --policy.size 16 --policy.width 16 --policy.layers 1 "
+    "--policy.heads 2 --policy.small.channels 8 8 8 --policy.small.text-layers 0 --device cpu --out {out}/run"
 )
 LIMIT = 600.0
 """Time after which a command counts as stuck [s]."""
@@ -95,10 +104,16 @@ WRITING = [
     Writing("locate", f"locate {SERVO} --png {{out}}/forces.png --html {{out}}/report.html"),
     Writing("add", f"add joint_friction --model {{inputs}}/{SERVO_MODEL} --fit {SERVO} --out {{out}}/m.toml"),
     Writing("train", f"{TRAIN} --iterations 4 --out {{out}}/run"),
+    Writing("distil", f"{DISTIL} --iterations 4 --out {{out}}/run"),
     Writing(
         "evaluate",
         f"evaluate --checkpoint {{inputs}}/{TRAINED} --world reality --episodes 2 --videos 2 --device cpu "
-        "--out {out}",
+        "--out {out} --record {out}/trials",
+    ),
+    Writing(
+        "explain",
+        f"explain {{inputs}}/{TRAINED} {{inputs}}/{TRIALS} --no-diagnose --most-trials 1 --repetitions 2 "
+        "--html {out}/page.html --out {out}/run",
     ),
     Writing("export, ONNX", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.onnx"),
     Writing("export, TorchScript", f"export --checkpoint {{inputs}}/{TRAINED} --out {{out}}/policy.pt"),
@@ -110,6 +125,7 @@ WRITING = [
     ),
     Writing("render-train", f"render-train {{inputs}}/{FOOTAGE} --out {{out}}/run --steps 10 {NETWORKS}"),
     Writing("render, LeRobot", f"{RENDER} --format lerobot --films 1 --figure {{out}}/layers.png"),
+    Writing("train-flow", f"{TRAIN_FLOW} --steps 10"),
     Writing("render, robomimic", f"{RENDER} --format robomimic --films 1 --figure {{out}}/layers.png"),
 ]
 
@@ -158,6 +174,8 @@ def prepare(inputs: Path, names: Sequence[str] | None = None) -> None:
         MODEL: f"geometry {RECORDING} --count {SPHERES} --out {MODEL}",
         SERVO_MODEL: f"add joint_damping --model servo.xml --out {SERVO_MODEL}",
         TRAINED: f"{TRAIN} --iterations 2 --out {TRAINED}",
+        DATASET: f"render --pretrained --episodes 2 --size 32 --cameras base --device cpu --keep all --out {DATASET}",
+        TRIALS: f"evaluate --checkpoint {TRAINED} --world reality --episodes 2 --device cpu --record {TRIALS}",
         FOOTAGE: f"record --out {FOOTAGE} --seeds 10 {QUICK} --reality.footage.cameras base "
         "--reality.footage.size 64 64 --reality.footage.rate 5 --reality.footage.no-objects",
         VIDEO: f"record --out {VIDEO} --seeds 0 {QUICK} --reality.sensing.images --reality.sensing.image-rate 10 "

@@ -59,7 +59,7 @@ def _torch(path: Path) -> bool:
     """Return whether a checkpoint or a TorchScript file can be read."""
     import torch
 
-    if path.name == "checkpoint.pt":
+    if path.name in ("checkpoint.pt", "flow_policy.pt"):
         return isinstance(torch.load(path, map_location="cpu", weights_only=True), dict)
     return torch.jit.load(path) is not None
 

@@ -27,7 +27,7 @@ import tyro
 
 from benchmarks.measurements import Measurements
 from benchmarks.pages import ROOT, machine
-from benchmarks.robustness.commands import FIT, RENDER, SERVO, TRAIN, Writing, launch, prepare, run
+from benchmarks.robustness.commands import FIT, RENDER, SERVO, TRAIN, TRAIN_FLOW, Writing, launch, prepare, run
 from benchmarks.robustness.contents import VARYING, files, unfinished, unreadable
 from benchmarks.robustness.page import store
 from concent_warp.fit.geometry.checkpoint import Checkpoint
@@ -65,6 +65,7 @@ KILLABLE = {
     "train": Killable(Writing("train", f"{TRAIN} --iterations 40 --out {{out}}/run")),
     "train, 2 processes": Killable(Writing("train", f"{TRAIN} --iterations 40 --out {{out}}/run"), before=TORCHRUN),
     "render": Killable(Writing("render", f"{RENDER} --episodes 8")),
+    "train-flow": Killable(Writing("train-flow", f"{TRAIN_FLOW} --steps 200"), inputs=("dataset",)),
     "diagnose": Killable(Writing("diagnose", DIAGNOSE), resume=()),
 }
 

@@ -41,6 +41,8 @@ TITLES = {
     ("stacking", "insert"): "Stacking",
 }
 """Titles of the sections by task and stage; *insert* is a task's last stage."""
+FRESH = 30
+"""First seed that was trained after the stress test was made."""
 ABOUT = """\
 `python -m benchmarks.train.trials FOLDERS`: insertion by policies trained in simulation, in a Reality that neither
 the model nor the policy knows. In each episode the objects' friction is 0.2 to 0.5 (0.3 in the model), that of the
@@ -56,16 +58,22 @@ are Wilson's, of these policies.
 the scene in place of spheres, stiff contacts, short steps, and friction factors of 0.6 or 1.7 (`StressCfg`). With all
 spheres in its physics the test does not predict success: fitted geometries differ in how hard they are. The shapes of
 the scene are those of Reality but for the chamfers of its edges; where a scene's shapes are wrong, the test is too.
-Shapes and starting grasps, now as demonstrated, were chosen by looking at these policies: from turned grasps, as in
-training, the correlation is 0.51 [-0.02, 0.90].
+Shapes and starting grasps, now as demonstrated, were chosen by looking at the policies of seeds 12 to 21: from turned
+grasps, as in training, their correlation is 0.51 [-0.02, 0.90].
 
-What the figures do not show: other tasks; policies trained for longer; how far one or two seeds speak for settings.
-Seeds 12 and 13 were used to choose. The trainings kept their last policy, not that of a best stress test.
-Eight trainings ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead
-0.015` with seeds 12 and 13, and without edges seeds 20 to 25. So did ten with geometry fitted with edge spheres, seeds
-30 to 39, after 160 of 300 iterations, and two of a round peg after 90; of these two policies were kept, seed 33, which
-succeeds in 191 of 200 trials, and a peg's, seed 30, in 187 of 200 (`concent evaluate --checkpoint POLICY --world
-reality --episodes 200`; they are not in the repository).
+What the figures do not show: tasks without a section of their own; policies trained for longer; how far one or two
+seeds speak for settings. Seeds 12 to 15 were used to choose; so was the seed of the whole task whose policy is shipped,
+by the stress test. The trainings of seeds 12, 13, 20 and 21 kept their last policy, the others that of the best stress
+test.
+
+Trainings that ended early with the machine that they ran on, and were not tried: `--environment.action.turn-lead
+0.015` with seeds 12 and 13; without edges seeds 20 to 25; insertion with seed 15; the whole task with seed 15 after
+240 s (52 % in training) and, with `turn 0.006`, seed 14 after 230 s (0 %). Ten with geometry fitted with edge
+spheres, seeds 30 to 39, ended so after 160 of 300 iterations; their stress tests after 50, 100 and 150 were alike, so
+that 100 iterations were made the second time, of seeds 30 to 37; 38 and 39 found no time. Of the first time two
+policies were kept, seed 33, which succeeds in 191 of 200 trials, and one of a round peg, seed 30 after 90 iterations,
+in 187 of 200 (`concent evaluate --checkpoint POLICY --world reality --episodes 200`; they are not in the repository).
+Trainings of seeds 30 to 37 shared a GPU by twos.
 """
 
 
@@ -143,17 +151,23 @@ def settings_table(rows: Sequence[Row]) -> str:
 
 
 def prediction(rows: Sequence[Row]) -> str:
-    """Return what the rank correlation of stress test and trial is, with an interval over policies."""
+    """Return what the rank correlation of stress test and trial is, of all policies and of those that chose nothing."""
+    fresh = [row for row in rows if row["seed"] >= FRESH]
+    said = f"Spearman's rank correlation over {len(rows)} policies, settings and seeds mixed: {correlation(rows)}"
+    if len(fresh) > 2:
+        said += f"; over {len(fresh)} of seeds from {FRESH} on, which the test was not made with: {correlation(fresh)}"
+    return f"{said} (bootstrap over policies)."
+
+
+def correlation(rows: Sequence[Row]) -> str:
+    """Return Spearman's rank correlation of stress test and trial with its 95 % interval."""
     stress = np.array([row["stress"]["successes"] / row["stress"]["episodes"] for row in rows])
     real = np.array([row["successes"] / row["episodes"] for row in rows])
     rng = np.random.default_rng(0)
     with np.errstate(invalid="ignore"):  # samples of equal policies have no correlation
         drawn = [rank_correlation(stress[k], real[k]) for k in rng.integers(len(rows), size=(2000, len(rows)))]
     low, high = np.nanpercentile(drawn, [2.5, 97.5])
-    return (
-        f"Spearman's rank correlation over {len(rows)} policies, settings and seeds mixed: "
-        f"{rank_correlation(stress, real):.2f} [{low:.2f}, {high:.2f}] (bootstrap over policies)."
-    )
+    return f"{rank_correlation(stress, real):.2f} [{low:.2f}, {high:.2f}]"
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

@@ -41,7 +41,9 @@ GROUPS = {
     },
     "from a model to a policy": {
         "train": "train a policy under the contact events of a demonstration",
+        "distil": "train a student that sees to act as a policy does",
         "evaluate": "count how often a policy succeeds, in simulation and Reality",
+        "explain": "find why trials of a policy failed: perception, physics or policy",
         "play": "show a policy live in the browser",
         "export": "write a policy as ONNX, or a recording as a LeRobot data set",
     },
@@ -49,6 +51,7 @@ GROUPS = {
         "splat-fit": "fit Gaussian splats to posed images of an object",
         "render-train": "train the networks that paint robot and background",
         "render": "render episodes or a recording as a data set of images",
+        "train-flow": "train a policy that sees, from a data set of images",
     },
 }
 """Commands by the step of the pipeline, each a module of this package, "-" as "_", with what it does."""
@@ -69,12 +72,15 @@ EXAMPLES = {
     "locate": "concent locate demo.h5 --model scene.xml --png forces.png",
     "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
     "train": "concent train demo.h5 --model model.toml -o runs/insert",
+    "distil": "concent distil runs/insert -o runs/student",
     "evaluate": "concent evaluate --checkpoint runs/insert --episodes 200",
+    "explain": "concent explain runs/insert trials --html explanation.html",
     "play": "concent play --checkpoint runs/insert",
     "export": "concent export --checkpoint runs/insert -o policy.onnx",
     "splat-fit": "concent splat-fit photographs -o runs/splats",
     "render-train": "concent render-train robot.h5 -o runs/render",
     "render": "concent render --checkpoint runs/insert -o dataset",
+    "train-flow": "concent train-flow dataset -o runs/flow",
 }
 """One example of each command, shown by its help."""
 LOADING_AFTER = 1.5

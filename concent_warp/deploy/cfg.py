@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from concent_warp.checks import Bounds, Count, PositiveShare, Signed, Worlds, check_seed, check_settings
 from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
+from concent_warp.reality.sensors.live_cameras import LiveCamerasCfg
 from concent_warp.reality.variation import VariationCfg
 from concent_warp.reality.world import WorldCfg
 from concent_warp.render.shadow_cfg import ShadowCfg
@@ -60,6 +61,10 @@ class EvaluateCfg(RealityWorldCfg):
     of the drives it bounds the force that the robot exerts."""
     videos: int = 0
     """Number of first episodes in Reality to record as MP4."""
+    record_failures: bool = False
+    """Whether only failed trials are recorded."""
+    cameras: LiveCamerasCfg = field(default_factory=LiveCamerasCfg)
+    """Reality's cameras, by which a student acts."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,23 @@ class PlayCfg(RealityWorldCfg):
     """Position of the camera relative to the objects [m]."""
     touch_gap: float = 5e-4
     """Gap below which a sphere is shown as touching a body [m], the depth of typical contacts."""
+
+
+@dataclass(frozen=True)
+class HandoverCfg:
+    """When a policy hands over to the one whose episodes are rendered, and what of it goes into the data set.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> cw.RenderCfg(handover=cw.HandoverCfg(time=(0.5, 2.0))).handover.frames
+        'teacher'
+    """
+
+    time: Annotated[tuple[float, float], Bounds(0, 3600, ascending=True)] = (0.0, 1.5)
+    """Least and largest time for which the first policy drives [s], uniform; episodes last as much longer."""
+    frames: Literal["teacher", "all"] = "teacher"
+    """Frames that go into the data set: those from the hand-over on, or all. What the first policy did is no example
+    to follow."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +162,12 @@ class RenderCfg:
     """Seed of initial states, lights and noise."""
     lights: ShadowCfg = field(default_factory=ShadowCfg)
     """Settings of the lights."""
+    handover: HandoverCfg = field(default_factory=HandoverCfg)
+    """Settings of the hand-over from another policy, where one is given."""
 
 
-def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0) -> None:
-    """Check the settings of an evaluation.
+def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: int = 0, *, record: bool = False) -> None:
+    """Check the settings of an evaluation; `record` says whether its trials are to be recorded.
 
     Raises:
         TrainError: One is out of bounds, or concerns Reality while the policy runs in simulation.
@@ -158,3 +182,5 @@ def check_evaluation(cfg: EvaluateCfg, world: TrialName, episodes: int, seed: in
         raise TrainError("hidden effects exist only in Reality", fix="add --world reality")
     if cfg.videos and world != "reality":
         raise TrainError("videos are of Reality", fix="add --world reality")
+    if record and world != "reality":
+        raise TrainError("trials are recorded in Reality", fix="add --world reality")

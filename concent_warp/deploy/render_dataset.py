@@ -26,12 +26,17 @@ from concent_warp.run_folder import (
 from concent_warp.scene.cameras import BASE, WRIST
 
 if TYPE_CHECKING:
+    from concent_warp.deploy.handover import Handover
     from concent_warp.model import Model
     from concent_warp.recording.recording import Recording
     from concent_warp.render.composite import HybridCamera
     from concent_warp.render.dataset.layout import DatasetWriter, EpisodeLayout
     from concent_warp.render.filming import DatasetFilming
+    from concent_warp.train.distil.student import Student
+    from concent_warp.train.environment.environment import Environment
+    from concent_warp.train.flow.policy import FlowPolicy
     from concent_warp.train.policy.load import Policy
+    from concent_warp.train.trials.episodes import PolicyFunction
 
 FREE = ("out", "resume", "overwrite", "source", "episodes", "worlds", "films", "figure", "device")
 """Settings that may differ when a data set is continued."""
@@ -64,6 +69,7 @@ def render(
     out: str | Path,
     cfg: RenderCfg | None = None,
     *,
+    driver: Policy | Student | FlowPolicy | None = None,
     format: Format = "lerobot",
     device: str | None = None,
     resume: bool = False,
@@ -79,6 +85,8 @@ def render(
         source: The policy, whose episodes in simulation are rendered, or a recording.
         out: Folder of the data set.
         cfg: Settings.
+        driver: Policy that acts at the beginning of each episode, for a random time, before it hands over to `source`;
+            a flow policy sees the images of the data set, a student its own. None for none.
         format: LeRobotDataset v3.0, or one HDF5 file in robomimic's layout.
         device: Warp's name of the device; the first CUDA device by default where there is one.
         resume: Continue an interrupted data set, or one with fewer episodes.
@@ -86,7 +94,8 @@ def render(
         progress: Called with the share done, 0..1.
 
     Raises:
-        RenderError: A setting is out of bounds, or the folder holds something else.
+        RenderError: A setting is out of bounds, the folder holds something else, or a recording has a driver.
+        TrainError: The driver does not fit the task.
         ConcentError: A file is there already, or the data set was begun with other settings.
 
     Example:
@@ -102,9 +111,11 @@ def render(
         claim_file(cfg.figure, overwrite=overwrite or resume)
     _check_replaced(out, overwrite=overwrite)
     with run_folder(out, overwrite=overwrite, resume=resume, keep_folders=False) as claimed:
-        to = Destination(claimed.path, cfg, format, device, resume)
+        to = Destination(claimed.path, cfg, format, device, resume, driver)
         from concent_warp.recording.recording import Recording
 
+        if driver is not None and isinstance(source, Recording):
+            raise RenderError("a recording is not driven", expected="a policy that takes over", found="a recording")
         film = _film_recording if isinstance(source, Recording) else _film_policy
         filming = film(source, to, progress or _ignore)  # pyright: ignore[reportArgumentType]
         count = filming.writer.finish()
@@ -120,6 +131,7 @@ class Destination:
     format: Format
     device: str | None
     resume: bool
+    driver: Policy | Student | FlowPolicy | None = None
 
 
 def _ignore(share: float) -> None:
@@ -152,6 +164,8 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     torch.manual_seed(cfg.seed)
     worlds = min(cfg.worlds, cfg.episodes)
     settings = replace(run.cfg.environment, worlds=worlds, capture="physics")
+    if to.driver is not None:
+        settings = replace(settings, episode=settings.seconds + cfg.handover.time[1])
     environment = make_environment(task, settings, states, device=to.device)
     act = policy.act_in(environment)
     rate = round(1 / environment.control_step)
@@ -161,6 +175,8 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
     joints, layout = _addressed(model, camera, rate)
     writer = _dataset_writer(to, layout, model)
     filming = _new_filming(to, camera, writer, cfg.task or run.recording[0].task or "do the task", rate)
+    handover = None if to.driver is None else _handover(environment, policy, act, filming, to)
+    act = act if handover is None else handover.act
     left = [row for row in range(cfg.episodes) if not writer.has(row)]
     physics, length = environment.physics, int(environment.max_episode_length)
     with _leaving(filming):
@@ -168,14 +184,18 @@ def _film_policy(policy: Policy, to: Destination, progress: Callable[[float], No
             rows = left[first : first + worlds]
             episodes = Episodes(environment, act, rows)
             filming.begin([*rows, *[None] * (worlds - len(rows))])
+            if handover is not None:
+                handover.begin(rows)
             filming.shoot(physics.qpos, physics.mocap)
             state = physics.qpos.cpu().numpy()[:, joints]
             for step in episodes:
                 for world in filming.running:
-                    filming.add(world, state[world], step.command[world])
+                    recorded = handover is None or handover.is_recorded(world)
+                    filming.add(world, state[world], step.command[world], recorded=recorded)
                     if world in step.outcome:
                         success = step.outcome[world] == SUCCESS
-                        filming.end(world, keep=cfg.keep == "all" or success, success=success)
+                        shown = handover is None or handover.has_taken_over(world)
+                        filming.end(world, keep=shown and (cfg.keep == "all" or success), success=success)
                 progress((first + len(rows) * episodes.length / length) / len(left))
                 if not filming.running:
                     break
@@ -214,6 +234,27 @@ def _film_recording(recording: Recording, to: Destination, progress: Callable[[f
                 progress((k + (t + 1) / len(time)) / len(recording.demonstrations))
             filming.end(0, keep=True)
     return filming
+
+
+def _handover(
+    environment: Environment, teacher: Policy, act: PolicyFunction, filming: DatasetFilming, to: Destination
+) -> Handover:
+    """Return who drives in an environment whose worlds are filmed; `act` is the teacher's function there."""
+    from concent_warp.deploy.handover import FilmedImages, Handover
+    from concent_warp.deploy.simulated_images import simulated_images
+    from concent_warp.train.distil.student import Student
+    from concent_warp.train.flow.policy import FlowPolicy
+    from concent_warp.train.flow.task_policy import TaskFlowPolicy
+
+    driver = to.driver
+    if isinstance(driver, FlowPolicy):
+        drive = TaskFlowPolicy(driver, teacher, filming.task).act_in(environment, FilmedImages(filming))
+    elif isinstance(driver, Student):
+        drive = driver.act_in(environment, simulated_images(environment, driver.cfg.images, driver.cfg.looks))
+    else:
+        assert driver is not None
+        drive = driver.act_in(environment)
+    return Handover(environment, drive, act, to.cfg.handover, to.cfg.seed)
 
 
 @contextmanager
@@ -285,6 +326,8 @@ def _addressed(model: mujoco.MjModel, camera: HybridCamera, rate: int) -> tuple[
 def _dataset_writer(to: Destination, layout: EpisodeLayout, model: mujoco.MjModel) -> DatasetWriter:
     """Return the data set of cameras in a model, new or to be continued, with their calibration beside it."""
     settings = {"format": to.format, "out": str(to.out), **plain(to.cfg)}
+    if to.driver is not None:
+        settings["driver"] = str(to.driver.folder)
     if to.resume:
         check_unchanged(to.out / SETTINGS, settings, FREE)
     write_settings(to.out, settings)

@@ -79,6 +79,26 @@ class ImageStream:
 
 
 @dataclass(frozen=True)
+class PolicyLog:
+    """What a policy observed and did in each control step of a trial.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> import numpy as np
+        >>> log = cw.PolicyLog(np.array([0.0, 0.05]), np.zeros((2, 155)), np.zeros((2, 8)))
+        >>> log.action.shape
+        (2, 8)
+    """
+
+    time: np.ndarray
+    """Times at which it was asked [s], shape (T,), strictly increasing."""
+    observation: np.ndarray
+    """Its observations, as `concent export` describes them, shape (T, O)."""
+    action: np.ndarray
+    """Its actions, -1..1, shape (T, A)."""
+
+
+@dataclass(frozen=True)
 class Demonstration:
     """One execution of a task, or one toss, swing or push: everything recorded between start and stop.
 
@@ -104,6 +124,8 @@ class Demonstration:
     """Tracked points, by body name."""
     image: Mapping[str, ImageStream] = field(default_factory=dict)
     """RGB-D streams, by camera name."""
+    policy: PolicyLog | None = None
+    """What the policy observed and did, in a trial of one."""
 
     @property
     def duration(self) -> float:

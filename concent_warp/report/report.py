@@ -41,6 +41,7 @@ def write_report(
     settings: Mapping[str, Any] | None = None,
     diagnosis: Diagnosis | Mapping[str, Any] | None = None,
     location: UnexplainedForces | Mapping[str, Any] | None = None,
+    first_section: str = "",
 ) -> None:
     """Write the report, in one piece or not at all.
 
@@ -56,6 +57,7 @@ def write_report(
         settings: ``command``, ``versions`` and ``settings`` to show.
         diagnosis: A diagnosis, or its JSON object.
         location: Unexplained forces, or their JSON object.
+        first_section: HTML of a section to show before all others.
 
     Example:
         >>> import concent_warp as cw
@@ -83,7 +85,7 @@ def write_report(
             f'<span class="key {kind_of(comparison, name)}"></span>{escape(name)}&emsp;' for name in comparison.models
         )
         + '<span class="key noise"></span>noise floor',
-        "diagnosis": diagnosis_section(diagnosis),
+        "diagnosis": first_section + diagnosis_section(diagnosis),
         "where": _worst_spans_section(comparison, [d.name for d in chosen]),
         "place_switch": PLACE_SWITCH if data["places"] else "",
         "errors_about": (

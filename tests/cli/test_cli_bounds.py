@@ -30,6 +30,9 @@ NEGATIVE = {
     "--eye": COORDINATE,
     "--lights.ground": COORDINATE,
     "--start": COORDINATE,
+    **{f"--{prefix}sensors.{name}-bias": COORDINATE
+       for prefix in ("", "environment.observation.", "stress.")
+       for name in ("position", "orientation")},
     "--limits.workspace": COORDINATE,
     "--reality.expert.grip-height": COORDINATE,
     "--reality.sensing.camera-position": COORDINATE,

@@ -24,6 +24,9 @@ CASES = [
     ("evaluate --checkpoint other", "other: the folder holds no training"),
     ("evaluate --pretrained nothing", "no such policy comes with the package"),
     ("evaluate --pretrained --out text.pt", "text.pt: this is a file"),
+    ("distil nobody", "no such policy comes with the package"),
+    ("distil other", "other: the folder holds no training"),
+    ("distil shape_sorter -o other", "other: the folder holds other things than a run"),
     ("export", "one policy is to be run"),
     ("export --checkpoint nowhere", "no such training"),
     ("export --pretrained -o demo.h5", "demo.h5: the file exists"),
@@ -70,7 +73,7 @@ def test_inputs_are_checked_before_heavy_imports(line, words, bench, tmp_path):
 
 
 def test_all_commands_that_import_torch_are_tried():
-    heavy = {"evaluate", "export", "play", "render", "splat-fit", "render-train", "train"}
+    heavy = {"distil", "evaluate", "export", "play", "render", "splat-fit", "render-train", "train"}
     assert {line.split()[0] for line, _ in CASES} == heavy
     assert heavy < set(COMMANDS)
 

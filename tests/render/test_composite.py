@@ -6,7 +6,7 @@ from small_arm import XML, ball, states
 
 from concent_warp.render.composite import HybridCamera, _composed
 from concent_warp.render.figure import FrameSelection, decomposition
-from concent_warp.render.raw import _camera_ids
+from concent_warp.render.raw import camera_ids
 from concent_warp.render.shadows import ShadowCfg
 from concent_warp.scene.scene import Scene
 
@@ -102,7 +102,7 @@ def test_figure_has_a_row_for_each_sample_and_camera(tmp_path):
     picture = cv2.imread(str(tmp_path / "layers.png"))
     assert picture is not None
     assert picture.shape[1] / picture.shape[0] == pytest.approx(5 / 4, rel=0.1)
-    assert len(_camera_ids(Scene(XML).model, camera.cameras)) == 2
+    assert len(camera_ids(Scene(XML).model, camera.cameras)) == 2
 
 
 @pytest.mark.gpu

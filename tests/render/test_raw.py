@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from concent_warp.errors import RenderError, SceneError
-from concent_warp.render.raw import PosedWorlds, RawCamera, _camera_ids, _matrix_quaternions
+from concent_warp.render.raw import PosedWorlds, RawCamera, _matrix_quaternions, camera_ids
 from concent_warp.scene.cameras import BASE, WRIST, with_cameras
 from concent_warp.scene.scene import Scene
 from concent_warp.scene.shape_sorter import ShapeSorterCfg, home
@@ -65,7 +65,7 @@ def test_depth_and_segmentation_are_those_of_c_mujoco(sorter):
 
 def cast_through_pixels(model, data, name, matrix):
     """Return planar depths [m] and geom ids, shape SIZE, by C MuJoCo's rays."""
-    row = _camera_ids(model, [name])[0]
+    row = camera_ids(model, [name])[0]
     depth, geom, hit = np.zeros(SIZE), np.full(SIZE, -1), np.zeros(1, dtype=np.int32)
     turned = data.cam_xmat[row].reshape(3, 3)
     shown = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
@@ -119,7 +119,7 @@ def test_wrist_camera_moves_with_the_hand_and_poses_are_those_of_mujoco(sorter):
         data.qpos[0] += angle
         stage.place(data.qpos[None].copy())
         mujoco.mj_forward(model, data)
-        row = _camera_ids(model, [WRIST])[0]
+        row = camera_ids(model, [WRIST])[0]
         pose = stage.camera_poses([WRIST])[0, 0].numpy()
         expected = np.zeros(4)
         mujoco.mju_mat2Quat(expected, data.cam_xmat[row])

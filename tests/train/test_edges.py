@@ -75,11 +75,12 @@ def test_edges_move_as_the_faces_beside_them(model):
     np.testing.assert_allclose(still, 0, atol=2e-5)
 
 
-def test_task_has_them_in_its_physics_beside_the_spheres_of_the_events():
-    run = cw.load_policy("pick_align_insert").run  # its geometry has none
+def test_task_has_them_in_its_physics_beside_the_spheres_of_the_events(model):
+    run = cw.load_policy("shape_sorter").run
+    (events,) = cw.extract_events(model, run.recording).values()
     without = replace(run.cfg.environment, stage="insert", edges=EdgeCfg(count=0))
     plain, task = (
-        Task.build(run.model, run.recording[0], cfg, run.events)
+        Task.build(model, run.recording[0], cfg, events)
         for cfg in (without, replace(without, edges=EdgeCfg(count=200)))
     )
     more = len(task.collidable) - len(plain.collidable)

@@ -121,9 +121,9 @@ def test_contacts_that_c_mujoco_drops_are_counted(task, states, monkeypatch):
     environment = make_environment(task, replace(SETTINGS, worlds=2), states, device="cpu")
     step, calls = mujoco.mj_step, 0
 
-    def full(model, data):
+    def full(model, data, nstep=1):
         nonlocal calls
-        step(model, data)
+        step(model, data, nstep)
         calls += 1
         if calls == 1:
             data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number += 1

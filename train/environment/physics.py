@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,6 +28,8 @@ UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, 
 """Warnings after which MuJoCo resets a world to its reference pose."""
 DROPPED = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """Warnings that contacts or constraints were dropped for lack of memory."""
+MIN_WORLDS_OF_THREAD = 4
+"""Worlds that are worth a thread."""
 
 
 class Physics(Protocol):
@@ -94,7 +98,7 @@ class Actor:
 
 
 class MujocoPhysics:
-    """Worlds of C MuJoCo, simulated one after the other: on CPUs, and for Reality."""
+    """Worlds of C MuJoCo, in threads where nothing of them is computed in Python: on CPUs, and for Reality."""
 
     def __init__(
         self,
@@ -147,6 +151,11 @@ class MujocoPhysics:
         self.buffers: tuple[int, int] | None = None
         arrays = (self.qpos, self.qvel, self.warmstart, self.position, self.quaternion, self.site)
         self._arrays = [tensor.numpy() for tensor in arrays]
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        # What is computed in Python takes turns anyway.
+        alone = bool(force_models) or any(self._actors)
+        threads = 1 if alone else min(cores, worlds // MIN_WORLDS_OF_THREAD)
+        self._threads = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def _model_of(self, world: int, fields: Mapping[str, np.ndarray]) -> mujoco.MjModel:
         """Return the model of a world; the same object for all worlds without varied fields."""
@@ -178,31 +187,47 @@ class MujocoPhysics:
     def _advance(self, ctrl: np.ndarray) -> None:
         """Simulate the steps of one action under the commands of each, shape (D, N, nu)."""
         wrench = self.wrench.numpy().astype(float)
-        for i, (m, d) in enumerate(zip(self._models, self._data, strict=True)):
-            self._write(i, m, d)
-            d.xfrc_applied[:] = wrench[i]
-            for command in ctrl[:, i]:
-                for actor in self._actors[i]:
-                    command = command if actor.command is None else actor.command(d.time, command)
-                d.ctrl[:] = command
-                if self._force_models[i] or self._actors[i]:
-                    d.qfrc_applied[:] = 0
-                    d.xfrc_applied[:] = wrench[i]
-                    for target, values in self._unedited[i]:
-                        target[:] = values
-                    for force_model in self._force_models[i]:
-                        force_model()
-                    for actor in self._actors[i]:
-                        if actor.force is not None:
-                            actor.force(m, d)
-                mujoco.mj_step(m, d)
-            mujoco.mj_kinematics(m, d)
-            self._read(i, d)
-            if any(d.warning[kind].number for kind in UNSTABLE):
-                self._arrays[0][i] = np.nan
-            for kind in DROPPED:
-                if d.warning[kind].number:
-                    d.warning[kind].number, self.overflow[i] = 0, 1
+        work = (range(self.worlds), ctrl.swapaxes(0, 1), wrench)
+        # Worlds do not depend on one another, so that the result is the same.
+        for _ in (map if self._threads is None else self._threads.map)(self._advance_world, *work):
+            pass
+
+    def _advance_world(self, i: int, ctrl: np.ndarray, wrench: np.ndarray) -> None:
+        """Simulate the steps of one action in a world, under the commands of each (D, nu) and wrenches (nbody, 6)."""
+        m, d = self._models[i], self._data[i]
+        self._write(i, m, d)
+        d.xfrc_applied[:] = wrench
+        if self._filter is None and not self._force_models[i] and not self._actors[i]:
+            d.ctrl[:] = ctrl[0]
+            mujoco.mj_step(m, d, nstep=len(ctrl))
+        else:
+            for command in ctrl:
+                self._step_world(i, command, wrench)
+        mujoco.mj_kinematics(m, d)
+        self._read(i, d)
+        if any(d.warning[kind].number for kind in UNSTABLE):
+            self._arrays[0][i] = np.nan
+        for kind in DROPPED:
+            if d.warning[kind].number:
+                d.warning[kind].number, self.overflow[i] = 0, 1
+
+    def _step_world(self, i: int, command: np.ndarray, wrench: np.ndarray) -> None:
+        """Simulate one step of a world under a command (nu,)."""
+        m, d = self._models[i], self._data[i]
+        for actor in self._actors[i]:
+            command = command if actor.command is None else actor.command(d.time, command)
+        d.ctrl[:] = command
+        if self._force_models[i] or self._actors[i]:
+            d.qfrc_applied[:] = 0
+            d.xfrc_applied[:] = wrench
+            for target, values in self._unedited[i]:
+                target[:] = values
+            for force_model in self._force_models[i]:
+                force_model()
+            for actor in self._actors[i]:
+                if actor.force is not None:
+                    actor.force(m, d)
+        mujoco.mj_step(m, d)
 
     def update_poses(self) -> None:
         """Compute the poses from the generalised positions."""

@@ -8,12 +8,14 @@ past counts relative to where the hand was then.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 
+from concent_warp.errors import TrainError
 from concent_warp.train.environment.physics import Physics
 from concent_warp.train.environment.quaternions import (
     invert_quaternion,
@@ -27,6 +29,9 @@ from concent_warp.train.task.task import Task
 
 Pose = tuple[torch.Tensor, torch.Tensor]
 """Positions (..., 3) [m] and unit quaternions (..., 4)."""
+FrameWatch = Callable[[torch.Tensor, torch.Tensor, Pose], None]
+"""Called with the times of frames since the episodes began [s], shape (N,), whether each shows an object, shape (N, O)
+bool, and the tracked poses, world frame."""
 SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 FIRST_FRAMES = 15
 """Frames of a fixed object that the tracker has seen before an episode begins."""
@@ -80,6 +85,9 @@ class StateEstimate:
         self._read = torch.zeros(n, len(self._arm), device=device)
         self._clock, self._newest = torch.zeros(n, device=device), torch.zeros(n, device=device)
         self._latency, self._phase = torch.zeros(n, device=device), torch.zeros(n, device=device)
+        self._bias = _bias(sensors, [m.body(body).name for body in task.objects]).to(device)
+        self.watch: FrameWatch | None = None
+        """Called with each frame of the tracker as it comes; only where steps are not captured in graphs."""
         self._deviation = torch.tensor([sensors.position_std] * 3 + [sensors.orientation_std] * 3, device=device)
 
     @property
@@ -134,7 +142,10 @@ class StateEstimate:
             fresh = (frame > self._newest) & ~started
             age = self._clock * self._dt - self._phase - frame / self._sensors.rate
             found = fresh[:, None] & (torch.rand_like(self._seen) >= self._sensors.dropout)
-            measured = _carried(self._measured(age), _at(self._past_hand, age / self._dt), now, grasped)
+            tracked = self._measured(age)
+            if self.watch is not None:
+                self.watch(self._clock * self._dt - age, found, tracked)
+            measured = _carried(tracked, _at(self._past_hand, age / self._dt), now, grasped)
             self._seen += found
             gain = torch.where(self._fixed, 1 / self._seen.clamp(min=1.0), self._gain) * found
             pose = _mixed(pose, measured, gain)
@@ -156,7 +167,7 @@ class StateEstimate:
     def _begin(self, started: torch.Tensor) -> None:
         """Sample what is constant in an episode, where one starts."""
         errors, n = self._sensors, len(started)
-        constant = math.sqrt(errors.constant_share) * self._deviation * torch.randn_like(self._constant)
+        constant = self._bias + math.sqrt(errors.constant_share) * self._deviation * torch.randn_like(self._constant)
         self._constant.copy_(torch.where(started[:, None, None], constant, self._constant))
         low, high = errors.latency
         chances = torch.rand(2, n, device=started.device)
@@ -187,6 +198,18 @@ class StateEstimate:
             elif fixture is not None:
                 mocap[0][:, fixture] = place.to(mocap[0].dtype)
                 mocap[1][:, fixture] = turn.to(mocap[1].dtype)
+
+
+def _bias(sensors: SensorErrorsCfg, objects: list[str]) -> torch.Tensor:
+    """Return the bias of each object's poses: position [m], rotation vector [rad], shape (O, 6).
+
+    Raises:
+        TrainError: The settings name an object that the task lacks.
+    """
+    if unknown := sorted(set(sensors.biased) - set(objects)):
+        raise TrainError("the poses of an unknown object are biased", expected=f"some of {objects}", found=unknown)
+    bias = torch.tensor([*sensors.position_bias, *sensors.orientation_bias])
+    return torch.stack([bias * (not sensors.biased or name in sensors.biased) for name in objects])
 
 
 def _address(m: mujoco.MjModel, body: int) -> tuple[int | None, int | None]:

@@ -49,14 +49,38 @@ def export(run: TrainingRun, weights: Mapping[str, Any], out: Path) -> dict[str,
     Raises:
         TrainError: The file has another suffix.
     """
+    check_suffix(out)
+    task = run.task()
+    described = describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
+    module = _policy_module(run.cfg, described["observation"]["size"], task.robot.actions, weights["actor_state_dict"])
+    write_module(module, {INPUT: torch.zeros(2, described["observation"]["size"])}, described, out)
+    return described
+
+
+def check_suffix(out: Path) -> None:
+    """Check that a file's suffix names a format.
+
+    Raises:
+        TrainError: It names none.
+    """
     if out.suffix not in SUFFIXES:
         raise TrainError("the export format is unknown", where=out, expected=f"a name in {' or '.join(SUFFIXES)}")
-    task = run.task()
-    described = _describe(run.cfg, task) | {"iterations": weights["iteration"], "steps": weights["steps"]}
-    module = _policy_module(run.cfg, described["observation"]["size"], task.robot.actions, weights["actor_state_dict"])
+
+
+def write_module(module: nn.Module, example: Mapping[str, torch.Tensor], described: dict[str, Any], out: Path) -> None:
+    """Write a module from inputs to actions, for batches of any size, in the format of the file's suffix.
+
+    Args:
+        module: The module.
+        example: An input of two worlds for each argument, by its name.
+        described: Metadata.
+        out: The file.
+
+    Raises:
+        TrainError: The module cannot be exported.
+    """
     to_bytes = _onnx if out.suffix == ".onnx" else _torchscript
-    write_bytes(out, to_bytes(module, described))
-    return described
+    write_bytes(out, to_bytes(module, example, described))
 
 
 def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapping[str, Any]) -> nn.Module:
@@ -71,11 +95,10 @@ def _policy_module(cfg: TrainCfg, observations: int, actions: int, weights: Mapp
     return actor.as_jit().eval()
 
 
-def _onnx(module: nn.Module, described: dict[str, Any]) -> bytes:
+def _onnx(module: nn.Module, example: Mapping[str, torch.Tensor], described: dict[str, Any]) -> bytes:
     """Return a policy as ONNX, with the weights inside, for batches of any size."""
     import onnx
 
-    example = torch.zeros(2, described["observation"]["size"])
     quiet = contextlib.redirect_stdout(io.StringIO())  # the exporter prints and logs
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
@@ -83,8 +106,9 @@ def _onnx(module: nn.Module, described: dict[str, Any]) -> bytes:
         with quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             program = torch.onnx.export(
-                module, (example,), input_names=[INPUT], output_names=[OUTPUT], opset_version=OPSET, dynamo=True,
-                dynamic_shapes=({0: torch.export.Dim("worlds")},), verbose=False,
+                module, tuple(example.values()), input_names=list(example), output_names=[OUTPUT],
+                opset_version=OPSET, dynamo=True, verbose=False,
+                dynamic_shapes=tuple({0: torch.export.Dim("worlds")} for _ in example),
             )  # fmt: skip
     except torch.onnx.OnnxExporterError as error:
         cause: BaseException = error
@@ -101,17 +125,17 @@ def _onnx(module: nn.Module, described: dict[str, Any]) -> bytes:
     return model.SerializeToString()
 
 
-def _torchscript(module: nn.Module, described: dict[str, Any]) -> bytes:
+def _torchscript(module: nn.Module, example: Mapping[str, torch.Tensor], described: dict[str, Any]) -> bytes:
     """Return a policy as TorchScript."""
     content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        traced = torch.jit.trace(module, torch.zeros(2, described["observation"]["size"]))
+        traced = torch.jit.trace(module, tuple(example.values()))
         torch.jit.save(traced, content, _extra_files={f"{METADATA}.json": json.dumps(described)})
     return content.getvalue()
 
 
-def _describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
+def describe(cfg: TrainCfg, task: Task) -> dict[str, Any]:
     """Return the metadata of a task's policy as plain data, in m, rad and s."""
     dt = task.replay.timestep
     return {

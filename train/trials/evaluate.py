@@ -41,6 +41,8 @@ class Evaluation:
     """Number of stage targets that each episode met in order, shape (E,) int."""
     videos: tuple[Path, ...] = ()
     """Files of the videos."""
+    recorded: Path | None = None
+    """Recording of the trials; None where none were recorded."""
 
     @property
     def rate(self) -> float:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from concent_warp.checks import Bounds
-from concent_warp.cli.given_policy import Pretrained, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_flow_policy, given_flow_policy, given_policy_or_student
 from concent_warp.cli.options import DeviceOption, OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
 from concent_warp.deploy.cfg import EvaluateCfg, TrialName, check_evaluation
+from concent_warp.errors import TrainError
 from concent_warp.reality.hidden.in_task import parse_effects
 from concent_warp.run_folder import check_folder, make_folder
 
@@ -29,9 +30,13 @@ class Arguments:
     """
 
     checkpoint: Path | None = None
-    """Run folder of a training, or its checkpoint file."""
+    """Run folder of a training, of a student that sees or of a flow policy, or its checkpoint file."""
     pretrained: Pretrained = None
     """Run a policy that comes with the package, shape_sorter where no name is given."""
+    task_of: str | None = None
+    """Policy whose task a flow policy is to do: a run folder of concent train, or one that comes with the package."""
+    instruction: str | None = None
+    """What a flow policy is told; the demonstration's task by default."""
     world: Literal["simulation", "stress", "reality", "both", "all"] = "both"
     """Where to run the policy: simulation as in training, the same under worse conditions (stress), Reality, both
     simulation and Reality, or all three."""
@@ -41,8 +46,10 @@ class Arguments:
     """Seed of the initial states."""
     out: OptionalOutPath = None
     """Folder for the videos; by default the folder videos in the run folder, of a pretrained policy here."""
+    record: Path | None = None
+    """Folder for a recording of the trials in Reality, as instruments and tracker show them, for concent explain."""
     overwrite: bool = False
-    """Replace videos that are there."""
+    """Replace videos and recordings that are there."""
     json: bool = False
     """Print one JSON object with the outcome of every episode instead of sentences."""
     device: DeviceOption = None
@@ -57,10 +64,18 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
         "all": ("simulation", "stress", "reality"),
     }
     worlds = several[arguments.world] if arguments.world in ("both", "all") else (arguments.world,)
-    check_evaluation(cfg, worlds[-1], arguments.episodes)
-    if arguments.out is not None:
-        check_folder(arguments.out)
-    policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    check_evaluation(cfg, worlds[-1], arguments.episodes, record=arguments.record is not None)
+    for folder in (arguments.out, arguments.record):
+        if folder is not None:
+            check_folder(folder)
+    if arguments.instruction is not None and arguments.task_of is None:
+        raise TrainError("an instruction is for flow policies", expected="--task-of", found=arguments.instruction)
+    if check_flow_policy(arguments.checkpoint, arguments.task_of):
+        assert arguments.checkpoint is not None
+        assert arguments.task_of is not None
+        policy = given_flow_policy(arguments.checkpoint, arguments.task_of, arguments.instruction, arguments.device)
+    else:
+        policy = given_policy_or_student(arguments.checkpoint, arguments.pretrained)
     if arguments.out is not None and cfg.videos:
         make_folder(arguments.out)
     from concent_warp.deploy.evaluate import evaluate, without_reality
@@ -76,6 +91,7 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
                 seed=arguments.seed,
                 device=arguments.device,
                 out=arguments.out,
+                record=arguments.record if world == "reality" else None,
                 overwrite=arguments.overwrite,
                 progress=progress,
             )
@@ -84,6 +100,8 @@ def run(arguments: Arguments) -> dict[str, Evaluation]:
             say(f"{world}{hidden}: {found[world].sentence()}")
             if found[world].videos:
                 say_written(*found[world].videos)
+            if (recorded := found[world].recorded) is not None:
+                say_written(recorded)
     if arguments.json:
         named = str(arguments.checkpoint) if arguments.pretrained is None else f"pretrained {arguments.pretrained}"
         document: dict[str, Any] = {

@@ -6,13 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy, given_policy_or_student
 from concent_warp.cli.options import OptionalOutPath
 from concent_warp.cli.terminal import progress_bar, say, say_written
-from concent_warp.errors import RenderError
+from concent_warp.errors import RenderError, TrainError
 from concent_warp.recording.load import load_recording
 from concent_warp.render.dataset.from_recording import WriteLeRobotCfg, write_lerobot
 from concent_warp.run_folder import check_folder, claim_file, make_folder
+from concent_warp.train.distil.cfg import holds_student
+from concent_warp.train.flow.cfg import holds_flow_policy
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Arguments:
     """
 
     checkpoint: Path | None = None
-    """Run folder of a training, or its checkpoint file."""
+    """Run folder of a training, of a student that sees or of a flow policy, or its checkpoint file."""
     pretrained: Pretrained = None
     """Export a policy that comes with the package, shape_sorter where no name is given."""
     recording: Path | None = None
@@ -44,7 +46,11 @@ def run(arguments: Arguments) -> dict[str, Any]:
     """Export and return the metadata."""
     if arguments.recording is not None:
         return _data_set(arguments, arguments.recording)
-    check_policy(arguments.checkpoint, arguments.pretrained)
+    if arguments.checkpoint is not None and not arguments.as_pretrained and holds_flow_policy(arguments.checkpoint):
+        return _flow_policy(arguments, arguments.checkpoint)
+    student = arguments.checkpoint is not None and holds_student(arguments.checkpoint)
+    if arguments.as_pretrained or not student:
+        check_policy(arguments.checkpoint, arguments.pretrained)
     if arguments.as_pretrained:
         folder = Path("pretrained") if arguments.out is None else arguments.out
         check_folder(folder)
@@ -59,11 +65,34 @@ def run(arguments: Arguments) -> dict[str, Any]:
         return origin
     out = Path("policy.onnx") if arguments.out is None else arguments.out
     claim_file(out, overwrite=arguments.overwrite)
-    policy = given_policy(arguments.checkpoint, arguments.pretrained)
+    policy = given_policy_or_student(arguments.checkpoint, arguments.pretrained)
     make_folder(out.parent)
     described = policy.export(out)
     observations, actions = described["observation"]["size"], described["action"]["size"]
-    say(f"{observations} observations to {actions} actions every {1e3 * described['control period']:g} ms")
+    seen = f"images of {len(described['images']['cameras'])} cameras and " if "images" in described else ""
+    say(f"{seen}{observations} observations to {actions} actions every {1e3 * described['control period']:g} ms")
+    say_written(out)
+    return described
+
+
+def _flow_policy(arguments: Arguments, checkpoint: Path) -> dict[str, Any]:
+    """Write a flow policy as ONNX and return its metadata.
+
+    Raises:
+        TrainError: Another policy is given as well, or the file has another suffix.
+    """
+    if arguments.pretrained is not None:
+        raise TrainError("one policy is to be exported", expected="--checkpoint or --pretrained", found="both")
+    out = Path("policy.onnx") if arguments.out is None else arguments.out
+    claim_file(out, overwrite=arguments.overwrite)
+    from concent_warp.train.flow.policy import load_flow_policy
+
+    policy = load_flow_policy(checkpoint)
+    make_folder(out.parent)
+    described = policy.export(out)
+    cameras, state, actions = (len(described[name]) for name in ("images", "proprioception", "action"))
+    seen = f"images of {cameras} camera{'s' * (cameras != 1)}"
+    say(f"{seen} and {state} numbers of state to {described['chunk']} times {actions} actions")
     say_written(out)
     return described
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from concent_warp.cli.given_policy import Pretrained, check_policy, given_policy
+from concent_warp.cli.given_policy import Pretrained, check_driver, check_policy, given_driver, given_policy
 from concent_warp.cli.options import DeviceOption, OutPath
 from concent_warp.cli.terminal import progress_bar, quiet_warp, say, say_written
 from concent_warp.deploy.cfg import Format, RenderCfg
@@ -35,6 +35,8 @@ class Arguments:
     """Render a policy that comes with the package, shape_sorter where no name is given."""
     recording: Path | None = None
     """Render the measured motion of a recording instead of a policy."""
+    handover: Path | None = None
+    """Run folder of the first driver."""
     out: OutPath = Path("runs/dataset")
     """Folder of the data set."""
     format: Format = "lerobot"
@@ -53,6 +55,10 @@ def run(arguments: Arguments) -> Dataset:
         raise RenderError("one thing is to be rendered", expected="either --recording, or --checkpoint or --pretrained")
     if arguments.recording is None:
         check_policy(arguments.checkpoint, arguments.pretrained)
+    if arguments.handover is not None:
+        if arguments.recording is not None:
+            raise RenderError("a recording is not driven", expected="--checkpoint or --pretrained with --handover")
+        check_driver(arguments.handover)
     check_run_folder(arguments.out, overwrite=arguments.overwrite, resume=arguments.resume)
     if arguments.cfg.networks is not None and not arguments.cfg.networks.is_dir():
         raise RenderError(
@@ -65,6 +71,7 @@ def run(arguments: Arguments) -> Dataset:
         quiet_warp()
     else:
         source = given_policy(arguments.checkpoint, arguments.pretrained)
+    driver = None if arguments.handover is None else given_driver(arguments.handover, arguments.device)
     from concent_warp.deploy.render_dataset import render
 
     with progress_bar("rendering") as progress:
@@ -72,6 +79,7 @@ def run(arguments: Arguments) -> Dataset:
             source,
             arguments.out,
             arguments.cfg,
+            driver=driver,
             format=arguments.format,
             device=arguments.device,
             resume=arguments.resume,

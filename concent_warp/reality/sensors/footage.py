@@ -61,12 +61,12 @@ def footage(
 
     spec = furnish(world, objects, there=cfg.objects)
     add_cameras(spec, objects)
-    model = _still(spec).compile()
+    model = still_world(spec).compile()
     data = mujoco.MjData(model)
     height, width = cfg.size
     rows = [model.camera(name).id for name in cfg.cameras]
     frames = np.zeros((len(rows), len(time), height, width, 3), dtype=np.uint8)
-    shade = _vignette(height, width, cfg.vignette)[..., None]
+    shade = vignette(height, width, cfg.vignette)[..., None]
     with wp.ScopedDevice("cpu"):
         warp_model, warp_data = mjw.put_model(model), mjw.put_data(model, data)
         context = mjw.create_render_context(
@@ -102,7 +102,7 @@ def apply_tone_curve(light: np.ndarray, cfg: FootageCfg) -> np.ndarray:
     return np.clip(light * np.array(cfg.white_balance), 0, 1) ** cfg.gamma
 
 
-def _still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def still_world(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Return a world without all that only moves it, which the ray tracer's simulator may not know."""
     for elements in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons):
         for element in list(elements):
@@ -112,7 +112,7 @@ def _still(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     return spec
 
 
-def _vignette(height: int, width: int, loss: float) -> np.ndarray:
+def vignette(height: int, width: int, loss: float) -> np.ndarray:
     """Return the share of light that arrives at each pixel, shape (height, width)."""
     v, u = np.mgrid[0:height, 0:width]
     squared = ((2 * u / (width - 1) - 1) ** 2 + (2 * v / (height - 1) - 1) ** 2) / 2

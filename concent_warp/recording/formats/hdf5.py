@@ -18,7 +18,7 @@ from concent_warp.limits import limits, raising
 from concent_warp.recording.formats.hdf5_access import CHECKSUM, SafeFile, sign
 from concent_warp.recording.formats.hdf5_heap import check_heaps
 from concent_warp.recording.naming import by_number, entry_of, name_of
-from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, Recording
+from concent_warp.recording.recording import Channel, Demonstration, ImageStream, PointTrack, PolicyLog, Recording
 from concent_warp.recording.validation.validate import validate
 from concent_warp.scene.scene import Scene
 
@@ -98,6 +98,10 @@ def _write_file(file: h5py.File, recording: Recording) -> None:
         for kind in ("action", "measured", "points", "image"):
             for name, stream in getattr(demonstration, kind).items():
                 _write_stream(group.require_group(kind).create_group(entry_of(name)), stream)
+        if demonstration.policy is not None:
+            log = group.create_group("policy")
+            for name in ("time", "observation", "action"):
+                _store(log, name, np.asarray(getattr(demonstration.policy, name), dtype=float))
 
 
 def _write_stream(group: h5py.Group, stream: Channel | PointTrack | ImageStream) -> None:
@@ -200,7 +204,7 @@ class Reader(SafeFile):
 
     def demonstration(self, group: h5py.Group, name: str) -> Demonstration:
         """Read one demonstration."""
-        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image"}, {"task", "success"})
+        self.refuse_unknown(group, {"initial", "action", "measured", "points", "image", "policy"}, {"task", "success"})
         success = self.attribute(group, "success")
         if success is not None and (np.shape(success) != () or success not in (0, 1)):
             raise self.error("success is not a truth value", group.name, expected="true or false", found=success)
@@ -217,6 +221,7 @@ class Reader(SafeFile):
             measured=self.streams(group, "measured", self.channel),
             points=self.streams(group, "points", self.points),
             image=self.streams(group, "image", self.image),
+            policy=self.policy(self.group(group, "policy")) if "policy" in group else None,
             **state,
         )
 
@@ -248,6 +253,12 @@ class Reader(SafeFile):
             self.text_attribute(group, "frame"),
             self.array(group, "covariance") if "covariance" in group else None,
         )
+
+    def policy(self, group: h5py.Group) -> PolicyLog:
+        """Read what a policy observed and did."""
+        names = ("time", "observation", "action")
+        self.refuse_unknown(group, set(names))
+        return PolicyLog(*(self.array(group, name) for name in names))
 
     def points(self, group: h5py.Group) -> PointTrack:
         """Read the point track of one body."""

@@ -19,7 +19,7 @@ from concent_warp.errors import SceneError, printable
 from concent_warp.limits import limits, raising
 from concent_warp.recording.bounds import MAX_MAGNITUDE
 from concent_warp.recording.naming import PREFIX
-from concent_warp.recording.recording import Channel, Demonstration, PointTrack, Recording
+from concent_warp.recording.recording import Channel, Demonstration, PointTrack, PolicyLog, Recording
 from concent_warp.recording.validation.cfg import ValidateCfg
 from concent_warp.recording.validation.clocks import check_clocks
 from concent_warp.recording.validation.covariances import check_covariance
@@ -97,6 +97,8 @@ def _check_demonstration(
     for name, stream in demonstration.image.items():
         _check_time(stream.time, place.at(f"image/{name}"))
         check_image(stream, model, place.at(f"image/{name}"), cfg)
+    if demonstration.policy is not None:
+        _check_policy(demonstration.policy, place.at("policy"))
     check_clocks(demonstration, place, cfg.clocks)
     _check_duration(demonstration, model.opt.timestep, place)
 
@@ -203,6 +205,16 @@ def _check_points(track: PointTrack, model: mujoco.MjModel, name: str, place: Er
         row, point = np.argwhere(lost)[0]
         raise place.error(f"point {point} is visible but has no position", row=int(row), found="NaN")
     check_lengths(np.linalg.norm(np.asarray(track.value)[seen], axis=1), model, place, cfg.units)
+
+
+def _check_policy(log: PolicyLog, place: ErrorLocation) -> None:
+    """Check what a policy observed and did."""
+    _check_time(log.time, place)
+    for name, value in (("observation", log.observation), ("action", log.action)):
+        shape = np.shape(value)
+        if len(shape) != 2 or shape[0] != len(log.time) or not shape[1]:
+            raise place.error(f"wrong shape of {name}", expected=f"({len(log.time)}, size)", found=shape)
+        _check_finite(value, place, missing_allowed=False)
 
 
 def _check_time(time: np.ndarray, place: ErrorLocation) -> None:

@@ -1,0 +1,1 @@
+"""Benchmarks of what happens to policies in Reality."""

@@ -1,0 +1,261 @@
+"""Why trials of a policy failed, from what was commanded and measured in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from concent_warp.checks import check_settings
+from concent_warp.deploy.explain.cfg import ExplainCfg
+from concent_warp.deploy.explain.evidence import Evidence, Judge
+from concent_warp.deploy.explain.measured_start import MeasuredStart
+from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
+from concent_warp.deploy.explain.policy_evidence import other_action
+from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, fit_pose_bias
+from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
+from concent_warp.deploy.explain.replay_trial import Replayer
+from concent_warp.deploy.explain.result import Explanation
+from concent_warp.diagnosis.cfg import DiagnoseCfg
+from concent_warp.diagnosis.diagnose import diagnose
+from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.tasks import Progress, ignore_progress
+from concent_warp.effects.registry import effect_classes
+from concent_warp.errors import ConcentError, RecordingError, TrainError
+from concent_warp.files import write_json
+from concent_warp.model import Model
+from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.train.environment.observation import ObservationLayout
+from concent_warp.train.observation_cfg import SensorErrorsCfg
+from concent_warp.train.policy.load import Policy
+
+JOINT_SCALE = 2.5
+"""Joint errors over noise of simulated trials where there are none to take it from."""
+
+
+def explain(
+    policy: Policy,
+    recordings: Recording | Sequence[Recording],
+    cfg: ExplainCfg | None = None,
+    *,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Explanation:
+    """Return why trials of a policy failed: wrong perception, other physics than the model's, or the policy itself.
+
+    Trials that do not say whether they succeeded count as failed.
+
+    Args:
+        policy: The policy that acted; with scaled commands, `Policy.scaled` of it.
+        recordings: Trials, as `evaluate` records them, or logs of a robot in the scene of the policy's model.
+        cfg: Settings.
+        out: Folder for what the search for a missing effect has finished, from which the same call continues after an
+            interruption, and for the result, ``explanation.json``.
+        progress: Called with the share done, 0..1, and what is being done.
+
+    Raises:
+        RecordingError: There is no failed trial, or one lacks commands, joint readings or tracked poses.
+        ModelError: A recording is of another robot than the policy's model.
+        TrainError: A setting is out of bounds.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> policy = cw.load_policy("shape_sorter")
+        >>> result = cw.evaluate(policy, cw.EvaluateCfg(action_scale=0.05), episodes=1, record="trials")
+        >>> trials = cw.load_recording(result.recorded)
+        >>> cw.explain(policy.scaled(0.05), trials, cw.ExplainCfg(repetitions=2, diagnose=False)).cause
+        'policy'
+    """
+    cfg = cfg or ExplainCfg()
+    check_settings(cfg, TrainError)
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    found = _Explaining(policy, given, cfg, progress or ignore_progress, out).run()
+    if out is not None:
+        write_json(Path(out) / RESULT, found.to_json())
+    return found
+
+
+RESULT = "explanation.json"
+"""File of the result."""
+
+
+class _Explaining:
+    """The steps of one explanation."""
+
+    def __init__(
+        self, policy: Policy, recordings: Sequence[Recording], cfg: ExplainCfg, progress: Progress,
+        out: str | Path | None,
+    ) -> None:  # fmt: skip
+        for recording in recordings:
+            policy.run.model.check_recording(recording)
+        self._policy, self._recordings, self._cfg, self._out = policy, recordings, cfg, out
+        self._progress = progress
+        failed = [(r, d) for r in recordings for d in r.demonstrations if not d.success]
+        if not failed:
+            raise RecordingError(
+                "no trial failed",
+                where=recordings[0].source if recordings else None,
+                expected="at least one trial that did not succeed",
+                found=f"{sum(len(r.demonstrations) for r in recordings)} successful ones",
+            )
+        self._failed, self._chosen = len(failed), failed[: cfg.most_trials]
+        self._succeeded = [d for r in recordings for d in r.demonstrations if d.success][: cfg.successes]
+        self._own = OwnSimulation(policy, cfg.repetitions, cfg.seed)
+        self._preparation = Preparation(self._own.task, policy.run.model.scene.model, cfg)
+
+    def run(self) -> Explanation:
+        """Return the explanation."""
+        cfg, progress = self._cfg, self._progress
+        progress(0.0, "finding where the trials began")
+        trials = [self._preparation.trial(d) for _, d in self._chosen]
+        others = [self._preparation.trial(d) for d in self._succeeded]
+        progress(0.05, "asking the policy's own simulation")
+        own = self._simulate([t.start for t in (*trials, *others)], 0.05, 0.2)
+        progress(0.2, "replaying simulated trials")
+        step = max(1, len(own.recording.demonstrations) // cfg.simulated)
+        simulated = self._preparation.simulated(own.recording.demonstrations[::step])
+        evidence = self._measured(trials, others, simulated, own.of_first(len(trials)))
+        judge = Judge(self._policy, self._own.task, cfg.judge)
+        if judge.differs(evidence):
+            evidence = self._with_bias(evidence)
+            if cfg.diagnose and not judge.is_perception(evidence):
+                evidence = self._with_diagnosis(evidence, judge)
+            evidence = self._with_cause_in_simulation(evidence, judge)
+        progress(1.0, "done")
+        total = sum(len(r.demonstrations) for r in self._recordings)
+        return judge.explanation(evidence, [r.source for r, _ in self._chosen], self._failed, total)
+
+    def _simulate(self, starts: Sequence[MeasuredStart], begin: float, end: float, **options: Any) -> SimulatedTrials:
+        """Run the policy's own simulation; see `OwnSimulation.run` for the options."""
+        text = "asking the policy's own simulation"
+        return self._own.run(starts, progress=lambda s: self._progress(begin + (end - begin) * s, text), **options)
+
+    def _measured(
+        self,
+        trials: list[PreparedTrial],
+        others: list[PreparedTrial],
+        simulated: list[PreparedTrial],
+        own: SimulatedTrials,
+    ) -> Evidence:
+        """Return how far the replays of trials, and of simulated ones, are from what was measured."""
+        replayer, contact = self._preparation.replayer, self._preparation.contact
+        scale = max(1.0, float(np.median([t.joint_error for t in simulated]))) if simulated else JOINT_SCALE
+        width = self._cfg.judge.window
+        return Evidence(
+            trials=trials,
+            own=own,
+            joint_scale=scale,
+            misfit=np.array([t.misfit(replayer, contact, scale) for t in trials]),
+            usual=np.array([t.misfit(replayer, contact, scale) for t in simulated] or [1.0]),
+            free=_known([t.free_error for t in (*trials, *others)]),
+            usual_free=_known([t.free_error for t in simulated]),
+            windows=[t.windows(replayer, contact, scale, width) for t in trials],
+            difference=self._difference(trials),
+            usual_windows=[t.windows(replayer, contact, scale, width) for t in simulated],
+        )
+
+    def _difference(self, trials: Sequence[PreparedTrial]) -> float | None:
+        """Return by how much logged actions differ from those of the policy, asked again; None without a log."""
+        act, cfg = self._own.act, self._policy.run.cfg.environment.observation
+        if act is None:
+            return None
+        size = ObservationLayout.of(self._own.task, cfg).size * cfg.history
+        found = [other_action(act, size, t.demonstration) for t in trials]
+        return max((one for one in found if one is not None), default=None)
+
+    def _with_bias(self, evidence: Evidence) -> Evidence:
+        """Search for an error of tracked poses, and see how much of all trials' misfit it explains."""
+        cfg, contact, replayer = self._cfg, self._preparation.contact, self._preparation.replayer
+        every = [TrialToFit(t.demonstration, t.readings, t.measured) for t in evidence.trials]
+        text = "searching for an error of the tracked poses"
+        self._progress(0.25, text)
+        bias = fit_pose_bias(
+            every,
+            replayer,
+            contact,
+            evidence.joint_scale,
+            cfg.bias,
+            seed=cfg.seed,
+            progress=lambda share: self._progress(0.25 + 0.2 * share, text),
+        )
+        return replace(evidence, bias=bias)
+
+    def _with_diagnosis(self, evidence: Evidence, judge: Judge) -> Evidence:
+        """Search for a missing effect in failed trials, and see how much of all trials' misfit it explains."""
+        cfg = self._cfg
+        names = cfg.effects or (_robot_effects() if judge.moves_otherwise(evidence) else ())
+        recording = _joined(self._chosen[: cfg.diagnose_trials])
+        settings = DiagnoseCfg(
+            effects=self._possible(names, recording), max_additions=cfg.additions, seconds=cfg.seconds, jobs=cfg.jobs,
+            seed=cfg.seed, explain=False,
+        )  # fmt: skip
+        out = None if self._out is None else Path(self._out) / "diagnosis"
+
+        def progress(share: float, text: str) -> None:
+            self._progress(0.45 + 0.45 * share, f"diagnosing: {text}")
+
+        diagnosis = diagnose(self._policy.run.model, recording, settings, out=out, progress=progress)
+        explained = None
+        if diagnosis.accepted:
+            replayer = Replayer(self._own.task, diagnosis.model)
+            contact, scale = self._preparation.contact, evidence.joint_scale
+            explained = np.array([t.misfit(replayer, contact, scale) for t in evidence.trials])
+        return replace(evidence, diagnosis=diagnosis, misfit_with_effect=explained)
+
+    def _possible(self, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
+        """Return those of some effects that could be missing in the model."""
+        from concent_warp.diagnosis.candidates.candidates import candidates
+
+        channels = {c for d in recording.demonstrations for c in d.measured}
+        model = self._policy.run.model
+        return tuple(name for name in names if candidates(model, channels, [name]))
+
+    def _with_cause_in_simulation(self, evidence: Evidence, judge: Judge) -> Evidence:
+        """Put the cause into the policy's own simulation: does it fail there as well?"""
+        self._progress(0.9, "trying the cause in the policy's own simulation")
+        starts = [t.start for t in evidence.trials]
+        if judge.is_perception(evidence) and (bias := evidence.bias) is not None:
+            true_starts = list(bias.starts)
+            fair = self._simulate(true_starts, 0.9, 0.95)
+            sensors = self._biased(bias)
+            return replace(evidence, own=fair, with_cause=self._simulate(true_starts, 0.95, 1.0, sensors=sensors))
+        diagnosis = evidence.diagnosis
+        if diagnosis is None or not diagnosis.accepted:
+            return evidence
+        try:
+            return replace(evidence, with_cause=self._simulate(starts, 0.9, 1.0, model=_added(self._policy, diagnosis)))
+        except ConcentError:  # training supports no such effect
+            return evidence
+
+    def _biased(self, bias: PoseBias) -> SensorErrorsCfg:
+        """Return the instruments of training with an error of tracked poses."""
+        sensors, task = self._policy.run.cfg.environment.observation.sensors, self._own.task
+        position, rotation = bias.value[:3].tolist(), bias.value[3:].tolist()
+        name = task.compiled.body(task.objects[0]).name
+        return replace(
+            sensors, exact=False, position_bias=tuple(position), orientation_bias=tuple(rotation), biased=(name,)
+        )
+
+
+def _known(values: Sequence[float | None]) -> np.ndarray:
+    """Return numbers with NaN in place of None."""
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
+def _robot_effects() -> tuple[str, ...]:
+    """Return the names of the effects that act on a robot that touches nothing."""
+    return tuple(n for n, kind in effect_classes().items() if kind.family == "joints" or n == "gravity_tilt")
+
+
+def _joined(trials: Sequence[tuple[Recording, Demonstration]]) -> Recording:
+    """Return one recording of trials from several ones, renumbered."""
+    demonstrations = tuple(replace(d, name=f"demo_{k}", policy=None) for k, (_, d) in enumerate(trials))
+    return Recording(trials[0][0].scene, demonstrations, source=trials[0][0].source)
+
+
+def _added(policy: Policy, diagnosis: Diagnosis) -> Model:
+    """Return the policy's model with the effects that were accepted."""
+    return replace(policy.run.model, effects=diagnosis.model.effects)

@@ -1,0 +1,62 @@
+"""Commands that mend the cause of failed trials."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+from concent_warp.deploy.explain.result import Cause
+from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.train.policy.load import Policy
+from concent_warp.train.run import DEMONSTRATION, MODEL
+
+
+def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: Sequence[str]) -> tuple[str, ...]:
+    """Return commands that mend a cause, each on the line after a comment.
+
+    Args:
+        policy: The policy.
+        cause: Why its trials failed.
+        diagnosis: What was found of missing effects.
+        sources: Recordings of the trials.
+    """
+    folder = policy.folder
+    model, demonstration = shlex.quote(str(folder / MODEL)), shlex.quote(str(folder / DEMONSTRATION))
+    trials = shlex.quote(sources[0])
+    if cause == "perception":
+        return (
+            "# calibrate the camera again, with the robot in view, and track with it",
+            "concent calibrate NEW_VIDEO.h5 -o calibrated.h5",
+            "# until then: train for errors of this size",
+            f"concent train {demonstration} --model {model} --out runs/robust "
+            "--environment.observation.sensors.position-std 0.003 --environment.observation.sensors.constant-share 0.8",
+        )
+    if cause == "physics":
+        names = (
+            ""
+            if diagnosis is None or not diagnosis.accepted
+            else " --effects " + " ".join(dict.fromkeys(f.name for f in diagnosis.accepted))
+        )
+        return (
+            "# add the missing effect to the model, with its intervals",
+            f"concent diagnose {trials} --model {model}{names} --apply better.toml",
+            "# train again in the better model",
+            f"concent train {demonstration} --model better.toml --out runs/better",
+        )
+    if cause == "policy":
+        return (
+            "# train on, or longer, with more starts from states without progress",
+            f"concent train {demonstration} --model {model} --out runs/longer --ppo.iterations 600 "
+            "--environment.reset.stuck.share 0.4",
+            "# if commands were at their limit: allow larger steps and leads",
+            f"concent train {demonstration} --model {model} --out runs/stronger --environment.action.turn-lead 0.05",
+        )
+    return (
+        "# record more trials, also successful ones, and explain them together",
+        f"concent evaluate --checkpoint {shlex.quote(str(folder))} --world reality --episodes 200 --record trials",
+        "# compare the model with them, channel by channel",
+        f"concent compare {trials} --model {model}",
+        "# train with more randomisation",
+        f"concent train {demonstration} --model {model} --out runs/wider --environment.randomisation.friction 0.3 3.0 "
+        "--environment.randomisation.stiffness 0.8 1.2",
+    )

@@ -1,0 +1,60 @@
+"""The benchmark of students at a tiny size: rows as they come, what was stopped goes on, the page."""
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.distil.student import Args, Benchmark, page, variant_cfg
+from benchmarks.measurements import Measurements
+from tests.distil.conftest import TINY
+
+
+def test_a_stopped_benchmark_goes_on_and_its_page_has_what_was_measured(tmp_path):
+    args = Args(
+        teachers=("shape_sorter",), controls=(), episodes=1, device="cpu", data=tmp_path / "rows.jsonl", distil=TINY
+    )
+    Benchmark(replace(args, seconds=0.5), tmp_path / "runs").run()
+    assert "shape_sorter student 0 training" not in Measurements(args.data).rows
+    Benchmark(args, tmp_path / "runs").run()
+    rows = Measurements(args.data).rows
+    parts = (
+        "student 0 training",
+        "student 0 simulation",
+        "student 0 reality",
+        "teacher 0 simulation",
+        "teacher 0 reality",
+    )
+    assert set(rows) == {f"shape_sorter {part}" for part in parts}
+    assert not any("error" in row for row in rows.values())
+    assert rows["shape_sorter student 0 training"]["samples"] == 18
+    text = page(list(rows.values()))
+    assert "| the student, by DAgger | 0 |" in text
+    assert "| the teacher, which observes the state | 0 | 100.0% |" in text
+    before = args.data.read_text()
+    Benchmark(args, tmp_path / "runs").run()
+    assert args.data.read_text() == before
+
+
+def test_an_error_is_kept_and_tried_again(tmp_path):
+    wrong = replace(TINY, images=replace(TINY.images, cameras=("ceiling",)))
+    args = Args(teachers=("shape_sorter",), controls=(), episodes=1, device="cpu", data=tmp_path / "rows.jsonl")
+    benchmark = Benchmark(replace(args, distil=wrong), tmp_path / "runs")
+    found = benchmark._attempt("key", lambda: benchmark._train(*_teacher(), tmp_path / "runs" / "x"), "t", "student", 0)
+    assert not found
+    assert "ceiling" in Measurements(args.data).rows["key"]["error"]
+    assert benchmark.kept.wanted("key")
+
+
+def _teacher():
+    import concent_warp as cw
+
+    return cw.load_policy("shape_sorter"), "student", 0
+
+
+@pytest.mark.parametrize("variant", ["blind", "cloned", "rsl_rl", "student"])
+def test_controls_differ_from_the_student_in_one_setting(variant):
+    cfg = variant_cfg(TINY, variant, 3)
+    assert cfg.seed == 3
+    assert cfg.network.blind == (variant == "blind")
+    assert (cfg.dagger.beta_end == 1) == (variant == "cloned")
+    assert (cfg.method == "rsl_rl") == (variant == "rsl_rl")

@@ -1,0 +1,145 @@
+"""Causes of failed trials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import concent_warp as cw
+from concent_warp.deploy.explain.cfg import JudgeCfg, PoseBiasCfg
+from concent_warp.deploy.explain.evidence import Evidence, Judge
+from concent_warp.deploy.explain.misfit import divergence, misfit
+from concent_warp.deploy.explain.own_simulation import OwnSimulation, SimulatedTrials
+from concent_warp.deploy.explain.pose_bias import PoseBias, TrialToFit, fit_pose_bias
+from concent_warp.deploy.explain.prepared import Preparation, PreparedTrial
+from concent_warp.deploy.explain.replay_trial import ReplayedTrials
+from concent_warp.recording.recording import Recording
+
+SHIFT = np.array([0.0, 0.0, -0.012, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def policy() -> cw.Policy:
+    return cw.load_policy("shape_sorter")
+
+
+@pytest.fixture(scope="module")
+def prepared(policy: cw.Policy, tmp_path_factory: pytest.TempPathFactory) -> tuple[Preparation, list[PreparedTrial]]:
+    """Two trials in Reality whose tracker shows all objects 12 mm too low, made ready."""
+    sensors = cw.SensorErrorsCfg(position_bias=(0.0, 0.0, -0.012))
+    folder = tmp_path_factory.mktemp("biased")
+    result = cw.evaluate(policy, cw.EvaluateCfg(sensors=sensors), episodes=2, record=folder)
+    assert result.recorded is not None
+    assert not result.success.any()
+    preparation = Preparation(policy.run.task(), policy.run.model.scene.model, cw.ExplainCfg())
+    return preparation, [preparation.trial(d) for d in cw.load_recording(result.recorded).demonstrations]
+
+
+def test_a_start_is_moved_until_nothing_overlaps(prepared: tuple[Preparation, list[PreparedTrial]]) -> None:
+    preparation, trials = prepared
+    start, address = trials[0].start, preparation.contact.address
+    inside = start.qpos.copy()
+    inside[address : address + 3] += (0.0, 0.0, -0.002)
+    settled, move = preparation.contact.settled(replace(start, qpos=inside))
+    again = preparation.contact.settled(settled)[1]
+    assert np.abs(again[:3]).max() < 0.3 * max(np.abs(move[:3]).max(), 1e-3)
+
+
+def test_a_constant_error_of_poses_is_found(prepared: tuple[Preparation, list[PreparedTrial]]) -> None:
+    preparation, trials = prepared
+    cfg = PoseBiasCfg(positions=(0.012,), orientations=(), scanned=1, samples=6, elite=3, iterations=2)
+    given = [TrialToFit(t.demonstration, t.readings, t.measured) for t in trials]
+    found = fit_pose_bias(given, preparation.replayer, preparation.contact, 2.5, cfg)
+    assert found.after.mean() < 0.6 * found.before.mean()
+    np.testing.assert_allclose(found.value[:3], SHIFT[:3], atol=4e-3)
+
+
+def test_the_misfit_of_a_perfect_replay_is_that_of_noise(prepared: tuple[Preparation, list[PreparedTrial]]) -> None:
+    readings = prepared[1][0].readings
+    pose = readings.pose.rotation.as_quat(scalar_first=True)
+    exact = ReplayedTrials(readings.joints[None], readings.pose.position[None], pose[None], np.zeros(1, bool))
+    assert misfit(readings, exact, 1.0).total == pytest.approx(0.0)
+    shifted = replace(exact, position=exact.position - 3 * readings.pose_std[0])
+    assert misfit(readings, shifted, 1.0).position == pytest.approx(9 * np.log(2))
+    bias = np.array([[*np.full(3, 3 * readings.pose_std[0]), 0, 0, 0]])
+    assert misfit(readings, shifted, 1.0, bias).position == pytest.approx(0.0)
+
+
+def test_windows_show_when_a_replay_leaves_the_measurements(prepared: tuple[Preparation, list[PreparedTrial]]) -> None:
+    readings = prepared[1][0].readings
+    pose = readings.pose.rotation.as_quat(scalar_first=True)
+    joints = readings.joints + 10 * readings.joint_std * (readings.time > 1.0)[:, None]
+    late = ReplayedTrials(joints[None], readings.pose.position[None], pose[None], np.zeros(1, bool))
+    windows = divergence(readings, late, 2.0, 0.5)
+    np.testing.assert_allclose(windows[:2], 0.0, atol=1e-6)
+    assert windows[2:].min() > 4.0
+
+
+def test_the_own_simulation_succeeds_from_measured_starts(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+) -> None:
+    start = prepared[1][0].start
+    lifted = start.qpos.copy()
+    lifted[prepared[0].contact.address + 2] += 0.012
+    found = OwnSimulation(policy, 2, 0).run([replace(start, qpos=lifted)])
+    assert found.success.shape == (1, 2)
+    assert found.rate >= 0.5
+    assert len(found.recording.demonstrations) == 2
+    assert set(found.position) == {0, 1}
+
+
+def evidence(**changes: Any) -> Evidence:
+    """Evidence on eight trials of a good policy that agree with the model."""
+    rng = np.random.default_rng(0)
+    own = SimulatedTrials(np.ones((8, 2), bool), Recording("", ()))
+    base = Evidence(
+        trials=(), own=own, joint_scale=2.0, misfit=rng.uniform(0.9, 1.1, 8), usual=rng.uniform(0.9, 1.1, 16),
+        free=np.full(8, 2.0), usual_free=np.full(16, 2.0), windows=(), usual_windows=(),
+    )  # fmt: skip
+    return replace(base, **changes)
+
+
+def bias(after: float) -> PoseBias:
+    return PoseBias(SHIFT, np.ones(6), np.full(8, 7.0), np.full(8, after), ())
+
+
+WEAK = SimulatedTrials(np.zeros((8, 2), bool), Recording("", ()))
+FAR = np.full(8, 7.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({}, "unexplained"),
+        ({"own": WEAK}, "policy"),
+        ({"misfit": FAR, "bias": bias(2.0)}, "perception"),
+        ({"misfit": FAR, "bias": bias(6.0)}, "unexplained"),
+        ({"misfit": FAR, "bias": bias(6.0), "free": np.full(8, 30.0)}, "physics"),
+        ({"misfit": FAR, "bias": bias(6.0), "misfit_with_effect": np.full(8, 1.2)}, "physics"),
+        ({"misfit": FAR, "own": WEAK, "bias": bias(6.0)}, "policy"),
+    ],
+)  # fmt: skip
+def test_the_cause_follows_from_the_evidence(policy: cw.Policy, changes: dict[str, Any], cause: str) -> None:
+    assert Judge(policy, policy.run.task(), JudgeCfg()).cause(evidence(**changes)) == cause
+
+
+def test_trials_that_all_succeeded_are_refused(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+) -> None:
+    trial = replace(prepared[1][0].demonstration, success=True)
+    recording = Recording(policy.run.model.scene.xml, (trial,), "good")
+    with pytest.raises(cw.RecordingError, match="no trial failed"):
+        cw.explain(policy, recording)
+
+
+def test_a_trial_without_tracked_poses_is_refused(
+    policy: cw.Policy, prepared: tuple[Preparation, list[PreparedTrial]]
+) -> None:
+    trial = prepared[1][0].demonstration
+    measured = {name: c for name, c in trial.measured.items() if not name.startswith("block")}
+    recording = Recording(policy.run.model.scene.xml, (replace(trial, measured=measured),), "blind")
+    with pytest.raises(cw.RecordingError, match="manipulated object was not tracked"):
+        cw.explain(policy, recording)

@@ -1,0 +1,228 @@
+"""Numbers, texts and images of a LeRobot v3 data set, as a flow policy learns from them.
+
+Features are found by the data set's own description, ``meta/info.json``. Numbers of all frames are in memory; `frames`
+decodes the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from concent_warp.errors import RecordingError, TrainError
+from concent_warp.recording.logs.readers.lerobot import BOOKKEEPING, NUMBERS, SUCCESS, LeRobotLog
+from concent_warp.recording.logs.readers.log import Episode
+from concent_warp.train.flow.cfg import FlowDataCfg
+
+IMAGES = "observation.images."
+"""Begins the names of features of images."""
+STATE, ACTION = "observation.state", "action"
+OBSERVATION, ACTIONS = "observation.", "action."
+
+
+@dataclass(frozen=True)
+class FlowFeatures:
+    """Inputs and outputs of a flow policy, by the names of a data set."""
+
+    cameras: tuple[str, ...]
+    """Cameras, without "observation.images."."""
+    state: tuple[str, ...]
+    """Names of the proprioception's numbers."""
+    action: tuple[str, ...]
+    """Names of an action's numbers."""
+    rate: float
+    """Actions in a second [Hz]."""
+    tasks: tuple[str, ...]
+    """Instructions of the data set."""
+    size: tuple[int, int]
+    """Height and width of the images of the first camera in the data set [px]."""
+
+    def plain(self) -> dict[str, Any]:
+        """Return the features as plain data."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @staticmethod
+    def of(plain: Mapping[str, Any]) -> FlowFeatures:
+        """Return the features that `plain` returned."""
+        names = {name: tuple(map(str, plain[name])) for name in ("cameras", "state", "action", "tasks")}
+        height, width = map(int, plain["size"])
+        return FlowFeatures(rate=float(plain["rate"]), size=(height, width), **names)
+
+
+@dataclass(frozen=True)
+class FlowDataset:
+    """A data set of T frames in E episodes."""
+
+    features: FlowFeatures
+    state: np.ndarray
+    """Proprioception, shape (T, P) float32."""
+    action: np.ndarray
+    """Actions, shape (T, A) float32."""
+    task: np.ndarray
+    """Instruction of each frame, a row of `features.tasks`, shape (T,) int64."""
+    start: np.ndarray
+    """First frame of each episode, shape (E + 1,) int64, the last entry being T."""
+    images: tuple[str, ...]
+    """Features of the images, in the order of the cameras."""
+
+    @property
+    def lengths(self) -> list[int]:
+        """Frames of each episode."""
+        return np.diff(self.start).tolist()
+
+    def last(self) -> np.ndarray:
+        """Return the last frame of the episode of each frame, shape (T,) int64."""
+        return np.repeat(self.start[1:] - 1, np.diff(self.start))
+
+    def split(self, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the frames of training and of validation, each (n,) int64, whole episodes apart.
+
+        Args:
+            share: Share of the episodes for validation; at least one is, where it is above 0 and there are two.
+            seed: Of the choice.
+        """
+        count = len(self.start) - 1
+        held = 0 if share == 0 or count < 2 else min(max(1, round(share * count)), count - 1)
+        order = np.random.default_rng(seed).permutation(count)
+        parts = (np.sort(order[held:]), np.sort(order[:held]))
+        rows = [np.arange(self.start[k], self.start[k + 1]) for k in range(count)]
+        training, validation = ([rows[k] for k in part] for part in parts)
+        return np.concatenate(training), np.concatenate(validation or [np.zeros(0, dtype=np.int64)])
+
+
+def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
+    """Return numbers and texts of a data set.
+
+    Args:
+        log: The data set.
+        cfg: Which features.
+
+    Raises:
+        TrainError: It lacks features or has no episodes, or a number is not finite.
+        RecordingError: A table is missing or cannot be read.
+    """
+    source, chosen = log.source, _chosen_features(log, cfg)
+    numbers = log.numbers
+    if not numbers:
+        raise TrainError("the data set has no episodes", where=source)
+    tables, tasks, lengths = [], [], []
+    names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    size = (0, 0)
+    for number in numbers:
+        episode = log.episode(number)
+        found = tuple(_columns(episode, features, source) for features in (chosen.state, chosen.action))
+        now = (tuple(found[0]), tuple(found[1]))
+        if names not in (None, now):
+            raise TrainError(
+                "an episode has other columns", where=f"{source}, episode {number}", expected=names, found=now
+            )
+        names, size = now, episode.images[chosen.cameras[0]].size
+        tables.append([_table(columns, f"{source}, episode {number}") for columns in found])
+        tasks.append(episode.task)
+        lengths.append(len(tables[-1][1]))
+    assert names is not None
+    texts = tuple(dict.fromkeys(tasks))
+    cameras = tuple(name.removeprefix(IMAGES) for name in chosen.cameras)
+    return FlowDataset(
+        FlowFeatures(cameras, *names, log.rate, texts, size),
+        np.concatenate([state for state, _ in tables]),
+        np.concatenate([action for _, action in tables]),
+        np.repeat([texts.index(task) for task in tasks], lengths),
+        np.concatenate([[0], np.cumsum(lengths)]),
+        chosen.cameras,
+    )
+
+
+def open_dataset(source: Path) -> LeRobotLog:
+    """Return a LeRobot data set.
+
+    Raises:
+        RecordingError: There is none in the folder, or it is of another version.
+    """
+    if not (source / "meta" / "info.json").is_file():
+        found = "no such folder" if not source.exists() else "a file" if source.is_file() else "no meta/info.json"
+        fix = "concent render and concent export --recording write one"
+        raise RecordingError("no LeRobot data set", where=source, expected="its folder", found=found, fix=fix)
+    return LeRobotLog(source)
+
+
+def check_features(source: Path, cfg: FlowDataCfg) -> None:
+    """Check that a folder holds a data set with the chosen features, before anything is decoded.
+
+    Raises:
+        TrainError: It lacks features.
+        RecordingError: It is no LeRobot v3 data set.
+    """
+    _chosen_features(open_dataset(source), cfg)
+
+
+def _chosen_features(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataCfg:
+    """Return the names of the features that are chosen, or that are taken where none are.
+
+    Raises:
+        TrainError: There are no such features.
+    """
+    where = log.source / "meta" / "info.json"
+    colours = [name for name, f in log.features.items() if f["dtype"] in ("video", "image") and not _is_depth(f)]
+    numeric = [
+        name
+        for name, f in log.features.items()
+        if f["dtype"].startswith(NUMBERS) and name not in BOOKKEEPING and name != SUCCESS
+    ]
+    cameras = [next((n for n in (one, IMAGES + one) if n in colours), one) for one in cfg.cameras] or colours
+    state = cfg.state or ([STATE] if STATE in numeric else [n for n in numeric if n.startswith(OBSERVATION)])
+    action = cfg.action or ([ACTION] if ACTION in numeric else [n for n in numeric if n.startswith(ACTIONS)])
+    for what, option, names, known in (
+        ("images", "cameras", cameras, colours), ("proprioception", "state", state, numeric),
+        ("actions", "action", action, numeric),
+    ):  # fmt: skip
+        if not names:
+            raise TrainError(f"the data set has no feature of {what}", where=where, found=sorted(log.features))
+        if missing := [name for name in names if name not in known]:
+            found = f"{missing[0]!r} among --{option}"
+            raise TrainError(f"the data set has no such feature of {what}", where=where, expected=known, found=found)
+        if len(set(names)) < len(names):
+            raise TrainError(f"a feature of {what} is named twice", where=where, found=list(names))
+    return FlowDataCfg(tuple(cameras), tuple(state), tuple(action))
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    """Return whether a feature of images is one of depths."""
+    info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+
+
+def _columns(episode: Episode, features: Sequence[str], source: Path) -> dict[str, np.ndarray]:
+    """Return the columns (T,) of features by name.
+
+    Raises:
+        TrainError: The table lacks a feature.
+    """
+    found: dict[str, np.ndarray] = {}
+    for feature in features:
+        columns = {n: s.value for n, s in episode.signals.items() if n == feature or n.startswith(f"{feature}/")}
+        if not columns:
+            where = f"{source}, episode {episode.number}"
+            raise TrainError("the table lacks a feature", where=where, expected=feature, found=sorted(episode.signals))
+        # The names of the most common features are dropped: "observation.state/elbow" is "elbow".
+        plain = feature in (STATE, ACTION) and len(features) == 1
+        found |= {name.removeprefix(f"{feature}/") if plain else name: value for name, value in columns.items()}
+    return found
+
+
+def _table(columns: Mapping[str, np.ndarray], where: str) -> np.ndarray:
+    """Return columns as a table (T, n) float32.
+
+    Raises:
+        TrainError: A number is not finite.
+    """
+    for name, value in columns.items():
+        if not np.isfinite(value).all():
+            row = int(np.flatnonzero(~np.isfinite(value))[0])
+            fix = "mend the data set, or choose other features"
+            raise TrainError(f"{name} is not finite", where=f"{where}, frame {row}", found=value[row], fix=fix)
+    return np.stack(list(columns.values()), axis=1).astype(np.float32)
