@@ -56,19 +56,17 @@ def page(rows: Sequence[Mapping[str, Any]], count: int) -> str:
     asked = [row for row in whole if row["group"] is not None]
     hosts = " ".join(dict.fromkeys(machine_line(row["machine"]) for row in rows))
     separable = [row for row in asked if row["methods"]["best"]["outcome"] != "none"]
+    share, done, failed, groups = f"{100 * PART:.0f} %", len(whole), len(rows) - len(whole), len(asked)
     hours = sum(row["seconds"] for row in rows) / 3600
     text = f"""# Suggested recordings
 
 Written by `benchmarks/diagnose/suggest.py`; do not edit. {hosts}
 
 `python -m benchmarks.diagnose.suggest`: how often the recording that `concent suggest` asks for resolves a group,
-that is effects that a diagnosis cannot distinguish. The data are those of the [hidden effects](hidden_effects.md)
-with one or two effects of the library and one demonstration, on other seeds; the first recording is the first {
-        100 * PART:.0f} % of each (of its time, or of its throws), since short recordings leave more open. {
-        len(whole)
-    } of {count}
-data sets are done, {len(rows) - len(whole)} ended in an error; {len(asked)} of them in a group that the hidden effect
-is in. {hours:.1f} hours of one core in all.
+effects that a diagnosis cannot distinguish. The data are those of the [hidden effects](hidden_effects.md) with one or
+two effects of the library and one demonstration, on other seeds. The first recording is the first {share} of each, of
+its time or of its throws, since short recordings leave more open. Of {count} data sets {done} are done and {failed}
+ended in an error; {groups} ended in a group that the hidden effect is in. {hours:.1f} hours of one core in all.
 
 Each motion is performed in Reality with the same hidden effect, and both recordings are diagnosed together. All methods
 have the same longest duration and the same limits; none knows the truth.
@@ -79,8 +77,7 @@ have the same longest duration and the same limits; none knows the truth.
     text += """
 *Right*: the hidden effect is named alone. *Wrong*: others are named without it. *Still open*: it is named with others.
 *Nothing suggested*: all motions within the limits are expected to leave the hypotheses as close as they are, as mass
-and drive gain of a pendulum, whose ratio alone acts. A random trajectory is performed even where it is expected to
-bring little, unless it is expected to bring nothing.
+and drive gain of a pendulum, whose ratio alone acts. A random trajectory is performed whatever it is expected to bring.
 """
     if separable:
         text += f"\nWhere something was suggested by the first method ({len(separable)} data sets):\n\n"

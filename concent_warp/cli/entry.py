@@ -68,7 +68,7 @@ EXAMPLES = {
     "events": "concent events demo.h5 --model model.toml -o events",
     "compare": "concent compare demo.h5 --model model.toml --baseline scene.xml",
     "diagnose": "concent diagnose demo.h5 --model scene.xml --html report.html",
-    "suggest": "concent suggest demo.h5 --model scene.xml --diagnosis found.json -o motion.h5",
+    "suggest": "concent suggest demo.h5 --model scene.xml --diagnosis found -o motion.h5",
     "locate": "concent locate demo.h5 --model scene.xml --png forces.png",
     "add": "concent add joint_friction --model scene.xml --fit demo.h5 -o with_friction.toml",
     "train": "concent train demo.h5 --model model.toml -o runs/insert",

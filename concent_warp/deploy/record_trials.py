@@ -28,7 +28,7 @@ POSES = (int(mujoco.mjtSensor.mjSENS_FRAMEPOS), int(mujoco.mjtSensor.mjSENS_FRAM
 JOINTS = (int(mujoco.mjtSensor.mjSENS_JOINTPOS), int(mujoco.mjtSensor.mjSENS_TENDONPOS))
 
 
-@dataclass
+@dataclass(frozen=True)
 class RecordedTrial:
     """Readings of one episode; one entry for each control step, or for each frame of the tracker."""
 

@@ -17,6 +17,8 @@ from concent_warp.recording.recording import Recording
 from concent_warp.run_folder import lock_folder, versions
 from concent_warp.simulate.select import EngineName
 
+DIAGNOSIS_FILE = "diagnosis.json"
+"""File of the diagnosis, as `Diagnosis.to_json` returns it, in the output folder."""
 EXPERIMENT_FILE = "next_experiment.json"
 """File of the suggested experiment in the output folder."""
 
@@ -38,8 +40,8 @@ def diagnose(
         cfg: Settings.
         engine: "mujoco", "warp", or "auto" for MuJoCo-Warp where there is a CUDA device; C MuJoCo is the faster one for
             the many short simulations of a diagnosis.
-        out: Folder for finished tasks, from which the same call continues after an interruption, and for the suggested
-            experiment with its arrays, ``next_experiment.json``.
+        out: Folder for finished tasks, from which the same call continues after an interruption, for the diagnosis,
+            ``diagnosis.json``, and for the suggested experiment with its arrays, ``next_experiment.json``.
         progress: Called with the share done, 0..1, and what is being done.
 
     Raises:
@@ -64,6 +66,7 @@ def diagnose(
     with lock_folder(Path(out)):
         runner = checkpointed_runner(model, recording, cfg, progress, engine, Path(out))
         found = _diagnosed(model, recording, cfg, runner, engine)
+        write_json(Path(out) / DIAGNOSIS_FILE, found.to_json())
         if found.next_experiment is not None:
             write_json(Path(out) / EXPERIMENT_FILE, found.next_experiment.to_json())
     return found

@@ -73,7 +73,7 @@ def test_the_page_counts_what_was_measured(tmp_path, monkeypatch):
     text = page(rows, 84)
     assert "| suggested (best of menu and search) | 4 | 2 (50 %) | 1 (25 %) | 0 (0 %) | 1 (25 %) | 0 |" in text
     assert "| suggested (best of menu and search) | 3 | 2 (67 %) | 1 (33 %) | 0 (0 %) | 0 (0 %) | 0 |" in text
-    assert "5 of 84 data sets" in " ".join(text.split())
+    assert "Of 84 data sets 5 are done and 1 ended in an error; 4 ended in a group" in " ".join(text.split())
     path = tmp_path / "rows.jsonl"
     path.write_text("".join(json.dumps(one) + "\n" for one in rows) + '{"name": "g", "fi')
     assert [one["name"] for one in read_rows(path)] == ["a", "b", "c", "d", "e", "f"]

@@ -27,7 +27,7 @@ def trials(policy: cw.Policy, tmp_path_factory: pytest.TempPathFactory) -> Recor
     folder = tmp_path_factory.mktemp("trials")
     result = cw.evaluate(policy, cw.EvaluateCfg(record_failures=True), episodes=2, record=folder)
     assert result.recorded == folder / "trials.h5"
-    return cw.load_recording(result.recorded)
+    return cw.load_recording(folder / "trials.h5")
 
 
 def test_a_trial_has_readings_and_frames_at_their_own_times_and_no_truth(trials: Recording) -> None:

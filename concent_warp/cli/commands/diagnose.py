@@ -69,8 +69,8 @@ class Arguments:
     seed: int = 0
     """Seed of all random numbers."""
     out: OptionalOutPath = None
-    """Folder for finished parts, from which the same command continues after an interruption, and for the motion of the
-    suggested experiment."""
+    """Folder for finished parts, from which the same command continues after an interruption, for the diagnosis
+    (diagnosis.json), and for the motion of the suggested experiment."""
     overwrite: bool = False
     """Replace what --html and --apply name if it is there."""
 

@@ -46,8 +46,8 @@ class Arguments:
     model: Path | None = None
     """Model (.toml) or MJCF (.xml); the scene in the recording by default."""
     diagnosis: Path | None = None
-    """Diagnosis of this model with this recording: what concent diagnose --json printed (.json), or the model of its
-    --apply (.toml); without, the model is diagnosed first."""
+    """Diagnosis of this model with this recording: the folder of concent diagnose --out, what its --json printed
+    (.json), or the model of its --apply (.toml); without, the model is diagnosed first."""
     demonstrations: tuple[str, ...] = ()
     """Demonstrations; all by default."""
     noise: NoiseOption = ()

@@ -23,10 +23,11 @@ from concent_warp.diagnosis.cfg import DiagnoseCfg
 from concent_warp.diagnosis.diagnose import diagnose
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.diagnosis.tasks import Progress, ignore_progress
-from concent_warp.effects.registry import effect_classes
-from concent_warp.errors import ConcentError, RecordingError, TrainError
+from concent_warp.effects.registry import effect_class, effect_classes
+from concent_warp.errors import ConcentError, ModelError, RecordingError, TrainError
 from concent_warp.files import write_json
 from concent_warp.model import Model
+from concent_warp.run_folder import make_folder
 from concent_warp.recording.recording import Demonstration, Recording
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.observation_cfg import SensorErrorsCfg
@@ -58,7 +59,7 @@ def explain(
 
     Raises:
         RecordingError: There is no failed trial, or one lacks commands, joint readings or tracked poses.
-        ModelError: A recording is of another robot than the policy's model.
+        ModelError: A recording is of another robot than the policy's model, or there is no effect of a given name.
         TrainError: A setting is out of bounds.
 
     Example:
@@ -74,6 +75,7 @@ def explain(
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     found = _Explaining(policy, given, cfg, progress or ignore_progress, out).run()
     if out is not None:
+        make_folder(Path(out))
         write_json(Path(out) / RESULT, found.to_json())
     return found
 
@@ -89,6 +91,8 @@ class _Explaining:
         self, policy: Policy, recordings: Sequence[Recording], cfg: ExplainCfg, progress: Progress,
         out: str | Path | None,
     ) -> None:  # fmt: skip
+        for name in cfg.effects:
+            effect_class(name)
         for recording in recordings:
             policy.run.model.check_recording(recording)
         self._policy, self._recordings, self._cfg, self._out = policy, recordings, cfg, out
@@ -206,12 +210,19 @@ class _Explaining:
         return replace(evidence, diagnosis=diagnosis, misfit_with_effect=explained)
 
     def _possible(self, names: Sequence[str], recording: Recording) -> tuple[str, ...]:
-        """Return those of some effects that could be missing in the model."""
+        """Return those of some effects that could be missing in the model.
+
+        Raises:
+            ModelError: None could be.
+        """
         from concent_warp.diagnosis.candidates.candidates import candidates
 
         channels = {c for d in recording.demonstrations for c in d.measured}
         model = self._policy.run.model
-        return tuple(name for name in names if candidates(model, channels, [name]))
+        found = tuple(name for name in names if candidates(model, channels, [name]))
+        if names and not found:
+            raise ModelError("none of the effects can be missing", where=model.scene.source, found=", ".join(names))
+        return found
 
     def _with_cause_in_simulation(self, evidence: Evidence, judge: Judge) -> Evidence:
         """Put the cause into the policy's own simulation: does it fail there as well?"""

@@ -109,8 +109,8 @@ def _section(explanation: Explanation, names: Sequence[str]) -> str:
         "table.</p>"
         "<div class='scroll'><table><tr><th>trial</th><th>cause</th><th>moment [s]</th><th>leaves prediction [s]</th>"
         f"<th>replay against measurement</th><th>evidence</th></tr>{rows}</table></div>"
-        f"<h3>All trials together</h3><div class='scroll'><table>{numbers}</table></div>"
-        f"<h3>What mends it</h3><pre>{commands}</pre></section>"
+        f"<h3 style='margin-top:18px'>All trials together</h3><div class='scroll'><table>{numbers}</table></div>"
+        f"<h3 style='margin-top:18px'>What mends it</h3><pre>{commands}</pre></section>"
     )
 
 
@@ -118,7 +118,8 @@ def _row(trial: TrialExplanation, name: str) -> str:
     """Return the row of one trial."""
     cells = [name, trial.cause, _number(trial.moment), _number(trial.left_prediction)]
     text = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
-    return f"<tr>{text}<td>{_chart(trial)}</td><td>{escape(trial.sentence)}</td></tr>"
+    sentence = f"<td style='white-space:normal;min-width:24em'>{escape(trial.sentence)}</td>"
+    return f"<tr>{text}<td>{_chart(trial)}</td>{sentence}</tr>"
 
 
 def _chart(trial: TrialExplanation) -> str:

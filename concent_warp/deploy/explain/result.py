@@ -25,7 +25,14 @@ CAUSES: dict[Cause, str] = {
 
 @dataclass(frozen=True)
 class TrialExplanation:
-    """Why one trial failed."""
+    """Why one trial failed.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> trial = cw.TrialExplanation("demo_0", "trials.h5", "policy", 2.5, None, "It fails in simulation too.", {})
+        >>> trial.cause, trial.to_json()["moment"]
+        ('policy', 2.5)
+    """
 
     name: str
     """Name of the trial in its recording."""
@@ -66,7 +73,14 @@ class TrialExplanation:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why trials of a policy failed, judged one by one and all together."""
+    """Why trials of a policy failed, judged one by one and all together.
+
+    Example:
+        >>> import concent_warp as cw
+        >>> explanation = cw.Explanation("policy", (), 3, 20, {}, ("It fails in simulation too.",), ())
+        >>> explanation.headline, explanation.effects
+        ('policy: it fails in its own simulation, too', ())
+    """
 
     cause: Cause
     """The cause that all trials together show."""

@@ -314,8 +314,8 @@ class _Refit:
     @cached_property
     def jacobian(self) -> np.ndarray:
         """Dependence of all readings on the parameters, then on the initial states of each window."""
-        blocks = [] if self.starts is None else [block_diag(*self.starts)]
-        return np.concatenate([np.concatenate(self.slopes), *blocks], axis=1)
+        slopes = np.concatenate(self.slopes)
+        return slopes if self.starts is None else np.hstack([slopes, np.asarray(block_diag(*self.starts))])
 
     @cached_property
     def normal(self) -> np.ndarray:

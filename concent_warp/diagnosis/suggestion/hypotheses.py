@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from concent_warp.diagnosis.diagnose import DIAGNOSIS_FILE
 from concent_warp.diagnosis.result import Diagnosis
 from concent_warp.diagnosis.search.nominal_values import possible_nominal_effects
 from concent_warp.diagnosis.suggestion.cfg import SuggestCfg
@@ -169,14 +170,14 @@ def read_diagnosis(path: Path, model: Model) -> dict[str, Any]:
     """Return a saved diagnosis as its JSON object.
 
     Args:
-        path: What ``concent diagnose --json`` printed (``.json``), or the model that ``--apply`` wrote (``.toml``),
-        which
-            has the accepted effects with their intervals, and no groups.
+        path: Folder that ``concent diagnose --out`` wrote, what its ``--json`` printed (``.json``), or the model that
+            its ``--apply`` wrote (``.toml``), which has the accepted effects with their intervals, and no groups.
         model: The model that was diagnosed.
 
     Raises:
         ModelError: The file is missing, damaged, or of another kind.
     """
+    path = path / DIAGNOSIS_FILE if path.is_dir() else path
     if path.suffix == ".toml":
         return _of_model(Model.load(path), model, path)
     document = read_json(path, ModelError)

@@ -11,13 +11,14 @@ RECORDED = recorded_range(RECORDING)
 
 def motion(speed, seconds=2.0):
     drives = Drives.of(RECORDED)
+    assert drives is not None
     time = np.arange(0, seconds, 0.01)
     return commanded_motion(RECORDED, drives, "sweep", "sweep", speed * time[:, None])
 
 
 def forecast(hypotheses, *motions, starts=False):
     moved = courses(hypotheses, RECORDED, motions, "mujoco")
-    pairs = [list(zip(motions, moved, strict=True))]
+    pairs = [[(motion, course) for motion, course in zip(motions, moved, strict=True) if course is not None]]
     (found,) = forecasts(hypotheses, RECORDED, pairs, "mujoco", window=2.0, step=0.1, starts=starts)
     assert found is not None
     return found
@@ -25,7 +26,8 @@ def forecast(hypotheses, *motions, starts=False):
 
 def test_evidence_without_a_refit_is_half_the_squared_difference_over_the_noise():
     hypotheses = friction_or_damping(RECORDING)
-    moved = courses(hypotheses, RECORDED, [motion(0.02)], "mujoco")[0]
+    (moved,) = courses(hypotheses, RECORDED, [motion(0.02)], "mujoco")
+    assert moved is not None
     rows = np.round(np.arange(0, 2, 0.01) / 0.004 - 1e-9).astype(int)
     apart = np.interp(np.arange(0, 2, 0.01), moved.time, moved.qpos[0, :, 0] - moved.qpos[1, :, 0]) / NOISE
     found = forecast(hypotheses, motion(0.02))

@@ -80,9 +80,11 @@ def test_nominal_values_are_open_within_their_tolerance():
 
 
 def test_saved_diagnoses_are_read(tmp_path):
-    path = tmp_path / "found.json"
+    path = tmp_path / "diagnosis.json"
     path.write_text(json.dumps(open_group()))
-    assert list(open_question(MODEL, read_diagnosis(path, MODEL), CFG).models) == ["joint_friction", "joint_damping"]
+    for given in (path, tmp_path):
+        found = open_question(MODEL, read_diagnosis(given, MODEL), CFG)
+        assert list(found.models) == ["joint_friction", "joint_damping"]
     better = MODEL.add(JointFriction("rail"), [0.2])
     better = replace(better, effects=(replace(better.effects[0], intervals=((0.1, 0.3),)),))
     better.save(tmp_path / "better.toml")

@@ -16,8 +16,11 @@ WALL = '<body name="wall" pos=".3 0 0"><geom size=".1" /></body>'
 def excess(command, cfg=None, more=""):
     recording = one_speed(more=more)
     recorded = recorded_range(recording)
-    motion = commanded_motion(recorded, Drives.of(recorded), "m", "m", np.asarray(command)[:, None])
+    drives = Drives.of(recorded)
+    assert drives is not None
+    motion = commanded_motion(recorded, drives, "m", "m", np.asarray(command)[:, None])
     (course,) = courses(friction_or_damping(recording), recorded, [motion], "mujoco")
+    assert course is not None
     return MotionLimits(recorded, cfg or MotionLimitsCfg(), "mujoco").excess(motion, course)
 
 
