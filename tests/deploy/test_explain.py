@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,11 @@ def bias(after: float) -> PoseBias:
     return PoseBias(SHIFT, np.ones(6), np.full(8, 7.0), np.full(8, after), ())
 
 
+def named(family: str, gain: float) -> Any:
+    """A diagnosis that accepted one effect."""
+    return SimpleNamespace(accepted=(SimpleNamespace(family=family, gain=gain),))
+
+
 WEAK = SimulatedTrials(np.zeros((8, 2), bool), Recording("", ()))
 FAR = np.full(8, 7.0)
 
@@ -119,6 +125,9 @@ FAR = np.full(8, 7.0)
         ({"misfit": FAR, "bias": bias(6.0)}, "unexplained"),
         ({"misfit": FAR, "bias": bias(6.0), "free": np.full(8, 30.0)}, "physics"),
         ({"misfit": FAR, "bias": bias(6.0), "misfit_with_effect": np.full(8, 1.2)}, "physics"),
+        ({"misfit": FAR, "bias": bias(6.0), "diagnosis": named("joints", 0.8)}, "physics"),
+        ({"misfit": FAR, "bias": bias(6.0), "diagnosis": named("measurement", 0.8)}, "perception"),
+        ({"misfit": FAR, "bias": bias(6.0), "diagnosis": named("joints", 0.2)}, "unexplained"),
         ({"misfit": FAR, "own": WEAK, "bias": bias(6.0)}, "policy"),
     ],
 )  # fmt: skip

@@ -22,11 +22,13 @@ from concent_warp.deploy.explain.sentences import (
     other_policy_sentence,
     trial_sentence,
 )
-from concent_warp.diagnosis.result import Diagnosis
+from concent_warp.diagnosis.result import Diagnosis, Finding
 from concent_warp.simulate.replay import interpolate
 from concent_warp.train.policy.load import Policy
 from concent_warp.train.task.task import Task
 
+MEASUREMENT = "measurement"
+"""Family of the effects of instruments."""
 QUANTILE = 0.95
 """Share of simulated trials below a threshold."""
 
@@ -102,9 +104,15 @@ class Judge:
             return False
         return bool(np.median(evidence.explained(evidence.bias.after)) >= self._cfg.explained)
 
+    def is_perception_by_diagnosis(self, evidence: Evidence) -> bool:
+        """Return whether the diagnosis names an error of the instruments."""
+        named = _named(evidence)
+        return named is not None and named.family == MEASUREMENT and named.gain >= self._cfg.explained
+
     def is_physics(self, evidence: Evidence) -> bool:
         """Return whether the world moved otherwise than the model."""
-        if self.moves_otherwise(evidence):
+        named = _named(evidence)
+        if self.moves_otherwise(evidence) or (named is not None and named.gain >= self._cfg.explained):
             return True
         if evidence.misfit_with_effect is None:
             return False
@@ -116,7 +124,7 @@ class Judge:
             return "policy"
         if not self.differs(evidence):
             return "unexplained"
-        if self.is_perception(evidence):
+        if self.is_perception(evidence) or self.is_perception_by_diagnosis(evidence):
             return "perception"
         return "physics" if self.is_physics(evidence) else "unexplained"
 
@@ -150,6 +158,7 @@ class Judge:
             "free joint error of simulated trials": _median(evidence.usual_free),
             "explained by perception": None if bias is None else float(np.median(evidence.explained(bias.after))),
             "explained by physics": None if effect is None else float(np.median(evidence.explained(effect))),
+            "held-out gain of the effect": None if (named := _named(evidence)) is None else named.gain,
         }
 
     def _remarks(self, evidence: Evidence, cause: Cause, numbers: dict[str, float | None]) -> list[str]:
@@ -163,7 +172,7 @@ class Judge:
         ]
         if self.moves_otherwise(evidence):
             said.append(free_motion_sentence(numbers))
-        if cause == "perception" and evidence.bias is not None:
+        if cause == "perception" and evidence.bias is not None and self.is_perception(evidence):
             said.append(bias_sentence(evidence.bias, numbers["explained by perception"]))
         if evidence.diagnosis is not None:
             said += diagnosis_sentences(evidence.diagnosis, numbers["explained by physics"])
@@ -189,8 +198,8 @@ class Judge:
             best = max(shares, key=lambda name: shares[name])
             if shares[best] >= self._cfg.explained:
                 own = "perception" if best == "perception" else "physics"
-            elif cause == "physics":
-                own = "physics"
+            elif cause in ("physics", "perception"):
+                own = cause  # what all trials show together; contacts may have gone another way in this replay
         usual = np.concatenate(list(evidence.usual_windows) or [np.ones(1)])
         threshold = float(max(np.quantile(usual, 0.99), self._cfg.least_ratio))
         above = np.flatnonzero(evidence.windows[k] > threshold)
@@ -260,6 +269,11 @@ def _mean_between(position: np.ndarray, dt: float, start: float, end: float) -> 
     """Return the mean of positions (S, 3) at steps of `dt` within a time; None where there are none."""
     part = position[round(start / dt) : round(end / dt)]
     return part.mean(axis=0) if len(part) else None
+
+
+def _named(evidence: Evidence) -> Finding | None:
+    """Return the first effect that the diagnosis accepted; None where there is none."""
+    return next(iter(evidence.diagnosis.accepted), None) if evidence.diagnosis is not None else None
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -27,8 +27,8 @@ from concent_warp.effects.registry import effect_class, effect_classes
 from concent_warp.errors import ConcentError, ModelError, RecordingError, TrainError
 from concent_warp.files import write_json
 from concent_warp.model import Model
-from concent_warp.run_folder import make_folder
 from concent_warp.recording.recording import Demonstration, Recording
+from concent_warp.run_folder import make_folder
 from concent_warp.train.environment.observation import ObservationLayout
 from concent_warp.train.observation_cfg import SensorErrorsCfg
 from concent_warp.train.policy.load import Policy
