@@ -40,7 +40,11 @@ SHARES = (
     "environment.observation.sensors.dropout", "ppo.discount", "ppo.lam",
 )  # fmt: skip
 """Settings from 0 to 1."""
-SIGNED = ("environment.reward.engineered.hole", "environment.reward.engineered.seat")
+SIGNED = (
+    "environment.reward.engineered.hole", "environment.reward.engineered.seat",
+    *(f"{of}.sensors.{what}_bias"
+      for of in ("environment.observation", "stress") for what in ("position", "orientation")),
+)  # fmt: skip
 """Settings that may be negative; all others may not."""
 INTERVALS = ("friction", "grip", "stiffness", "damping", "mass", "joint_friction", "delay", "lag")
 """Settings of the randomisation that are a smallest and a largest value."""
