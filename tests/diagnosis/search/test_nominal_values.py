@@ -15,11 +15,11 @@ from concent_warp.diagnosis.cfg import NominalCfg
 from concent_warp.diagnosis.procedure import Procedure
 from concent_warp.diagnosis.search.nominal_values import (
     _independent,
-    _nominal_effects_of,
     _visible,
     considered_std,
     nominal_errors,
     nominal_sensitivities,
+    possible_nominal_effects,
     with_nominal_values,
 )
 from concent_warp.effects.registry import effect_class
@@ -67,12 +67,14 @@ def test_a_nominal_value_whose_error_would_show_counts_by_what_may_go_unseen():
 
 def test_a_nominal_value_is_not_considered_beside_the_effect_that_it_is():
     model = cw.Model(cw.Scene(PUSHER))
-    gains = {t for e in _nominal_effects_of(model) if e.name == "nominal_gain" for t in e.target}
+    gains = {t for e in possible_nominal_effects(model) if e.name == "nominal_gain" for t in e.target}
     assert len(gains) == 2
     first = sorted(gains)[0]
     with_gain = model.add_effect("actuator_gain", target=[first])
-    assert {t for e in _nominal_effects_of(with_gain) if e.name == "nominal_gain" for t in e.target} == gains - {first}
-    assert any(e.name == "nominal_velocity_gain" and first in e.target for e in _nominal_effects_of(with_gain))
+    assert {t for e in possible_nominal_effects(with_gain) if e.name == "nominal_gain" for t in e.target} == gains - {
+        first
+    }
+    assert any(e.name == "nominal_velocity_gain" and first in e.target for e in possible_nominal_effects(with_gain))
 
 
 def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_they_are_added_to():
@@ -86,7 +88,7 @@ def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_
     base = plus(base, "joint_damping")  # explains the data
     assert base.ratio < 1.25
     shared = nominal_sensitivities(base)
-    kinds = _nominal_effects_of(base.model)
+    kinds = possible_nominal_effects(base.model)
     assert shared.names == tuple((e.name, t) for e in kinds for t in e.target)
     assert shared.columns.shape == (sum(len(p.residual) for p in base.pieces), len(shared.names))
     for k, effect in enumerate(kinds):
