@@ -71,10 +71,9 @@ def test_a_nominal_value_is_not_considered_beside_the_effect_that_it_is():
     assert len(gains) == 2
     first = sorted(gains)[0]
     with_gain = model.add_effect("actuator_gain", target=[first])
-    assert {t for e in possible_nominal_effects(with_gain) if e.name == "nominal_gain" for t in e.target} == gains - {
-        first
-    }
-    assert any(e.name == "nominal_velocity_gain" and first in e.target for e in possible_nominal_effects(with_gain))
+    beside = possible_nominal_effects(with_gain)
+    assert {t for e in beside if e.name == "nominal_gain" for t in e.target} == gains - {first}
+    assert any(e.name == "nominal_velocity_gain" and first in e.target for e in beside)
 
 
 def test_candidates_share_the_sensitivities_to_nominal_values_of_the_model_that_they_are_added_to():
