@@ -10,8 +10,9 @@ from tests.distil.conftest import TINY
 
 
 def test_a_stopped_benchmark_goes_on_and_its_page_has_what_was_measured(tmp_path):
+    longer = replace(TINY, dagger=replace(TINY.dagger, iterations=60))  # more than a second, the least that is given
     args = Args(
-        teachers=("shape_sorter",), controls=(), episodes=1, device="cpu", data=tmp_path / "rows.jsonl", distil=TINY
+        teachers=("shape_sorter",), controls=(), episodes=1, device="cpu", data=tmp_path / "rows.jsonl", distil=longer
     )
     Benchmark(replace(args, seconds=0.5), tmp_path / "runs").run()
     assert "shape_sorter student 0 training" not in Measurements(args.data).rows
@@ -26,7 +27,7 @@ def test_a_stopped_benchmark_goes_on_and_its_page_has_what_was_measured(tmp_path
     )
     assert set(rows) == {f"shape_sorter {part}" for part in parts}
     assert not any("error" in row for row in rows.values())
-    assert rows["shape_sorter student 0 training"]["samples"] == 18
+    assert rows["shape_sorter student 0 training"]["samples"] == 360
     text = page(list(rows.values()))
     assert "| the student, by DAgger | 0 |" in text
     assert "| the teacher, which observes the state | 0 | 100.0% |" in text

@@ -26,7 +26,7 @@ class Arguments:
 
     Without networks and splats the images are the simulation's. With networks (concent render-train), robot and
     background look as the real camera sees them; with splats (concent splat-fit, or any 3DGS model), so do the objects.
-    Images, state and commands go to a LeRobotDataset v3.0 or to robomimic's HDF5. Ctrl-C loses nothing.
+    Images, state and commands go to a LeRobotDataset v3.0 or to robomimic's HDF5.
     """
 
     checkpoint: Path | None = None
