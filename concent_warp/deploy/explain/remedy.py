@@ -32,11 +32,8 @@ def remedy(policy: Policy, cause: Cause, diagnosis: Diagnosis | None, sources: S
             "--environment.observation.sensors.position-std 0.003 --environment.observation.sensors.constant-share 0.8",
         )
     if cause == "physics":
-        names = (
-            ""
-            if diagnosis is None or not diagnosis.accepted
-            else " --effects " + " ".join(dict.fromkeys(f.name for f in diagnosis.accepted))
-        )
+        accepted = [] if diagnosis is None else [found.name.partition("(")[0] for found in diagnosis.accepted]
+        names = " --effects " + " ".join(dict.fromkeys(accepted)) if accepted else ""
         return (
             "# add the missing effect to the model, with its intervals",
             f"concent diagnose {trials} --model {model}{names} --apply better.toml",

@@ -1,0 +1,28 @@
+"""The commands that mend a cause can be given as they are printed."""
+
+import shlex
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import tyro
+
+import concent_warp as cw
+from concent_warp.deploy.explain.remedy import remedy
+from concent_warp.deploy.explain.result import Cause
+
+FOUND = cast(Any, SimpleNamespace(accepted=[SimpleNamespace(name="joint_friction(joint1, ...)")] * 2))
+
+
+@pytest.mark.parametrize("cause", ["perception", "physics", "policy", "unexplained"])
+def test_commands_are_understood(cause: Cause) -> None:
+    lines = remedy(cw.load_policy("shape_sorter"), cause, FOUND, ["my trials.h5"])
+    commands = [shlex.split(line) for line in lines if not line.startswith("#")]
+    assert len(commands) >= 2
+    for concent, name, *arguments in commands:
+        assert concent == "concent"
+        module = import_module(f"concent_warp.cli.commands.{name}")
+        given = tyro.cli(module.Arguments, args=arguments, config=(tyro.conf.HelptextFromCommentsOff,))
+        if name == "diagnose":
+            assert given.effects == ("joint_friction",)
