@@ -160,7 +160,7 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
     head = ["cause", "all together", "95 %", "one by one", "95 %"]
     columns = ["case", "cause", "found", "one by one", "effect named", "error of poses found [mm]", "failed", "seconds"]
     effects = f"Of {len(named)} cases of changed physics the missing effect is named first in {sum(named)} "
-    effects += f"({_shares(named)[1]}), and is among those that the data cannot tell apart in {sum(grouped)}."
+    effects += f"({_shares(named)[1]}), and is among those that the data cannot distinguish in {sum(grouped)}."
     parts = [
         "# Why trials failed", "Written by `benchmarks/deploy/explain.py`; do not edit.", INTRODUCTION,
         machines(rows), "## Causes named rightly", table(head, summary), effects, "## Cases", table(columns, detail),

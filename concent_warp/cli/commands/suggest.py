@@ -150,7 +150,7 @@ def _discarded_if_empty(folder: Path) -> Iterator[None]:
 
 
 def _say_suggestion(found: Suggestion) -> None:
-    """Write what is open, what to do, and a table of what it tells apart."""
+    """Write what is open, what to do, and a table of the evidence between hypotheses."""
     if found.question != found.sentence:
         say(escape(found.question))
     say(f"[bold]{escape(found.sentence)}[/bold]")

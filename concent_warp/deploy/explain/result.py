@@ -105,7 +105,7 @@ class Explanation:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of the missing effects; of those that the data cannot tell apart the first one."""
+        """Names of the missing effects; of those that the data cannot distinguish the first one."""
         if self.diagnosis is None or self.cause not in ("physics", "perception"):
             return ()
         return tuple(finding.name for finding in self.diagnosis.accepted)

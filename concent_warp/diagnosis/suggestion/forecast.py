@@ -1,4 +1,4 @@
-"""What hypotheses predict for motions that were not recorded yet, and how far one can then be told from another.
+"""What hypotheses predict for motions that were not recorded yet, and how well they can then be distinguished.
 
 Let y_i be the readings that hypothesis i predicts, in units of their noise, F_j the dependence of those of hypothesis
 j on its parameters, A their dependence on the initial states of the windows, in units of the standard deviations with
@@ -40,7 +40,7 @@ Readings = list[np.ndarray]
 
 @dataclass(frozen=True)
 class Forecast:
-    """How far H hypotheses can be told apart by a motion."""
+    """How well a motion distinguishes H hypotheses."""
 
     evidence: np.ndarray
     """Expected log likelihood ratio [nat] of the true hypothesis (row) to another one (column) that is refitted to old

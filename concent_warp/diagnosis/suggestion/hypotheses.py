@@ -1,4 +1,4 @@
-"""The hypotheses that the next recording is to tell apart: what a diagnosis leaves open, fitted to the data at hand.
+"""The hypotheses that the next recording is to distinguish: what a diagnosis leaves open, fitted to the data at hand.
 
 Two kinds: the effects of a group, one hypothesis each beside all other accepted effects; or the ends of the interval
 of a parameter that is not known well enough.
@@ -97,7 +97,7 @@ def open_question(model: Model, diagnosis: Diagnosis | Mapping[str, Any], cfg: S
     verdict, findings, groups = _checked(document)
     accepted = sorted((f for f in findings if f.get("accepted")), key=lambda f: f.get("step", 0))
     if verdict == "none_needed":
-        return OpenQuestion({}, sentence="No effect is missing: there is nothing to tell apart.")
+        return OpenQuestion({}, sentence="No effect is missing: there is nothing to distinguish.")
     base = _with_nominal(model, document.get("nominal_values") or [])
     for place, group in enumerate(groups[: len(accepted)]):
         if len(group) > 1:
@@ -109,7 +109,7 @@ def open_question(model: Model, diagnosis: Diagnosis | Mapping[str, Any], cfg: S
             return OpenQuestion(models, sentence=f"Open: {_listed(list(models))}{more}.")
     if not accepted:
         return OpenQuestion(
-            {}, sentence=f'The verdict is "{verdict}" without an accepted effect: no hypotheses to tell apart.'
+            {}, sentence=f'The verdict is "{verdict}" without an accepted effect: no hypotheses to distinguish.'
         )
     widest = max(
         ((_width(p), k, i) for k, f in enumerate(accepted) for i, p in enumerate(f["parameters"])), default=None

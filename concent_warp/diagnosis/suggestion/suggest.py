@@ -244,7 +244,7 @@ class _Prefixed(Evaluations):
 
 
 def _pairs(hypotheses: list[Hypothesis], forecast: Forecast, needed: float) -> tuple[SuggestedPair, ...]:
-    """Return how far each two hypotheses are told apart."""
+    """Return how well each two hypotheses are distinguished."""
     return tuple(
         SuggestedPair(
             a.name,
@@ -308,7 +308,7 @@ def _suggestion(
 
 
 def _brings(names: list[str], pairs: tuple[SuggestedPair, ...], needed: float) -> str:
-    """Return what a motion tells apart in a sentence."""
+    """Return which hypotheses a motion distinguishes, in a sentence."""
     decided = [pair for pair in pairs if pair.resolved]
     least = min(pair.evidence for pair in decided)
     if len(decided) == len(pairs):

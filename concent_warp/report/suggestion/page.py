@@ -106,7 +106,7 @@ def _thinned(count: int) -> np.ndarray:
 
 
 def _table(suggestion: Suggestion) -> str:
-    """Return what is told apart as a table."""
+    """Return the evidence between hypotheses as a table."""
     head = "".join(f"<th>{name}</th>" for name in ("if true", "against", "evidence [nat]", "x noise", "channel", ""))
     rows = "".join(
         f"<tr><td>{escape(p.true)}</td><td>{escape(p.other)}</td><td>{p.evidence:.3g}</td><td>{p.separation:.2g}</td>"
