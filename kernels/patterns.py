@@ -12,6 +12,15 @@ WAVES = 4
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def _cell(place: wp.vec3, seed: int) -> float:
+    """Return the random number in -1..1 of the unit cube that a place is in."""
+    x, y, z = int(wp.floor(place[0])), int(wp.floor(place[1])), int(wp.floor(place[2]))
+    # Large primes spread neighbouring cubes (Teschner et al., "Optimized spatial hashing", VMV 2003).
+    state = wp.rand_init(seed, (x * 73856093) ^ (y * 19349663) ^ (z * 83492791))
+    return wp.randf(state, -1.0, 1.0)
+
+
 @wp.kernel
 def paint_patterns_kernel(
     colour: wp.array4d(dtype=wp.vec3),
@@ -26,6 +35,7 @@ def paint_patterns_kernel(
     body_quaternion: wp.array2d(dtype=wp.quat),
     waves: wp.array3d(dtype=wp.vec4),
     contrast: wp.array2d(dtype=float),
+    grain: wp.array2d(dtype=wp.vec3),
     background: wp.array3d(dtype=wp.vec3),
     image: wp.array4d(dtype=wp.uint8),
 ) -> None:
@@ -46,6 +56,8 @@ def paint_patterns_kernel(
         body_quaternion: Their orientations, wxyz, shape (W, nbody).
         waves: Wave vectors [rad/m] and phases of the patterns, shape (W, P, WAVES); geom g has pattern g % P.
         contrast: Contrast of the patterns [-], shape (W, P).
+        grain: Cells per length [1/m], contrast of the cells [-] and a seed, shape (W, P): surfaces are divided into
+            cubes of the body's frame, each of a brightness of its own.
         background: Colours at the upper and the lower edge where nothing is, shape (W, C, 2).
         image: Colours 0..255, shape (W * C, 3, H, W').
     """
@@ -74,6 +86,8 @@ def paint_patterns_kernel(
             wave = waves[world, pattern, k]
             level += wp.sin(wave[0] * local[0] + wave[1] * local[1] + wave[2] * local[2] + wave[3])
         light = light * (1.0 + contrast[world, pattern] * level / float(wp.static(WAVES)))
+        grains = grain[world, pattern]
+        light = light * (1.0 + grains[1] * _cell(local * grains[0], int(grains[2])))
     for k in range(3):
         image[world * colour.shape[1] + c, k, v, u] = wp.uint8(wp.clamp(255.0 * light[k] + 0.5, 0.0, 255.0))
 

@@ -81,6 +81,7 @@ class RandomisedImages:
         n, count = worlds, len(images.cameras)
         self._waves = torch.zeros(n, PATTERNS, WAVES, 4, device=device)
         self._contrast = torch.zeros(n, PATTERNS, device=device)
+        self._grain = torch.zeros(n, PATTERNS, 3, device=device)
         self._background = torch.zeros(n, count, 2, 3, device=device)
         self._image = torch.zeros(n, count, 3, images.size, images.size, dtype=torch.uint8, device=device)
         self._paint = Launches(self._painting(model), self._stage.device)
@@ -99,7 +100,7 @@ class RandomisedImages:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the looks by name."""
-        names = (*VARIED, "waves", "contrast", "background")
+        names = (*VARIED, "waves", "contrast", "grain", "background")
         return {name: value.clone() for name, value in zip(names, self._random(), strict=True)}
 
     def restore(self, state: dict[str, torch.Tensor]) -> None:
@@ -109,7 +110,7 @@ class RandomisedImages:
 
     def _random(self) -> list[torch.Tensor]:
         """Return the tensors of what is random."""
-        return [*self._fields.values(), self._waves, self._contrast, self._background]
+        return [*self._fields.values(), self._waves, self._contrast, self._grain, self._background]
 
     def _sampled(self) -> list[torch.Tensor]:
         """Return random looks of all worlds, in the order of `_random`."""
@@ -125,6 +126,7 @@ class RandomisedImages:
             *self._lamps(nominal["light_pos"].shape[1]),
             self._wave_vectors(),
             cfg.pattern * self._uniform((0.0, 1.0), n, PATTERNS),
+            self._grains(),
             self._uniform((0.0, 1.0), n, len(self.cameras), 1, 3) * self._uniform((0.6, 1.0), n, 1, 2, 3),
         ]
 
@@ -160,6 +162,15 @@ class RandomisedImages:
         length = length * self._uniform((0.5, 2.0), *shape, 1)
         return torch.cat([2 * np.pi / length * direction, 2 * np.pi * self._uniform((0.0, 1.0), *shape, 1)], dim=-1)
 
+    def _grains(self) -> torch.Tensor:
+        """Return cells per length [1/m], contrasts and seeds of the grains, shape (N, PATTERNS, 3)."""
+        cfg, shape = self._looks, (self._worlds, PATTERNS)
+        low, high = cfg.grain_length
+        length = low * (high / low) ** self._uniform((0.0, 1.0), *shape)
+        grained = self._uniform((0.0, 1.0), *shape) < cfg.grain_share
+        contrast = grained * cfg.grain * self._uniform((0.0, 1.0), *shape)
+        return torch.stack([1 / length, contrast, self._uniform((0.0, 1e6), *shape).floor()], dim=-1)
+
     def _uniform(self, bounds: tuple[float, float], *shape: int) -> torch.Tensor:
         low, high = bounds
         return low + (high - low) * torch.rand(*shape, device=self._device)
@@ -178,6 +189,7 @@ class RandomisedImages:
                 wp.array(camera_ids(model, self.cameras), dtype=int), wp.array(focal, dtype=float),
                 data.cam_xpos, data.cam_xmat, wp.from_torch(self._body_of), data.xpos, data.xquat,
                 wp.from_torch(self._waves, dtype=wp.vec4), wp.from_torch(self._contrast),
+                wp.from_torch(self._grain, dtype=wp.vec3),
                 wp.from_torch(self._background, dtype=wp.vec3),
             ]  # fmt: skip
             image = wp.from_torch(self._image.flatten(0, 1))

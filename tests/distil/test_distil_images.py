@@ -19,8 +19,8 @@ from tests.render.photographed import ball
 SIZE = 32
 IMAGES = cw.ImagesCfg(size=SIZE, samples=1, shadows=False)
 STILL = cw.LooksCfg(
-    colour=0.0, hue_share=0.0, pattern=0.0, light_elevation=(60.0, 60.0), light_strength=(0.5, 0.5), light_tint=0.0,
-    ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0,
+    colour=0.0, hue_share=0.0, pattern=0.0, grain_share=0.0, light_elevation=(60.0, 60.0), light_strength=(0.5, 0.5),
+    light_tint=0.0, ambient=(0.1, 0.1), camera_position=0.0, camera_angle=0.0,
 )  # fmt: skip
 """Looks of which only the direction of the lights varies."""
 ALL = torch.ones(2, dtype=torch.bool)
@@ -67,9 +67,10 @@ def test_looks_are_restored(environment):
     assert np.array_equal(seen(source, environment), first)
 
 
-def test_patterns_change_the_brightness_of_surfaces_by_their_contrast(environment):
+@pytest.mark.parametrize("looks", [{"pattern": 1.0}, {"grain_share": 1.0, "grain": 1.0}])
+def test_patterns_change_the_brightness_of_surfaces_by_their_contrast(environment, looks):
     plain = RandomisedImages(environment.task, 2, IMAGES, STILL, "cpu")
-    patterned = RandomisedImages(environment.task, 2, IMAGES, replace(STILL, pattern=1.0), "cpu")
+    patterned = RandomisedImages(environment.task, 2, IMAGES, replace(STILL, **looks), "cpu")
     images = []
     for source in (plain, patterned):
         torch.manual_seed(3)
@@ -81,6 +82,22 @@ def test_patterns_change_the_brightness_of_surfaces_by_their_contrast(environmen
     assert ratio.max() < 2.1
     # A pattern is grey: it changes the colours alike.
     assert np.abs(ratio - ratio.mean(axis=1, keepdims=True)).max() < 0.15
+
+
+def test_grains_have_their_size(environment):
+    changes = []
+    for length in (5.0, 0.01):
+        looks = replace(STILL, grain_share=1.0, grain=1.0, grain_length=(length, length))
+        images = []
+        for one in (STILL, looks):
+            source = RandomisedImages(environment.task, 2, IMAGES, one, "cpu")
+            torch.manual_seed(3)
+            source.begin(ALL)
+            images.append(seen(source, environment)[:, BASE, :, SIZE // 2 :])  # mostly the table
+        changes.append(np.median(np.abs(np.diff(images[1] / np.maximum(images[0], 1), axis=-1))))
+    # A cell as large as the scene changes the table evenly, small ones from pixel to pixel.
+    assert changes[0] < 0.02
+    assert changes[1] > 0.1
 
 
 def test_a_camera_that_is_displaced_sees_the_scene_from_elsewhere(environment):

@@ -75,8 +75,9 @@ class Dagger:
         seed_everything(cfg.seed)  # the same network on all ranks
         self.network = make_network(cfg, self._proprioception, environment.num_actions).to(self.device)
         if self.device.startswith("cuda"):
-            self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
             self.network.reduce_precision(cfg.dagger.half)
+            if cfg.dagger.compiled:
+                self.network.compile_encoders(self.device)
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=cfg.dagger.learning_rate, weight_decay=cfg.dagger.decay,
             fused=self.device.startswith("cuda"),

@@ -6,6 +6,8 @@ Group normalisation and the spatial softmax follow Chi et al., "Diffusion Policy
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from torch import nn
 
@@ -89,6 +91,17 @@ class StudentNetwork(nn.Module):
         for encoder in self.encoders:
             assert isinstance(encoder, CameraEncoder)
             encoder.reduced_precision = reduced
+
+    def compile_encoders(self, device: str) -> None:
+        """Compile the convolutions for each size of batch; warn and leave them as they are where that cannot work."""
+        try:
+            torch.compile(torch.sin)(torch.zeros(8, device=device))
+        except Exception as error:  # what is missing shows in many types: Triton, a C compiler, an old GPU
+            reason = " ".join(str(error).split())[:200]
+            warnings.warn(f"the student is not compiled, and learns more slowly: {reason}", stacklevel=2)
+            return
+        for encoder in self.encoders:
+            encoder.compile(dynamic=False)
 
     def forward(self, images: torch.Tensor, proprioception: torch.Tensor) -> torch.Tensor:
         """Return actions, shape (N, A); see `both`."""
