@@ -161,11 +161,11 @@ class DaggerCfg:
         1.0
     """
 
-    iterations: Count = 1000
+    iterations: Count = 1400
     """Iterations of collecting samples and updating the student."""
-    worlds: Worlds = 1024
+    worlds: Worlds = 2048
     """Number of environments simulated in parallel, on each rank."""
-    steps: Annotated[int, Bounds(1, 100_000)] = 8
+    steps: Annotated[int, Bounds(1, 100_000)] = 4
     """Steps of each environment per iteration."""
     updates: Annotated[int, Bounds(1, 1_000_000)] = 16
     """Gradient steps per iteration."""
