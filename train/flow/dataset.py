@@ -22,6 +22,13 @@ IMAGES = "observation.images."
 """Begins the names of features of images."""
 STATE, ACTION = "observation.state", "action"
 OBSERVATION, ACTIONS = "observation.", "action."
+LABELS = "teacher_chunk"
+"""Feature with the commands that a teacher would give from a frame on; NaN where it is the one that drives."""
+
+
+def label_names(action: Sequence[str], length: int) -> tuple[str, ...]:
+    """Return the names of the numbers of a label: those of the actions, each with its step."""
+    return tuple(f"{step}:{name}" for step in range(length) for name in action)
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,9 @@ class FlowDataset:
     """First frame of each episode, shape (E + 1,) int64, the last entry being T."""
     images: tuple[str, ...]
     """Features of the images, in the order of the cameras."""
+    labels: np.ndarray | None = None
+    """Chunks of a teacher from each frame on, shape (T, C, A) float32, NaN where the frames themselves go on as it
+    would; None where the data set has none."""
 
     @property
     def lengths(self) -> list[int]:
@@ -109,7 +119,11 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
     numbers = log.numbers
     if not numbers:
         raise TrainError("the data set has no episodes", where=source)
-    tables, tasks, lengths = [], [], []
+    tables, tasks, lengths, labels = [], [], [], []
+    labelled = cfg.labels and LABELS in log.features
+    if labelled and chosen.action != (ACTION,):
+        fix = "choose no other actions, or set labels aside with --data.no-labels"
+        raise TrainError(f"{LABELS} labels other actions", where=source, expected=ACTION, found=chosen.action, fix=fix)
     names: tuple[tuple[str, ...], tuple[str, ...]] | None = None
     size = (0, 0)
     for number in numbers:
@@ -124,6 +138,8 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
         tables.append([_table(columns, f"{source}, episode {number}") for columns in found])
         tasks.append(episode.task)
         lengths.append(len(tables[-1][1]))
+        if labelled:
+            labels.append(_labels(episode, now[1], f"{source}, episode {number}"))
     assert names is not None
     texts = tuple(dict.fromkeys(tasks))
     cameras = tuple(name.removeprefix(IMAGES) for name in chosen.cameras)
@@ -134,6 +150,7 @@ def read_dataset(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataset:
         np.repeat([texts.index(task) for task in tasks], lengths),
         np.concatenate([[0], np.cumsum(lengths)]),
         chosen.cameras,
+        np.concatenate(labels) if labelled else None,
     )
 
 
@@ -187,7 +204,7 @@ def _chosen_features(log: LeRobotLog, cfg: FlowDataCfg) -> FlowDataCfg:
             raise TrainError(f"the data set has no such feature of {what}", where=where, expected=known, found=found)
         if len(set(names)) < len(names):
             raise TrainError(f"a feature of {what} is named twice", where=where, found=list(names))
-    return FlowDataCfg(tuple(cameras), tuple(state), tuple(action))
+    return FlowDataCfg(tuple(cameras), tuple(state), tuple(action), labels=cfg.labels)
 
 
 def _is_depth(feature: Mapping[str, Any]) -> bool:
@@ -226,3 +243,22 @@ def _table(columns: Mapping[str, np.ndarray], where: str) -> np.ndarray:
             fix = "mend the data set, or choose other features"
             raise TrainError(f"{name} is not finite", where=f"{where}, frame {row}", found=value[row], fix=fix)
     return np.stack(list(columns.values()), axis=1).astype(np.float32)
+
+
+def _labels(episode: Episode, action: Sequence[str], where: str) -> np.ndarray:
+    """Return the labels of the frames of an episode, shape (T, C, A) float32; see `FlowDataset.labels`.
+
+    Raises:
+        TrainError: They are of other actions, or a label is finite in part.
+    """
+    columns = {n.partition("/")[2]: s.value for n, s in episode.signals.items() if n.startswith(f"{LABELS}/")}
+    expected = label_names(action, len(columns) // len(action))
+    if not expected or tuple(columns) != expected:
+        raise TrainError(f"{LABELS} is of other actions", where=where, expected=expected[:3], found=list(columns)[:3])
+    found = np.stack(list(columns.values()), axis=1).astype(np.float32)
+    known = np.isfinite(found)
+    if (broken := known.any(axis=1) & ~known.all(axis=1)).any():
+        row = int(np.flatnonzero(broken)[0])
+        fix = "mend the data set, or set labels aside with --data.no-labels"
+        raise TrainError(f"{LABELS} is not finite in part", where=f"{where}, frame {row}", fix=fix)
+    return found.reshape(len(found), -1, len(action))
