@@ -10,7 +10,8 @@ import pytest
 import concent_warp as cw
 from concent_warp.cli.entry import main
 from concent_warp.recording.logs.readers.lerobot import LeRobotLog
-from concent_warp.train.flow.dataset import FlowDataset, open_dataset, read_dataset
+from concent_warp.train.flow.dataset import FlowDataset, read_dataset
+from concent_warp.train.flow.sources import open_dataset
 
 CHUNK, DRIVEN = 4, 8
 HANDOVER = cw.HandoverCfg(time=(0.4, 0.4), frames="labelled", chunk=CHUNK)

@@ -13,8 +13,9 @@ import torch
 import concent_warp as cw
 from concent_warp.render.dataset.layout import EpisodeLayout
 from concent_warp.render.dataset.lerobot import LeRobotWriter
-from concent_warp.train.flow.dataset import LABELS, label_names, open_dataset, read_dataset
+from concent_warp.train.flow.dataset import LABELS, label_names, read_dataset
 from concent_warp.train.flow.learning import FlowTraining
+from concent_warp.train.flow.sources import open_dataset
 from tests.train.flow_dataset import RATE, SIZE, TINY, image
 
 LENGTH, CHUNK, ACTIONS = 6, 5, ("goal", "side")
